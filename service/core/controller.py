@@ -1,8 +1,8 @@
-"""The core: each tick's inbox in, a frame out; and what is published of it, under which keys, which
-bytes, made once and recorded as published.
+"""Core of the service: from the events of each tick to a frame, and from a frame to the messages
+that are published.
 
-Deterministic: no clock, no input or output, and all it remembers is one flat state and
-the skill in force.
+The core is deterministic: it has no clock, no input or output, and all that it remembers is one
+flat state and the skill in force. Messages are encoded once; they are recorded as published.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
 from service.core.skill.skill import NEVER, Skill
 from service.core.skill.stage import SkillStage
 
-# Plain numbers, as an enumeration's members cost a microsecond where they are combined.
+# Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
 SAMPLES = ("hands/left", "hands/right", "joints/state")
@@ -65,11 +65,11 @@ Tap: TypeAlias = Callable[[Tick, Frame], None]
 
 
 def no_lap(stage: str) -> None:
-    """Measures nothing: outside of the daemon nobody asks how long a stage took."""
+    """Ignore the end of a stage; the daemon passes a function that measures durations instead."""
 
 
 def start_state(settings: Settings, skill: Skill) -> Record:
-    """The state before the first tick."""
+    """State before the first tick."""
     state = blank(state_layout(len(settings.joints.names)))
     Intake(settings).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
@@ -80,10 +80,10 @@ def start_state(settings: Settings, skill: Skill) -> Record:
 
 
 class Controller:
-    """Seven stages in a row: intake, skill, decision, separation, setpoint, arm, limiter.
+    """Sequence of seven stages: intake, skill, decision, separation, setpoint, arm, limiter.
 
-    `Controller(settings, skill, state)` goes on bit for bit from where another controller's `state`
-    was taken. `urdf` is the text of the arm's description.
+    `Controller(settings, skill, state)` continues bit for bit from the `state` of another
+    controller. `urdf` is the text of the arm's description.
     """
 
     def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
@@ -99,34 +99,33 @@ class Controller:
         self._setpoint = SetpointStage(settings, self._arm)
         self._limiter = LimiterStage(settings, self._arm)
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
-        self._here: Kinematics | None = None  # of the state's joints
+        self._here: Kinematics | None = None  # kinematics at the state's joints
 
     @property
     def state(self) -> Record:
-        """A copy of all that the next frame depends on, but for settings and skill."""
+        """Copy of all that the next frame depends on, except settings and skill."""
         return copied(self._state)
 
     @property
     def skill(self) -> Skill:
-        """The skill in force."""
+        """Skill in force."""
         return self._skill.skill
 
     @property
     def max_part_speed(self) -> float:
-        """A bound [m/s] of the speed of any part of the arm."""
+        """Upper bound [m/s] of the speed of every part of the arm."""
         return self._separation.max_speed
 
     def copy_from(self, other: Controller) -> None:
-        """Takes over what another controller with the same settings remembers, and its skill."""
+        """Take over state and skill of another controller with the same settings."""
         if self.skill is not other.skill:
             self._adopt(other.skill)
         self._memory[:], self._here = other._memory, other._here
 
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
-        """The frame of one tick.
+        """Frame of one tick, whose index must be higher than that of the tick before.
 
-        Ticks have growing indices. Over indices that are left out hands are taken to have moved on;
-        the arm moves by one period only.
+        Over omitted indices, the hands' motion is extrapolated; the arm moves by one period only.
         """
         state, frame = self._state, self._blank.copy()[0]
         known = self._take_in(tick, frame)
@@ -152,6 +151,9 @@ class Controller:
         return unchanging
 
     def _take_in(self, tick: Tick, frame: Frame) -> int:
+        """Apply the events of a tick and advance the intake. Returns its flags of `codes.Known`.
+        Raises ValueError if the tick's index does not grow.
+        """
         state = self._state
         if tick.index <= state["tick"]:
             raise ValueError(f"tick {tick.index} after tick {state['tick']}: indices must grow")
@@ -168,9 +170,11 @@ class Controller:
         return self.intake.step(state, frame, tick.index - int(state["tick"]), samples)
 
     def _alone(self, frame: Frame) -> int:
-        """HANDS_KNOWN and ONE_HAND, where one hand leads the skill and the other one has never been
-        seen, or has disappeared. A hand that was seen lately may be near, so the arm holds; it
-        keeps away from where that hand was last seen.
+        """Flags ONE_HAND and HANDS_KNOWN if one hand leads the skill and the other one has never
+        been seen, or has disappeared.
+
+        A hand that was seen lately may be near, so the arm holds. The arm keeps away from where the
+        other hand was last seen.
         """
         side, ages = self.skill.conductor, frame["hand_ages"]
         if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
@@ -178,11 +182,12 @@ class Controller:
         return ONE_HAND | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
 
     def _adopt(self, skill: Skill) -> None:
+        """Replace the skill in force."""
         self._skill.adopt(self._state, skill)
         self._separation.set_contacts(skill.via_points)
 
     def _decide(self, frame: Frame, known: int, gate_m: float) -> Kinematics:
-        """Decides; the arm's kinematics, where it is or has just appeared."""
+        """Determine the mode, and start an arm that has become ready. Returns its kinematics."""
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if state["arm_ready"] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
@@ -196,8 +201,8 @@ class Controller:
         return here
 
     def _follow(self, frame: Frame, wanted: Wanted, here: Kinematics, lap: Lap) -> None:
-        """Moves setpoint and joints on. A setpoint that passes a bound, or a tool that cannot be
-        kept slow enough, is a fault.
+        """Advance setpoint and joints by one period. A setpoint outside its bounds, or a tool that
+        cannot be slowed down enough, is a fault.
         """
         state, separation = self._state, self._separation
         met = self._setpoint.step(state, frame, wanted, here, self.skill.workspace, separation.setpoint_share)
@@ -217,8 +222,8 @@ class Controller:
         lap("limiter")
 
     def _hold(self, frame: Frame, lap: Lap) -> None:
-        """Brakes the joints, or brings them into their limits, out of a thing that they are in or
-        along a way out; the setpoints stay with the tool.
+        """Brake the joints; or move them back into their limits, out of a thing that they are
+        inside of, or along a way out. The setpoint is reset to the tool.
         """
         state, separation, here = self._state, self._separation, self._at()
         own = self.decision.own_motion(state, here.tasks)
@@ -235,7 +240,7 @@ class Controller:
         lap("setpoint")
 
     def _at(self) -> Kinematics:
-        """The arm at the state's joints, computed once for the same ones."""
+        """Kinematics of the arm at the state's joints, computed once for each posture."""
         joints, here = self._state["joints"][0], self._here
         if here is None or here.record["joints"][0].tobytes() != joints.tobytes():
             here = self._here = self._arm.at(joints)
@@ -243,8 +248,8 @@ class Controller:
 
 
 def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:
-    """Steps through all ticks and shows each frame to the taps: the only loop, live, in replay and
-    in tests.
+    """Step a controller through all ticks and pass each frame to the taps. Live operation, replay
+    and tests all use this loop.
     """
     taps = tuple(taps)
     for tick in ticks:
@@ -254,9 +259,9 @@ def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap:
 
 
 def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
-    """What is published of a frame; `joints` are the names of the commanded ones.
+    """Messages to publish for a frame; `joints` are the names of the commanded joints.
 
-    Nothing is commanded before the arm is ready, and no target is there without both hands.
+    Before the arm is ready there is no command, and without known hands no target.
     """
     tick = int(frame["tick"])
     made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in STREAMS if tick % one.every == 0)
@@ -264,12 +269,16 @@ def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
 
 
 def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Joint command as CDR bytes; None while nothing is commanded."""
     if not frame["commanded"]:
         return None
     return cdr.encode_command(stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist())
 
 
 def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Target pose and covariance (6, 6), position [m²] then orientation [rad²], as CDR bytes; None
+    while nothing is predicted.
+    """
     if not frame["covariance"].any():
         return None
     covariance = [0.0] * 36
@@ -283,6 +292,7 @@ def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | Non
 
 
 def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Setpoint pose as CDR bytes."""
     message = PoseStamped(
         stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["setpoint_orientation"].tolist())
     )
@@ -290,6 +300,7 @@ def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | N
 
 
 def _gripper(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
+    """Command 0 (open) or 1 (closed) as CDR bytes; None while the gripper's state is unknown."""
     if frame["gripper"] == UNKNOWN:
         return None
     return cdr.encode_command(stamp_ns, (GRIPPER,), [float(frame["gripper"] == CLOSED)], [0.0])

@@ -1,7 +1,7 @@
-"""Event, Tick, Frame, State: what goes into the core, what comes out, and what it remembers.
+"""Data types of the core: Event and Tick are its input, Frame is its output, State is its memory.
 
-Frame and State are records, NumPy structured arrays of one element, which compiled functions take
-whole. They are assembled from what each stage declares in its package.
+Frame and State are NumPy structured records, which compiled functions take as arrays of one
+element. Each stage declares its fields in its package; this module assembles them.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ Record: TypeAlias = np.void
 Records: TypeAlias = NDArray[np.void]
 DType: TypeAlias = np.dtype[np.void]
 Outputs: TypeAlias = Sequence[tuple[str, bytes]]
-"""Keys below the cell, and what is published there."""
+"""Keys below the cell's, each with the bytes to publish."""
 
 
 @functools.cache
 def dtype_of(layout: Layout, joints: int) -> DType:
-    """The memory of a layout for an arm with so many joints: NumPy's own order, little endian."""
+    """NumPy type of a layout for an arm with this number of joints, in little endian."""
     return np.dtype([(field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints)) for field in layout])
 
 
 as_array: Callable[[Record], Records] = operator.attrgetter("base")
-"""The memory (1,) of a record that `blank` or `copied` made, as compiled functions take it."""
+"""Array (1,) of a record that `blank` or `copied` made, as compiled functions take it."""
 
 
 def structured(count: int, fields: Any) -> Records:
-    """So many records of zeros, whose fields compiled functions, and their plain Python, read by
-    name.
+    """Records of zeros (`count`,), whose fields compiled functions read as attributes. Where these
+    run as plain Python, the records are NumPy record arrays, which allow the same.
     """
     records = np.zeros(count, fields)
     return records.view(np.recarray) if PLAIN else records
 
 
 def parameters(**values: ArrayLike) -> Records:
-    """The parameters of a stage: numbers and arrays by name, as one record (1,)."""
+    """Parameters of a stage, numbers and arrays by name, as one record (1,)."""
     arrays = {name: np.asarray(value) for name, value in values.items()}
     record = structured(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
     for name, array in arrays.items():
@@ -57,25 +57,25 @@ def parameters(**values: ArrayLike) -> Records:
 
 
 def blank(layout: DType) -> Record:
-    """A record of zeros, to be filled."""
+    """Record of zeros."""
     record: Record = structured(1, layout)[0]
     return record
 
 
 def copied(record: Record) -> Record:
-    """A copy with memory of its own, as `blank` makes it."""
+    """Copy of a record with memory of its own, as `blank` makes it."""
     copy = blank(record.dtype)
     as_array(copy)[:] = record
     return copy
 
 
 def frozen(record: Record) -> Record:
-    """A copy that cannot be changed."""
+    """Read-only copy of a record."""
     copy: Record = np.frombuffer(record.tobytes(), record.dtype)[0]
     return copy
 
 
-Frame: TypeAlias = Record  # of the layout `frame_layout`
+Frame: TypeAlias = Record  # a record of `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
 
 _PACKAGES: tuple[ModuleType, ...] = (intake, skill, decision, separation, setpoint, arm, limiter)
@@ -89,7 +89,7 @@ TIMING_FIELDS = (
     Field("missed", "int64"),  # deadlines skipped since start
     Field("lateness_us", "float32"),
     Field("work_us", "float32"),
-    Field("latency_us", "float32"),  # newest hand's stamp to command published; 0: no new sample
+    Field("latency_us", "float32"),  # from the newest hand sample's stamp to the published command; 0: no new one
     Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
@@ -97,8 +97,8 @@ TIMING = dtype_of(TIMING_FIELDS, 0)
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that may change the next command: its kind, the bytes that a recording keeps, and
-    what they mean.
+    """Input of the core: its kind, the bytes that a recording keeps, and the value decoded from
+    them.
     """
 
     kind: str
@@ -107,30 +107,30 @@ class Event:
 
 
 def order(kind: str, text: str = "{}") -> Event:
-    """A hold, resume, reset or fault as an event, and what a recording keeps of it."""
+    """Event of kind hold, resume, reset or fault, with the text that a recording keeps."""
     return Event(kind, cdr.encode_string(text), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A deadline's number since start, and the events that it consumes, in order."""
+    """Number of a deadline since start, and the events that it consumes, in order."""
 
     index: int
     inbox: tuple[Event, ...] = ()
 
 
 def frame_layout(joints: int) -> DType:
-    """The layout of a Frame for an arm with so many joints."""
+    """Layout of a Frame for an arm with this number of joints."""
     return dtype_of(FRAME, joints)
 
 
 def state_layout(joints: int) -> DType:
-    """The layout of a State for an arm with so many joints."""
+    """Layout of a State for an arm with this number of joints."""
     return dtype_of(STATE, joints)
 
 
 def definitions(joints: int) -> dict[str, str]:
-    """The ROS 2 definitions of Frame, State and Timing for an arm with so many joints."""
+    """ROS 2 definitions of Frame, State and Timing for an arm with this number of joints."""
     layouts = {"Frame": FRAME, "State": STATE, "Timing": TIMING_FIELDS}
     return {f"thirdhand/{name}": definition(layout, joints) for name, layout in layouts.items()}
 
@@ -144,7 +144,7 @@ def timed(
     latency_us: float,
     stages_us: Sequence[float],
 ) -> Record:
-    """A Timing of these, which are its fields, made whole."""
+    """Timing record of these values, which are its fields."""
     fields = (tick, time_ns, missed, lateness_us, work_us, latency_us, stages_us)
     record: Record = np.array([fields], TIMING)[0]
     return record
@@ -156,13 +156,13 @@ def encode(record: Record) -> bytes:
 
 
 def decode(data: bytes, layout: DType) -> Record:
-    """The record in CDR bytes. Raises WireError."""
+    """Record in CDR bytes. Raises WireError."""
     record: Record = np.frombuffer(bytearray(cdr.decode_record(data, layout.itemsize)), layout)[0]
     return record
 
 
 def differences(a: Record, b: Record) -> dict[str, float]:
-    """The fields in which two records of one layout differ, bit for bit, with the largest
+    """Fields in which two records of one layout differ bit for bit, each with the largest
     difference.
     """
     if a.tobytes() == b.tobytes():

@@ -1,11 +1,10 @@
-"""Ways out of places that a step-by-step controller cannot leave: a path in joint space from the
-arm's posture to one in which the tool is where it is to be.
+"""Ways out of places that a step-by-step controller cannot leave: paths in joint space from the
+arm's posture to one that has the tool at its target.
 
-Not in the loop: found beside it, and brought to it as an event. Postures come from damped
-Gauss-Newton steps from many starts, the path between them from two trees that grow towards each
-other (RRT-Connect; Kuffner and LaValle, ICRA 2000), shortened afterwards. Everything on it keeps
-the limits of position, and more than the clearance from people as they are now, from things and
-from the arm itself.
+They are planned outside of the control loop, which receives them as events. Goal postures are found
+by damped Gauss-Newton steps from many starts; the path is found by two trees that grow toward each
+other (RRT-Connect; Kuffner and LaValle, ICRA 2000), and then shortened. The whole path keeps the
+joints' position limits, and keeps clear of people as they are now, of things and of the arm itself.
 """
 
 from __future__ import annotations
@@ -23,24 +22,24 @@ from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 from service.core.kinematics import Kinematics
 from service.core.separation.stage import Separation
 
-STARTS, ITERATIONS = 60, 120  # of the search for postures, and steps of each
-STEP_RAD = 0.2  # at most, of a joint in one of them
-SLACK, SLACK_SHARE = 0.03, 0.1  # [rad, m] kept from the position limits; at most this share of the range
-REACHED_M, REACHED_RAD = 2e-3, 0.1  # a posture so near to position and orientation will do
-DAMPING = 1e-5  # [m²] of those steps
-OPPOSITE = -0.9999  # cosine of directions between which no turn is the shortest
-GOALS = 6  # postures to which a path is looked for ...
-WAYS = 3  # ... until so many are found, of which the shortest is taken
-MARGIN_M = 0.02  # of clearance, kept more on the way, where both its ends do
-SMALL_M = 1e-3  # of that, which its ends need not have
-GRAIN_RAD = 0.05  # between postures of a path that are looked at
-REACH_RAD = 0.5  # at most, by which a tree grows at once
-NODES = 1500  # of both trees
-SHORTCUTS = 150  # tried
+STARTS, ITERATIONS = 60, 120  # random starts of the search for postures, and steps from each start
+STEP_RAD = 0.2  # largest change of a joint in one step
+SLACK, SLACK_SHARE = 0.03, 0.1  # [rad, m] distance from the position limits; at most this share of the range
+REACHED_M, REACHED_RAD = 2e-3, 0.1  # a posture this near to position and orientation is accepted
+DAMPING = 1e-5  # [m²] damping of the Gauss-Newton steps
+OPPOSITE = -0.9999  # below this cosine, two directions are opposite and have no single shortest rotation
+GOALS = 6  # largest number of postures to which a path is planned
+WAYS = 3  # planning ends when this number of paths is found
+MARGIN_M = 0.02  # clearance required along the path; that of its ends, if one of them has less
+SMALL_M = 1e-3  # tolerance of the clearance along a path, so that the path's ends have it
+GRAIN_RAD = 0.05  # distance between the postures of a path at which clearance is checked
+REACH_RAD = 0.5  # largest extension of a tree in one step
+NODES = 1500  # largest number of random postures toward which the trees grow
+SHORTCUTS = 150  # attempts to shorten a path
 
 
 class WayOut:
-    """Finds ways out for the arm of one cell; the same arguments give the same way."""
+    """Planner of ways out for the arm of one cell; equal arguments give equal paths."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
         self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
@@ -53,14 +52,17 @@ class WayOut:
         self._lever = float(self._arm.parameters["turn_lever"][0])
 
     def find(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> list[Vector]:
-        """Postures (J,) [rad], WAY at most, that lead from `joints` (J,) to one with the tool at a
-        position (3,) [m] in an orientation (4,), past hands (2, 3) [m] where they are; empty where
-        none is found.
+        """Path of at most WAY postures (J,) [rad] from `joints` (J,) to one with the tool at a
+        position (3,) [m] in an orientation (4,), past hands (2, 3) [m] at rest; empty if none is
+        found.
+
+        If no path reaches the orientation, one that reaches the position alone is taken. Of up to
+        WAYS paths, the shortest one is returned.
         """
         random, here_m = np.random.default_rng(0), self._separation.clearance(joints, hands)[0]
         limits = self._around(joints)
         ways: list[list[Vector]] = []
-        for turned in (True, False):  # position goes before orientation
+        for turned in (True, False):  # without a path to position and orientation, position alone
             for goal in self._postures(joints, limits, position, orientation if turned else None, hands, random):
                 least = min(here_m, self._separation.clearance(goal, hands)[0], MARGIN_M) - SMALL_M
                 path = self._connect(joints, goal, limits, hands, least, random)
@@ -73,8 +75,8 @@ class WayOut:
         return min((way for way in ways if len(way) <= WAY), key=_length, default=[])
 
     def _around(self, joints: Vector) -> Vector:
-        """Lower and upper limits (2, J) [rad, m] of the search: of a continuous joint half a turn
-        each way, which is all there is.
+        """Lower and upper limits (2, J) [rad, m] of the search. A continuous joint is searched half
+        a turn each way, which covers all its postures.
         """
         lower = np.where(self._is_continuous, np.maximum(joints - math.pi, self._lower), self._lower)
         upper = np.where(self._is_continuous, np.minimum(joints + math.pi, self._upper), self._upper)
@@ -89,7 +91,9 @@ class WayOut:
         hands: Vector,
         random: np.random.Generator,
     ) -> list[Vector]:
-        """Free postures with the tool there, the one nearest to `joints` first."""
+        """Collision-free postures with the tool at its target, at most GOALS, the nearest one to
+        `joints` first. Without an `orientation`, any orientation is accepted.
+        """
         drawn = random.uniform(limits[0], limits[1], (STARTS, len(joints)))
         turns = 2.0 * math.pi * np.rint((joints - self._home) / (2.0 * math.pi))
         home = self._home + np.where(self._is_continuous, turns, 0.0)
@@ -103,7 +107,14 @@ class WayOut:
         return sorted(found, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
 
     def _solved(self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
-        """A posture with the tool there within the limits, from one (J,)."""
+        """Posture (J,) within the limits with the tool at its target, from the start q (J,); None
+        if the iteration does not converge.
+
+            step = Jᵀ (J Jᵀ + DAMPING I)⁻¹ e,   q = clip(q + step min(1, STEP_RAD / max |step_j|))
+
+        e is the error of position [m], and that of orientation in the tool's frame, times the arm's
+        `turn_lever` [m]; J are the rows of `tasks` for it.
+        """
         for _ in range(ITERATIONS):
             here = self._arm.at(q)
             error, tasks, turn = position - here.position, here.tasks[:3], 0.0
@@ -118,7 +129,10 @@ class WayOut:
         return None
 
     def _turn(self, here: Kinematics, orientation: Vector) -> Vector:
-        """The turn (3,) [rad] that is left, about no more than what the arm follows."""
+        """Rotation vector (3,) [rad] in frame base from the tool's orientation to the target's. If
+        the arm follows only the direction of the tool's z axis, it is the shortest rotation of that
+        axis.
+        """
         turn, wanted = np.empty(3), np.empty(3)
         if self._whole:
             now = np.empty(4)
@@ -131,14 +145,18 @@ class WayOut:
         return math.pi * here.rotation[:, 0] if now @ wanted < OPPOSITE else turn
 
     def _is_free(self, a: Vector, b: Vector, hands: Vector, least: float) -> bool:
-        """Whether all on a straight line in joint space has so much clearance [m]."""
+        """True if all postures on a straight line in joint space, GRAIN_RAD apart, have more than
+        the clearance `least` [m].
+        """
         count = max(1, int(np.ceil(np.abs(b - a).max() / GRAIN_RAD)))
         return all(self._separation.clearance(a + k / count * (b - a), hands)[0] > least for k in range(1, count + 1))
 
     def _connect(
         self, start: Vector, goal: Vector, limits: Vector, hands: Vector, least: float, random: np.random.Generator
     ) -> list[Vector]:
-        """A free path of straight lines; empty where none is found."""
+        """Collision-free path of straight lines from `start` to `goal` (J,); empty if none is
+        found.
+        """
         if self._is_free(start, goal, hands, least):
             return [start, goal]
         trees = [([start], [-1]), ([goal], [-1])]
@@ -159,7 +177,11 @@ class WayOut:
     def _grow(
         self, nodes: list[Vector], before: list[int], toward: Vector, hands: Vector, least: float
     ) -> Vector | None:
-        """The node by which a tree came nearer to a posture, or that posture, or None."""
+        """Grow a tree toward a posture (J,), by at most REACH_RAD. Returns the new node, which may
+        be that posture; None if the line to it is not free.
+
+        `before` has the index of each node's parent.
+        """
         nearest = int(np.argmin(np.abs(np.array(nodes) - toward).max(axis=1)))
         way = toward - nodes[nearest]
         far = float(np.abs(way).max())
@@ -171,7 +193,7 @@ class WayOut:
         return new
 
     def _shortened(self, path: list[Vector], hands: Vector, least: float, random: np.random.Generator) -> list[Vector]:
-        """The path without the corners that can be left out."""
+        """Path without the corners that straight lines can bypass, by SHORTCUTS random attempts."""
         for _ in range(SHORTCUTS):
             if len(path) < 3:
                 break
@@ -182,12 +204,12 @@ class WayOut:
 
 
 def _length(path: list[Vector]) -> float:
-    """The way of the busiest joint, each time [rad]."""
+    """Length of a path [rad]: the sum over its lines of the largest joint difference."""
     return sum(float(np.abs(b - a).max()) for a, b in itertools.pairwise(path))
 
 
 def _back(nodes: list[Vector], before: list[int]) -> list[Vector]:
-    """From the newest node of a tree to its root."""
+    """Postures from the newest node of a tree back to its root."""
     path, at = [], len(nodes) - 1
     while at >= 0:
         path.append(nodes[at])

@@ -1,24 +1,24 @@
-"""Stage 3, decision: the mode of this tick and the reason for it."""
+"""Stage 3, decision: determine the mode of this tick and the reason for it."""
 
 from __future__ import annotations
 
 from service.contract.records import PER_JOINT, Field
 
-WAY = 24  # postures of a way out, at most
+WAY = 24  # largest number of postures of a way out
 STATE = (
-    Field("slow_tick", "int64"),  # the last one at which the tool was not too fast
-    Field("stuck_tick", "int64"),  # the last one at which the tool was there, or came nearer
-    Field("way_next", "int64"),  # the posture of the way out that is gone to
-    Field("way_count", "int64"),  # postures of the way out; 0: there is none
-    Field("stuck_gap", "float64"),  # how far from the target it was then [m]
-    Field("stuck_target", "float64", (3,)),  # the target then [m]
-    Field("way", "float64", (WAY, PER_JOINT)),  # postures that lead to where the target is reached [rad]
-    Field("mode", "uint8"),
-    Field("reason", "uint8"),
-    Field("operator_hold", "uint8"),
-    Field("arm_ready", "uint8"),  # 1: yes; 2: on its way into its limits, or out of a thing
-    Field("stuck", "uint8"),  # 1: the tool comes no nearer to its target; 2: it holds for that
-    Field("leaves", "uint8"),  # somebody confirmed that the arm is to leave the thing that it stands in
+    Field("slow_tick", "int64"),  # the last tick at which the tool was below its fault speed
+    Field("stuck_tick", "int64"),  # the last tick at which the tool made progress, or began a way out
+    Field("way_next", "int64"),  # index of the posture of the way out to which the arm moves
+    Field("way_count", "int64"),  # number of postures of the way out; 0: there is none
+    Field("stuck_gap", "float64"),  # distance between tool and target at `stuck_tick` [m]
+    Field("stuck_target", "float64", (3,)),  # target at `stuck_tick` [m]
+    Field("way", "float64", (WAY, PER_JOINT)),  # postures of the way out [rad]; the last one has the tool at its target
+    Field("mode", "uint8"),  # `contract.records.Mode`
+    Field("reason", "uint8"),  # `contract.records.Reason`
+    Field("operator_hold", "uint8"),  # 1: the operator holds the arm
+    Field("arm_ready", "uint8"),  # `codes.ArmReady`; 0: the arm is not ready
+    Field("stuck", "uint8"),  # `codes.Stuck`; 0: the tool comes nearer to its target
+    Field("leaves", "uint8"),  # 1: the operator has confirmed that the arm may leave the thing that it is inside of
 )
 FRAME = (
     Field("mode", "uint8"),

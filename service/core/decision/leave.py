@@ -1,6 +1,4 @@
-"""A tool that is stuck is led along a way out that was found beside the loop, by
-`service.core.way_out`.
-"""
+"""Motion of a stuck tool along a way out, which `service.core.way_out` plans beside the loop."""
 
 from __future__ import annotations
 
@@ -23,14 +21,16 @@ from service.core.frame import Event, Record, Vector
 
 
 class WayOut:
-    """The way out in the state: postures that are gone to one after the other."""
+    """Way out in the state: postures that the arm approaches one after the other."""
 
     def __init__(self, settings: Settings) -> None:
         self._mps = min(WAY_MPS, WAY_SPEED_SHARE * settings.tool.max_speed)
         self._radps = min(WAY_RADPS, WAY_SPEED_SHARE * min(settings.joints.velocity))
 
     def take(self, state: Record, event: Event) -> None:
-        """A way that was found, if the tool is still stuck near where that begins."""
+        """Start on a planned way out, if the tool is still stuck and the way begins within
+        WAY_START_RAD of the commanded joints.
+        """
         path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1]))
         if state["stuck"] and np.abs(path[:1] - state["joints"][0]).max(initial=0.0) < WAY_START_RAD:
             count = state["way_count"] = len(path)
@@ -38,7 +38,18 @@ class WayOut:
             state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
 
     def velocity(self, state: Record, tasks: Vector) -> Vector | None:
-        """Joint velocities (J,) [rad/s] along the way; None where there is none."""
+        """Joint velocities (J,) [rad/s] toward the next posture of the way out; None if there is
+        none.
+
+        With the difference d (J,) from the commanded joints, D = max |d_j| and the tool's Jacobian
+        J_p, the first three rows of `tasks`:
+
+            u = d min(radps, WAY_GAIN_PER_S D) / max(D, WAY_NEAR_RAD)
+            velocity = u / max(1, |J_p u| / mps)
+
+        radps [rad/s] and mps [m/s] are the largest speeds of a joint and of the tool. A posture is
+        reached when D < WAY_NEAR_RAD.
+        """
         if state["way_next"] >= state["way_count"]:
             return None
         off: Vector = state["way"][state["way_next"]] - state["joints"][0]

@@ -1,5 +1,5 @@
-"""The mode of a tick and the reason for it: whether the arm is ready and does what it is told,
-whether hands are known and where the skill is sure.
+"""Mode of a tick and the reason for it, from the state of the arm, the visibility of the hands and
+the skill's confidence.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from service.core.frame import Event, Record, Records, Vector, as_array, paramet
 
 
 class Decision:
-    """Mode and reason, in the state. `measured`: how far the arm is off its command [rad], and the
-    tool's speed [m/s], measured; at a fault what it was found by.
+    """Mode and reason of each tick, kept in the state.
+
+    `measured`: the largest difference between measured and commanded joints [rad], and the measured
+    speed of the tool [m/s]; during a fault, the values that caused it.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -38,11 +40,11 @@ class Decision:
         self.measured = (0.0, 0.0)
 
     def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
-        """Mode and reason of this tick, with the arm's kinematics `here` (1,); 0, STARTS_ASSUMED or
-        STARTS_MEASURED.
+        """Determine mode and reason of this tick from the arm's kinematics `here` (1,) and `known`,
+        flags of `codes.Known`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if the arm starts.
 
-        known: flags of `codes.Known`. gate_m: what the skill compares with its threshold, NaN where
-        it predicts nothing.
+        `gate_m` [m] is compared with the skill's `threshold` [m]; it is NaN if the skill predicts
+        nothing.
         """
         gates = gate_m, threshold
         starts, error, speed = step(as_array(state), as_array(frame), here, self._parameters, known, *gates)
@@ -52,8 +54,8 @@ class Decision:
         return int(starts)
 
     def own_motion(self, state: Record, tasks: Vector) -> Vector | None:
-        """Velocities (J,) [rad/s] of an arm in a hold on its way into its limits, or on a way out
-        of where it is stuck; None of any other. The arm's tasks are as in `Kinematics`.
+        """Joint velocities (J,) [rad/s] of a holding arm that moves back into its limits or along a
+        way out; None for any other. `tasks` is that of `Kinematics`.
         """
         if state["arm_ready"] == RETURNING and state["reason"] == NOT_READY and not state["operator_hold"]:
             q = state["joints"][0]
@@ -62,8 +64,8 @@ class Decision:
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def take(self, state: Record, event: Event) -> None:
-        """A hold, resume, reset or fault that somebody asks for, or a way out that was found.
-        Raises ValueError for others.
+        """Apply an event of kind hold, resume, reset, fault or way (a way out). Raises ValueError
+        for others.
         """
         match event.kind:
             case "hold" | "resume":
@@ -84,7 +86,9 @@ class Decision:
                 raise ValueError(f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}")
 
     def fail(self, state: Record, frame: Record, reason: Reason, *, speed: float | None = None) -> None:
-        """At fault from this tick on, for a `speed` [m/s] of the tool where that is why."""
+        """Set the mode to fault from this tick on. `speed` [m/s] is the tool's, if it is the
+        reason.
+        """
         state["mode"], state["reason"] = frame["mode"], frame["reason"] = FAULT, reason
         if speed is not None:
             self.measured = self.measured[0], speed

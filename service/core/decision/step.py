@@ -1,4 +1,4 @@
-"""The decision's compiled step: mode and reason from the arm, the hands and the skill."""
+"""Compiled step of the decision: determine mode and reason from arm, hands and skill."""
 
 from __future__ import annotations
 
@@ -62,7 +62,26 @@ def step(
     gate_m: float,
     threshold: float,
 ) -> tuple[int, float, float]:
-    """`Decision.step`, and what was measured; -1: nothing."""
+    """Mode and reason of this tick, written to the state; compiled part of `Decision.step`.
+
+    A fault remains until a reset. Otherwise the arm may cause a fault (`_arm`), or the first reason
+    in this order causes a hold; without one, the arm follows:
+
+    * TWO_SOURCES: a hand or the arm is contested.
+    * NOT_READY: the arm is not ready.
+    * OPERATOR: the operator holds it.
+    * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
+      been seen or is not seen now.
+    * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
+      follow yet.
+    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > GATE_RETURN_SHARE
+      threshold.
+    * AMBIGUOUS: the stage of the task is not known.
+    * BLOCKED: the tool is stuck, and the arm waits or moves along a way out (`_stuck`).
+
+    Returns STARTS_ASSUMED or STARTS_MEASURED if the arm starts, else 0, and the result of
+    `measured_error`, or -1 twice if nothing was measured.
+    """
     state = states[0]
     if state.mode == FAULT:
         return 0, -1.0, -1.0
@@ -93,7 +112,19 @@ def step(
 
 @compiled
 def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
-    """Whether the arm starts, what is wrong with it, its error and speed as measured."""
+    """State of the arm: starts, stops being ready, or fails. Returns STARTS_ASSUMED,
+    STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or -1 twice.
+
+    * An assumed arm starts at its configured posture and is ready.
+    * Any other arm starts where it reports one posture, once the commanded joints are at rest. If
+      it is outside its limits it is RETURNING, else READY. One that is inside of a thing starts
+      only after the operator's confirmation (`leaves`), and is RETURNING.
+    * A RETURNING arm is READY within its limits and inside of nothing, or within its limits without
+      motion for FREED_TIMEOUT_S.
+    * A silent arm is a fault (ARM_SILENT) if it follows or moves; at rest, it is no longer ready.
+    * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
+    * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
+    """
     state, given, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & ARM_INSIDE
     if given.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
@@ -106,7 +137,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.stuck = state.way_count = 0
         if not known & ARM_STILL:
             state.leaves = 0
-        # what still moves comes to rest first; what was reported must have been one posture
+        # Commanded joints that move come to rest first; the reported posture must be constant.
         if not known & ARM_STILL or moving or (inside and not state.leaves):
             return 0, NONE, -1.0, -1.0
         state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
@@ -133,7 +164,21 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
 
 @compiled
 def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
-    """Whether the tool comes no nearer to where it is to be: NOTICED or HELD; else 0."""
+    """Progress of the tool toward its target: HELD while the arm waits or moves along a way out,
+    NOTICED when the tool has come no nearer for STUCK_S, else 0.
+
+    With g = |target - tool| now and g_0 at `stuck_tick`, the tool makes progress if
+
+        g_0 - g > min(PROGRESS_SHARE g_0, PROGRESS_SPEED_SHARE max_speed STUCK_S)
+
+    and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
+    anew; so they are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved by
+    more than STUCK_TARGET_M.
+
+    HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
+    WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
+    ANOTHER_TARGET_M.
+    """
     state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
     gap = moved = 0.0
     for i in range(3):
@@ -158,7 +203,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
 @compiled
 def _is_outside(joints: Vector, parameters: Records) -> bool:
-    """Whether a joint (J,) [rad] is outside its limits."""
+    """True if a joint (J,) [rad] is outside its limits."""
     outside = False
     for j in range(len(joints)):
         outside = outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
@@ -167,8 +212,12 @@ def _is_outside(joints: Vector, parameters: Records) -> bool:
 
 @compiled
 def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
-    """Largest difference between measured and commanded joints, by `per_rad` [rad]; and the
-    measured speed of the tool [m/s], from the Jacobian at the commanded joints.
+    """Largest joint error [rad] and speed of the tool [m/s], as measured:
+
+        error = max_j |q_j - measured_j| / per_rad_j,   speed = |J_p measured_velocities|
+
+    q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
+    Jacobian there.
     """
     state, here = states[0], heres[0]
     error = speed = 0.0

@@ -1,6 +1,7 @@
-"""What a sample of the arm's joints is compared with: what an arm can have, and what this had.
+"""Plausibility of the arm's joint samples: within the joints' range, near the newest sample, and
+near the posture of an arm at rest.
 
-Tolerances are in rad; for a prismatic joint they are multiplied by `per_rad`, which gives metres.
+Tolerances are in rad. For a prismatic joint they are multiplied by `per_rad` [m/rad].
 """
 
 from __future__ import annotations
@@ -18,20 +19,26 @@ TURN = 2.0 * math.pi
 
 
 def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
-    """Joints (..., J) [rad], the continuous ones in the turn nearest to other joints (..., J)."""
+    """Joint positions (..., J) [rad], those of continuous joints shifted by whole turns to be the
+    nearest to the positions `near` (..., J).
+    """
     is_continuous = np.array(joints.every_kind) == "continuous"
     return position + np.where(is_continuous, TURN * np.rint((near - position) / TURN), 0.0)
 
 
 def still_ticks(settings: Settings) -> int:
-    """The ticks over which an arm must report one posture before it is believed."""
+    """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
     return math.ceil(round(ARM_STILL_S / settings.period_s, 6))
 
 
 @compiled
 def compared(states: Records, parameters: Records, position: Vector, velocity: Vector) -> tuple[bool, float, float]:
-    """Whether joints can be so [rad, rad/s]; how far one is off the newest sample, and off the
-    posture that was constant, both by `per_rad` [rad].
+    """Check of joint positions and velocities (J,) [rad, rad/s] against plausible ranges and known
+    ones.
+
+    Returns: true if every joint is within `plausible_joints` and not faster than MAX_JOINT_RADPS;
+    the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
+    Differences are divided by `per_rad`.
     """
     state, given, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
     for i in range(len(position)):
@@ -44,8 +51,8 @@ def compared(states: Records, parameters: Records, position: Vector, velocity: V
 
 @compiled
 def unwrap(states: Records, parameters: Records, position: Vector) -> None:
-    """Brings continuous joints (J,) [rad] to the turn nearest to where they were measured last, in
-    place: a state that wraps at ±pi then goes on as one that counts turns.
+    """Shift continuous joints (J,) [rad] by whole turns to be nearest to the newest sample, in
+    place. A driver that wraps at ±π and one that counts turns then give the same positions.
     """
     for i in range(len(position)):
         if parameters[0].is_continuous[i] and math.isfinite(position[i]):

@@ -1,4 +1,4 @@
-"""What is said of a position that is too far from the base plate to be meant."""
+"""Message about a position that is too far from the base plate to be a hand."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from service.core.intake.tuning import MAX_HAND_DISTANCE_M, PLAUSIBLE_DISTANCES_
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
-    """A position as it was reported, the unit that it looks to be in, and what is accepted.
+    """Message with the reported position, the unit that it is probably in, and the accepted
+    distance.
 
-    It was taken to be in `unit`; by which `rule`, if not by `[hands] unit`. Of the units that fit,
-    the one with the distance nearest to 1 m is named.
+    The position was read in `unit`, which `rule` states (by default, the setting `[hands] unit`).
+    Among the other units that give a plausible distance, the message names the one nearest to 1 m.
     """
     far = sum(v * v for v in position) ** 0.5
     meant = [

@@ -1,12 +1,13 @@
-"""A hand's position, velocity and acceleration from its tracker's samples, whatever the tracker's
-noise.
+"""Position, velocity, acceleration and stillness of each hand, estimated from its tracker's
+samples.
 
-An interacting-multiple-model filter (`mode_filter`) of three modes: rest, reach, change. They share
-one noise variance, estimated from the third differences of the samples: smooth motion leaves
-nothing in them, white noise of variance r leaves 20 r an axis.
+The estimator is an interacting-multiple-model filter (`mode_filter`) with the modes rest, reach and
+change. The modes share one measurement noise variance r, which is estimated from the third
+differences of the samples: smooth motion leaves almost nothing in them, and white noise of variance
+r leaves the variance 20 r on each axis.
 
-Stillness, 0 to 1, tells a hand that waits at a via-point from one on its way: it comes slowly and
-goes at once, and neither a tremor nor a turn on the way is still.
+Stillness, 0 to 1, distinguishes a hand that waits at a via-point from one on its way. It rises
+slowly and falls fast. A tremor does not lower it, and a turning point on the way hardly raises it.
 """
 
 from __future__ import annotations
@@ -40,19 +41,26 @@ from service.core.intake.tuning import (
     TICK_ROUNDING,
 )
 
-STILL = np.ones(2)  # both hands
-USUAL = HandSettings()  # of recordings, whose cell nobody knows
+STILL = np.ones(2)  # stillness of two hands that rest
+USUAL = HandSettings()  # default settings, for recordings without a cell's settings
 
 
 def smoothing(period_s: float, still_s: float) -> Vector:
-    """By how much (3,) the lowpass velocity, rising and falling stillness change in a period."""
+    """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
+    stillness: 1 - exp(-period / time constant).
+    """
     return 1.0 - np.exp(-period_s / np.array([STILLNESS_LOWPASS_S, still_s, STILLNESS_FALL_S]))
 
 
 @compiled
 def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpass: Vector, stillness: float) -> float:
-    """The stillness of a hand a period later, when it moves so (3,) [m/s]; `changes` are those of
-    `smoothing`, `lowpass` (3,) is its velocity without tremor, moved on too.
+    """Stillness s of a hand one period later, at the velocity v (3,) [m/s].
+
+    With the gains g of `smoothing` (`changes`), and the velocity without tremor u (`lowpass`, (3,),
+    updated in place):
+
+        u = u + g_0 (v - u),   n = exp(-(|u| / still_speed)⁴)
+        s = s + (g_1 if n > s else g_2) (n - s)
     """
     square = 0.0
     for axis in range(3):
@@ -65,7 +73,7 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
 
 
 def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUAL) -> Vector:
-    """The stillness (T, 2) of both hands that moved so (T, 6) [m/s], from stillness."""
+    """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
     out, stillness = np.empty((len(velocities), 2)), STILL.copy()
     changes, lowpass, speed = smoothing(period_s, hands.still_s), np.zeros((2, 3)), float(hands.still_speed)
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
@@ -75,17 +83,20 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
     return out
 
 
-LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # clocks: in their first second, not steady, steady
+LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # a tracker's clock: in its first window, not trusted, trusted
 
 
 class HandEstimator:
-    """The estimates of both hands, in the state's arrays."""
+    """Estimates of both hands; all that is estimated is kept in the state's arrays."""
 
     def __init__(self, hands: HandSettings, period_s: float, models: Records) -> None:
         self._hands, self._period_s, self._models = hands, period_s, models
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
+        """Transition, process noise and the gains of `smoothing` over an interval of some ticks,
+        and the speed of a still hand, as one record (1,).
+        """
         transition, noise = model(ticks * self._period_s)
         changed = smoothing(ticks * self._period_s, self._hands.still_s)
         return parameters(
@@ -93,19 +104,28 @@ class HandEstimator:
         )
 
     def begin(self, state: Record) -> None:
-        """Sets what no sample has reported yet."""
+        """Set the estimates that hold before the first sample: noise variance and stillness."""
         state["noise_variance"] = self._hands.noise_std_m**2
         state["hand_stillness"] = STILL
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
-        """Moves both hands on by some ticks; one that is not seen stands still."""
+        """Advance both hands by some ticks. A hand without a sample for `stale_ticks` is assumed to
+        stand still.
+        """
         _advance_both(as_array(state), stale_ticks, self._model(ticks), self._models, self._period_s)
 
 
 @compiled
 def _update_noise(states: Records, side: int, position: Vector, interval_s: float) -> None:
-    """The noise variance after one more sample; samples after a gap are compared with no earlier
-    ones.
+    """Update the noise variance r [m²] of one hand by a sample x_0 (3,) [m] that follows x_1, x_2,
+    x_3:
+
+        d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, NOISE_SAMPLES)
+        r = r + (min(|d|² / 60, NOISE_OUTLIER_SHARE r) - r) / (n + 1)
+
+    60 = 3 axes * (1 + 9 + 9 + 1). r is limited to LEAST_NOISE_M² ... MAX_NOISE_M². Only evenly
+    spaced samples are used: when an interval differs by more than half from the one before, this
+    sample and the next do not change r.
     """
     state, past = states[0], states[0].past_samples[side]
     count, variance = state.even_samples[side], state.noise_variance[side]
@@ -132,6 +152,10 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
 
 @compiled
 def _advance_both(states: Records, stale_ticks: int, one: Records, models: Records, period_s: float) -> None:
+    """Advance modes, estimate and stillness of both hands to the current tick. `one` (1,) is the
+    record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
+    stands still: its velocity, acceleration and tremor are set to zero.
+    """
     state, over = states[0], one[0]
     state.response_s = _response_s(states, period_s)
     for side in range(2):
@@ -148,7 +172,12 @@ def _advance_both(states: Records, stale_ticks: int, one: Records, models: Recor
 
 @compiled
 def look_ahead(states: Records, models: Records, side: int) -> None:
-    """Into the state's estimate (3, 3) where a hand is by now, by its newest sample."""
+    """Extrapolate one hand to the current tick: x = Σ_j μ_j O_j m_j, written to `hands` (3, 3) of
+    the state, by position, velocity and acceleration.
+
+    μ_j and m_j (3, 3) are probability and mean of mode j after the newest sample, O_j (3, 3) is
+    `onward` of `motion_model.models` for the time since then.
+    """
     state, estimate = states[0], states[0].hands[side]
     at = slot(states, side, 0)
     means, modes = state.kept_means[side, at], state.kept_probabilities[side, at]
@@ -164,14 +193,18 @@ def look_ahead(states: Records, models: Records, side: int) -> None:
 
 @compiled
 def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
-    """Whether a hand has been seen, and lately enough."""
+    """True if a sample of this hand arrived less than `stale_ticks` ago."""
     seen = states[0].hand_ticks[side]
     return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
 
 
 @compiled
 def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> bool:
-    """Whether a hand that is seen again may have come there (3,) [m], as the filter has it."""
+    """True if a hand that is seen again at x (3,) [m] continues its filter: its newest sample is
+    less than `unseen_ticks` old, and |x - p|² < REAPPEARED_VARIANCE_SHARE (P + r).
+
+    p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
+    """
     state, square = states[0], 0.0
     for axis in range(3):
         square += (position[axis] - state.hands[side, 0, axis]) ** 2
@@ -181,12 +214,16 @@ def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> 
 
 @compiled
 def _response_s(states: Records, period_s: float) -> float:
-    """In which time the filter follows a change of motion, of the hand that its tracker shows worse
-    [s]: for a Wiener process of jerk, (noise variance x interval / intensity)^(1/6).
+    """Time [s] in which the filter follows a change of motion: (r Δ / q)^(1/6), the larger one of
+    both hands.
+
+    r is the noise variance [m²], Δ the mean interval of the retained samples [s], at most
+    MAX_LATE_S, and q the intensity of the mode CHANGE [m²/s⁵]. The form is that of the steady-state
+    filter of a Wiener process of acceleration.
     """
     state, slowest = states[0], 0.0
     for side in range(2):
-        more = max(state.kept[side] - 1, 0)  # of them, so that an interval in which one is late counts little
+        more = max(state.kept[side] - 1, 0)  # many intervals are averaged, so that one late sample matters little
         if more > 0:
             passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
             each_s = min(passed * period_s / more, MAX_LATE_S)
@@ -196,7 +233,11 @@ def _response_s(states: Records, period_s: float) -> float:
 
 @compiled
 def turn_to(states: Records, side: int, turn: tuple[float, float, float, float], frame: Vector) -> None:
-    """Takes in a quaternion x y z w of a hand, by the tracker's axes in its unit (3, 4)."""
+    """Store the orientation of one hand as a rotation matrix in frame base, row by row.
+
+    `turn` is the quaternion x y z w in the tracker's axes. `frame` (3, 4) maps the tracker's
+    coordinates to base: rotation times unit [m], and origin.
+    """
     (x, y, z, w), out = turn, states[0].hand_turns[side]
     s, matrix = 2.0 / (x * x + y * y + z * z + w * w), np.empty((3, 3))
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
@@ -212,14 +253,18 @@ def turn_to(states: Records, side: int, turn: tuple[float, float, float, float],
 
 @compiled
 def seconds_after(stamp_ns: int, other_ns: int) -> float:
-    """How much later a stamp is than another one [s], whatever both are."""
+    """Difference `stamp_ns` - `other_ns` in seconds, without overflow for any two stamps."""
     apart_ns = float(stamp_ns) - float(other_ns)
     return 1e-9 * (float(stamp_ns - other_ns) if abs(apart_ns) < MAX_STAMP_DIFFERENCE_NS else apart_ns)
 
 
 @compiled
 def _later_s(states: Records, side: int, quickest: int, stamp_ns: int, period_s: float) -> float:
-    """How much later a sample comes than the quickest of this second (0) or the last (1) [s]."""
+    """Delay [s] of a sample that arrives now, minus the minimum delay of the current window
+    (`quickest` = 0) or the one before (1).
+
+    A delay is arrival time minus stamp; the unknown offset of the tracker's clock cancels.
+    """
     state = states[0]
     passed_s = (state.tick - state.quickest_ticks[side, quickest]) * period_s
     return float(passed_s - seconds_after(stamp_ns, state.quickest_stamps_ns[side, quickest]))
@@ -227,8 +272,8 @@ def _later_s(states: Records, side: int, quickest: int, stamp_ns: int, period_s:
 
 @compiled
 def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> int:
-    """How many whole ticks later a sample comes than the quickest ones; 0 by a clock that is not
-    believed.
+    """Whole ticks by which a sample's delay exceeds the smaller minimum delay of the last two
+    windows, at most MAX_LATE_S; 0 while the tracker's clock is not trusted.
     """
     if states[0].clock[side] != BELIEVED:
         return 0
@@ -238,7 +283,14 @@ def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> in
 
 @compiled
 def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh: bool) -> None:
-    """Remembers how late a sample came; a clock set back over a silence is another one."""
+    """Update the minimum delays of one tracker by a sample that arrives now, and the trust in its
+    clock.
+
+    Every DELAY_WINDOW_S, the clock is trusted if the minimum delays of two consecutive windows
+    agree within DELAY_TOLERANCE_S. Learning restarts with the first sample, and with one that
+    arrives after a silence (not `fresh`) more than MAX_LATE_S above the minimum delay: the clock
+    was set back.
+    """
     state = states[0]
     stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
     known = state.clock_tick[side] >= 0
@@ -258,13 +310,13 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
 
 @compiled
 def slot(states: Records, side: int, order: int) -> int:
-    """Where in its ring a hand's sample is."""
+    """Index in a hand's ring of its sample number `order`; 0 is the newest."""
     return int((states[0].kept_newest[side] - order) % KEPT)
 
 
 @compiled
 def order_of(states: Records, side: int, stamp_ns: int) -> int:
-    """How many kept samples have a newer stamp than this; -1: one has the same."""
+    """Number of retained samples with a newer stamp than this; -1 if one has the same stamp."""
     state = states[0]
     for order in range(state.kept[side]):
         kept_ns = state.kept_stamps_ns[side, slot(states, side, order)]
@@ -284,8 +336,11 @@ def take(
     restarts: bool,
     fresh: bool,
 ) -> None:
-    """Filters in a sample (3,) [m] of one hand that is the newest and was made now; with one that
-    `restarts`, or of a hand that was not `fresh`, the filter begins anew.
+    """Filter a sample (3,) [m] of one hand that has the newest stamp and arrived without extra
+    delay.
+
+    The filter starts anew if the sample `restarts` it (a confirmed jump), or if no sample is
+    retained. `fresh` is false after a silence; see `note_clock`.
     """
     state, period_s = states[0], parameters[0].period_s
     note_clock(states, side, stamp_ns, period_s, fresh)
@@ -302,7 +357,11 @@ def take(
 
 @compiled
 def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool) -> None:
-    """Filters in a kept sample, with the filter as of when that was made, and keeps it so."""
+    """Filter the retained sample at ring index `at`, and store the filter's state beside it.
+
+    The filter must have been advanced to the sample's tick. `anew` starts it from this sample
+    alone.
+    """
     state, position = states[0], states[0].kept_positions[side, at]
     means, covariances = state.mode_means[side], state.mode_covariances[side]
     if anew:
@@ -318,7 +377,7 @@ def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool
 
 @compiled
 def _remember(states: Records, side: int, at: int) -> None:
-    """Keeps the filter as it is, in all its parts."""
+    """Store the complete state of one hand's filter at ring index `at`, for `late_samples`."""
     state = states[0]
     state.kept_means[side, at] = state.mode_means[side]
     state.kept_covariances[side, at] = state.mode_covariances[side]

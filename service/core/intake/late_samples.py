@@ -1,12 +1,15 @@
-"""When a hand's sample was made, by its stamp: in which tick, and between which of those before it.
+"""Late and overtaken samples of a hand: the tick in which each was made, and their filtering at
+that tick.
 
-A tracker's clock is another machine's, so its stamps tell how much later one sample comes than
-another. The quickest of the last one to two seconds were made when they came; one that comes later
-than these was made as much earlier. A clock is gone by while the quickest of each second are of one
-mind; that of no other is known, and its samples are made when they come. Of samples that overtook
-each other the stamps' order counts, whatever the clock.
+A tracker's clock is that of another machine, so its stamps only show how much longer the delay of
+one sample is than that of another. Samples with the minimum delay of the last one to two seconds
+are taken to be made when they arrive; a sample with a longer delay was made earlier by the
+difference. A tracker's clock is trusted while the minimum delays of consecutive seconds agree.
+While it is not trusted, samples are taken to be made when they arrive. Samples that overtook each
+other are always put in the order of their stamps.
 
-The newest `KEPT` samples of each hand are kept in rings; `order` counts back from the newest, 0.
+The newest KEPT samples of each hand are retained in rings, each with the state of the filter after
+it. `order` counts them backward from the newest, which is 0.
 """
 
 from __future__ import annotations
@@ -23,8 +26,11 @@ from service.core.intake.tuning import LONE_SAMPLE_S, TICK_ROUNDING
 
 @compiled
 def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, period_s: float) -> int:
-    """The tick as of which a sample of this order is to be taken: not before the one before it, nor
-    after the one behind it.
+    """Tick in which a sample of this `order` was made, between the ticks of its neighbours by
+    stamp.
+
+    It is the current tick minus `late`. For a sample that was overtaken (`order` > 0) by a clock
+    that is not trusted, it is the newest sample's tick minus the difference of the stamps.
     """
     state = states[0]
     tick = state.tick - late
@@ -41,8 +47,12 @@ def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, 
 
 @compiled
 def expected(states: Records, models: Records, side: int, order: int, tick: int, out: Vector) -> None:
-    """Where a hand was in a tick (3,) [m], by the samples up to one of this order; before the first
-    of all, where that was.
+    """Predicted position of a hand at a tick, p = Σ_j μ_j F_j[0, :3] m_j, written to `out` (3,)
+    [m].
+
+    μ_j, m_j are probability and mean of mode j after retained sample number `order`, F_j is the
+    transition since then. For a sample older than all retained ones, p is the oldest one's
+    position.
     """
     state = states[0]
     if order == 0 and tick == state.tick:
@@ -63,7 +73,10 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
 
 @compiled
 def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, position: Vector, restarts: bool) -> None:
-    """Keeps a sample (3,) [m] among the others; with one that `restarts` the filter begins anew."""
+    """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
+    filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
+    them again.
+    """
     state = states[0]
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
@@ -91,8 +104,11 @@ def take_late(
     position: Vector,
     restarts: bool,
 ) -> None:
-    """Filters in a sample (3,) [m] of one hand as of the tick in which it was made, and again all
-    that are newer. Those before one that `restarts` count no more.
+    """Filter a sample (3,) [m] of one hand at the tick in which it was made.
+
+    The filter is restored to its state after the next older sample. The new sample and all newer
+    ones are then filtered in the order of their stamps, and the filter is advanced to the current
+    tick. If the sample `restarts` the filter (a confirmed jump), it starts from this sample alone.
     """
     state, given = states[0], parameters[0]
     order, kept = order_of(states, side, stamp_ns), state.kept[side]
@@ -116,6 +132,7 @@ def take_late(
 
 @compiled
 def _move_on(means: Vector, covariances: Vector, models: Records, ticks: int) -> None:
+    """Advance all modes by some ticks; 0 ticks change nothing."""
     if ticks > 0:
         over = models[min(ticks, len(models) - 1)]
         advance(means, covariances, over.transition, over.noise)
@@ -123,7 +140,7 @@ def _move_on(means: Vector, covariances: Vector, models: Records, ticks: int) ->
 
 @compiled
 def _recall(states: Records, side: int, at: int) -> None:
-    """The filter as it was kept."""
+    """Restore one hand's filter to the state stored at ring index `at`."""
     state, noise = states[0], states[0].kept_noise[side, at]
     state.mode_means[side] = state.kept_means[side, at]
     state.mode_covariances[side] = state.kept_covariances[side, at]
@@ -134,8 +151,8 @@ def _recall(states: Records, side: int, at: int) -> None:
 
 
 def lateness_ms(state: Record, side: int, period_s: float) -> tuple[float, float] | None:
-    """How much later than the quickest a hand's newest samples came, mean and 95 % [ms]; None:
-    nobody knows.
+    """Delay of a hand's retained samples above the minimum delay, mean and 95th percentile [ms];
+    None while the tracker's clock is not trusted.
     """
     if state["clock"][side] != BELIEVED or not state["kept"][side]:
         return None

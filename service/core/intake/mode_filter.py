@@ -1,17 +1,21 @@
-"""The interacting-multiple-model filter of a hand (Blom and Bar-Shalom, IEEE TAC 33(8), 1988):
-started, moved on, and given a sample.
+"""Interacting-multiple-model filter of one hand (Blom and Bar-Shalom, IEEE TAC 33(8), 1988).
 
-A hand rests, reaches, or changes its way. Each mode is a Kalman filter of position, velocity and
-acceleration (`motion_model`). One that rests or reaches trembles too: an oscillation that its
-samples show and that is no part of its motion. Who changes their way does not, as a change would be
-taken for tremor at first. One that rests is slow. Its speed and tremor are bounded: without that a
-mode that expects most to happen within one sample would win in the quickest motion, which none
-explains. Only who has become slow comes to rest, with what was known of its motion and that it is
-slow. Who leaves rest begins with all that the samples showed.
+A hand rests, reaches, or changes its motion. Each mode is a Kalman filter with the linear system of
+`motion_model`: position p, velocity v, acceleration a, tremor y and its velocity w. A sample
+measures p + y; tremor is seen by the tracker but is no part of the hand's motion.
 
-Arrays of one hand: means (MODES, STATES, 3), by mode, then position, velocity, acceleration, tremor
-and its velocity, by axis [m, m/s, m/s²]; covariances (MODES, STATES, STATES), alike for the axes;
-probabilities (MODES,).
+Three rules are added to the published filter:
+
+* The mode CHANGE has no tremor (σ = 0), because the beginning of a change would otherwise be
+  explained as tremor.
+* A resting hand is slow and its tremor is bounded (`_beyond_rest`). No mode explains the fastest
+  motions; without the bound, the mode that allows the largest change between two samples wins.
+* A hand enters REST only when it is slow (`_switched`), conditioned on being slow
+  (`_come_to_rest`). On leaving REST, its tremor becomes motion (`_leave_rest`).
+
+Arrays of one hand: `means` (MODES, STATES, 3) hold (p, v, a, y, w) of each mode, by axis [m, m/s,
+m/s², m, m/s]; `covariances` (MODES, STATES, STATES) are shared by the three axes; `modes` (MODES,)
+are the probabilities of the modes. All functions change them in place.
 """
 
 from __future__ import annotations
@@ -43,7 +47,13 @@ from service.core.intake.tuning import (
 
 @compiled
 def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
-    """A hand of which one sample (3,) [m] is known."""
+    """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
+
+        mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², σ_a², σ², (ω σ)²)
+
+    with σ_v = START_SPEED_STD_MPS, σ_a = START_ACCELERATION_STD_MPS2 and the mode's tremor σ. The
+    probabilities are MODE_PRIOR.
+    """
     means[:] = 0.0
     covariances[:] = 0.0
     for mode in range(MODES):
@@ -58,12 +68,14 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
 
 @compiled
 def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
-    """All modes moved on: m = F m, P = F P F' + Q, each by its own F and Q."""
+    """Prediction of all modes: m = F m, P = F P Fᵀ + Q, with each mode's `transition` F and `noise`
+    Q, both (MODES, STATES, STATES). F has a motion block (3, 3) and a tremor block (2, 2).
+    """
     moved, product = np.empty((STATES, 3)), np.empty((STATES, STATES))
     for mode in range(MODES):
         mean, covariance, over = means[mode], covariances[mode], transition[mode]
         for row in range(STATES):
-            first, end = (0, 3) if row < 3 else (3, STATES)  # motion and tremor do not drive each other
+            first, end = (0, 3) if row < 3 else (3, STATES)  # F is block-diagonal: motion and tremor
             for column in range(STATES):
                 p = 0.0
                 for k in range(first, end):
@@ -86,7 +98,9 @@ def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vecto
 
 @compiled
 def _tremble(mean: Vector, covariance: Vector, mode: int) -> None:
-    """Nothing is known yet of the tremor of a hand of this mode."""
+    """Reset the tremor of one mode to its stationary distribution: mean 0, variances σ² of y and (ω
+    σ)² of w, uncorrelated with the motion.
+    """
     mean[3:] = 0.0
     covariance[3:, :] = 0.0
     covariance[:, 3:] = 0.0
@@ -95,7 +109,9 @@ def _tremble(mean: Vector, covariance: Vector, mode: int) -> None:
 
 @compiled
 def _come_to_rest(mean: Vector, covariance: Vector) -> None:
-    """A mode of motion, known to be slow: so are its velocity and its acceleration."""
+    """Condition a moving mode on being slow: a Kalman update by v = 0 with standard deviation
+    REST_SPEED_STD_MPS, then by a = 0 with REST_ACCELERATION_STD_MPS2.
+    """
     for known in range(1, 3):
         spread = REST_SPEED_STD_MPS if known == 1 else REST_ACCELERATION_STD_MPS2
         row_of = covariance[known, :3].copy()
@@ -111,7 +127,9 @@ def _come_to_rest(mean: Vector, covariance: Vector) -> None:
 
 @compiled
 def _leave_rest(mean: Vector, covariance: Vector) -> None:
-    """The mode of rest as one of motion: all that was seen is."""
+    """Turn the tremor of the mode REST into motion: p = p + y and v = v + w, in mean and
+    covariance. The samples showed both, so the filter restarts from the unsmoothed state.
+    """
     for row in range(2):
         for axis in range(3):
             mean[row, axis] += mean[row + 3, axis]
@@ -124,8 +142,15 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 @compiled
 def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector) -> None:
-    """The probabilities (MODES, MODES) that a hand was of the first mode and is of the second an
-    interval later; it comes to rest when it is slow.
+    """Joint probabilities s (MODES, MODES), written to `shares`, of mode i before an interval Δ and
+    mode j after it:
+
+        s_ij = μ_i ((1 - exp(-λ_i Δ)) ρ_j + δ_ij exp(-λ_i Δ))
+
+    μ are the probabilities `modes`, λ is MODE_SWITCH_RATES_PER_S, ρ is MODE_PRIOR. The transition
+    from a moving mode i to REST is weighted by how slow that mode is; s_ii keeps the rest:
+
+        slow_i = exp(-½ min(|v_i|² / (P_i[v, v] + REST_SPEED_STD_MPS²), MAX_INNOVATION))
     """
     for i in range(MODES):
         stay = math.exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
@@ -144,7 +169,16 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
 
 @compiled
 def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -> None:
-    """Each mode mixed of all, by those shares: the modes' probabilities (MODES,) are `expected`."""
+    """Mixed initial condition of each mode j from the `shares` s (MODES, MODES) of `_switched`, in
+    place; the predicted probabilities c (MODES,) are written to `expected`.
+
+        c_j = Σ_i s_ij,   m_j = Σ_i s_ij m_ij / c_j
+        P_j = Σ_i s_ij (P_ij + Σ_axes (m_ij - m_j)(m_ij - m_j)ᵀ / 3) / c_j
+
+    m_ij and P_ij are those of mode i; for i ≠ j, after `_come_to_rest` (j = REST) or `_leave_rest`
+    (i = REST), and with the tremor of mode j reset. Of each P_j, only the upper triangle is
+    computed.
+    """
     of_means, of_covariances = np.empty((MODES, MODES, STATES, 3)), np.empty((MODES, MODES, STATES, STATES))
     for j in range(MODES):
         for i in range(MODES):
@@ -177,7 +211,13 @@ def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -
 
 @compiled
 def _beyond_rest(mean: Vector) -> float:
-    """By how much a hand is faster, and trembles more, than one that rests: squared, normalised."""
+    """Squared, normalised excess of the speed and tremor of the mode REST over their bounds:
+
+        max(|v|² - v_max², 0) / σ_v² + max(|y|² + |w|² / ω² - y_max², 0) / σ²
+
+    with v_max = REST_MAX_SPEED_MPS, σ_v = REST_SPEED_STD_MPS, y_max = MAX_TREMOR_M and the tremor's
+    σ.
+    """
     speed = tremor = 0.0
     for axis in range(3):
         speed += mean[1, axis] ** 2
@@ -190,8 +230,16 @@ def _beyond_rest(mean: Vector) -> float:
 def update(
     means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, interval_s: float
 ) -> None:
-    """One sample (3,) [m] of a noise variance [m²] filtered in: modes mixed over the interval, each
-    updated, weighed by its likelihood.
+    """Posterior of all modes after a sample z (3,) [m] with noise variance r [m²], `interval_s`
+    after the sample before. The modes must have been advanced to the time of the sample.
+
+    The modes are mixed (`_switched`, `_mix`), then each is updated with H = [1, 0, 0, 1, 0]:
+
+        S = H P Hᵀ + r,   K = P Hᵀ / S,   m = m + K (z - H m),   P = P - K S Kᵀ
+        log L = -3/2 log S - ½ min(|z - H m|² / S, MAX_INNOVATION),   μ_j ∝ c_j L_j
+
+    The innovation in log L is that before the update. For REST, log L is reduced by half of
+    `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY and are rounded.
     """
     shares, expected, likelihood, seen = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES), np.empty(STATES)
     _switched(means, covariances, modes, interval_s, shares)
@@ -202,7 +250,7 @@ def update(
         for row in range(STATES):
             for column in range(row):
                 p[row, column] = p[column, row]
-            seen[row] = p[row, 0] + p[row, 3]  # a sample shows position and tremor
+            seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
         variance, square = seen[0] + seen[3] + noise, 0.0
         for axis in range(3):
             innovation = position[axis] - mean[0, axis] - mean[3, axis]
@@ -229,6 +277,7 @@ def update(
 
 @compiled
 def _normalise(modes: Vector) -> None:
+    """Divide the probabilities (MODES,) by their sum, in place."""
     total = 0.0
     for i in range(MODES):
         total += modes[i]

@@ -1,12 +1,20 @@
-"""How a hand moves on over an interval: transition and process noise of the estimator's modes.
+"""Motion of a hand over an interval: transition and process noise of the hand filter's modes.
 
-Acceleration and velocity revert to 0, and tremor is a damped oscillation beside them:
+The filter has MODES = 3 modes, REST, REACH and CHANGE. Each describes every axis by the same linear
+system with STATES = 5 states: position p [m], velocity v [m/s], acceleration a [m/s²], tremor y [m]
+and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each other:
 
-    dx = v dt    dv = a dt    da = -REVERT_A a dt - REVERT_V v dt + sqrt(intensity) dW
-    dy = w dt    dw = -TREMOR_RATE² y dt - 2 TREMOR_DAMPING TREMOR_RATE w dt + ... dW
+    dp = v dt,   dv = a dt,   da = (-k_v v - k_a a) dt + sqrt(q) dW1
+    dy = w dt,   dw = (-ω² y - 2 ζ ω w) dt + sqrt(4 ζ ω³ σ²) dW2
 
-Against that samples are weighed. For KEPT_ON_S after the newest one a hand in motion keeps its
-velocity, and its acceleration fades: that its motion will end would say too early that it does.
+Velocity and acceleration revert to zero by k_v (MODE_VELOCITY_REVERSIONS_PER_S2) and k_a
+(MODE_ACCELERATION_REVERSIONS_PER_S); q is MODE_INTENSITIES [m²/s⁵]. These three and the tremor's
+stationary standard deviation σ (TREMOR_STDS_M) differ between the modes; ω = TREMOR_RATE_PER_S and
+ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
+
+The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
+sample, a hand that reaches or changes keeps its velocity while its acceleration fades. The
+reversion to zero would report the end of a motion too early.
 """
 
 from __future__ import annotations
@@ -29,13 +37,20 @@ from service.core.intake.tuning import (
     VELOCITY_KEPT_S,
 )
 
-REST, REACH, CHANGE = range(MODES)  # the modes
+REST, REACH, CHANGE = range(MODES)  # a hand rests, reaches, or changes its motion
 
 
 @functools.cache
 def models(period_s: float, count: int) -> Records:
-    """A `transition` and a process `noise` each, of all modes, over 0 to count - 1 periods; and
-    `onward`, the motion since the newest sample.
+    """Transition, process noise and extrapolation of all modes over 0 to `count` - 1 periods.
+
+    Record n holds, for the interval t = n `period_s`, `transition` F(t) and `noise` Q(t) as `model`
+    computes them, and `onward` (MODES, 3, 3), which extrapolates (p, v, a) from the newest sample.
+    With h = min(t, VELOCITY_KEPT_S) and e = ACCELERATION_FADE_PER_S:
+
+        onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -e]]
+
+    For REST, onward = F(t)[:3, :3].
     """
     kinds = [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")]
     out = structured(count, [*kinds, ("onward", np.float64, (MODES, 3, 3))])
@@ -51,7 +66,15 @@ def models(period_s: float, count: int) -> Records:
 
 
 def model(interval_s: float) -> tuple[Vector, Vector]:
-    """Transitions and process noise (MODES, STATES, STATES) of the modes over an interval."""
+    """Transition F and process noise Q, both (MODES, STATES, STATES), over an interval t.
+
+    Both are block-diagonal, with a motion block (3, 3) and a tremor block (2, 2):
+
+        F = expm(A t),   A = [[0, 1, 0], [0, 0, 1], [0, -k_v, -k_a]]  or  [[0, 1], [-ω², -2 ζ ω]]
+        Q = c ∫ expm(A s) e eᵀ expm(A s)ᵀ ds,  s = 0 ... t,   c = q  or  4 ζ ω³ σ²
+
+    where e is the unit vector of the block's last state (acceleration or tremor velocity).
+    """
     transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
     dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE_PER_S**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S]])
     trembles, driven = _over(dynamics, interval_s)
@@ -66,13 +89,19 @@ def model(interval_s: float) -> tuple[Vector, Vector]:
 
 
 def _motion(revert_v: float, revert_a: float) -> Vector:
-    """How position, velocity and acceleration change (3, 3)."""
+    """Dynamics A (3, 3) of position, velocity and acceleration: [[0, 1, 0], [0, 0, 1], [0, -k_v,
+    -k_a]].
+    """
     return np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -revert_v, -revert_a]])
 
 
 def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:
-    """The transition (N, N), and the noise (N, N) when the last state is driven by unit intensity
-    (Van Loan, 1978).
+    """Transition F (N, N) over an interval, and the covariance Q (N, N) of white noise of unit
+    intensity that drives the last state.
+
+    One matrix exponential gives both (Van Loan, IEEE TAC 23(3), 1978), with E = e eᵀ:
+
+        expm([[-A, E], [0, Aᵀ]] t) = [[..., F⁻¹ Q], [0, Fᵀ]]
     """
     n = len(dynamics)
     whole = np.zeros((2 * n, 2 * n))
@@ -83,5 +112,5 @@ def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:
 
 
 def _to_digits(matrix: Vector) -> Vector:
-    """To 12 digits, as LAPACK's last ones are another CPU's."""
+    """Round to 12 significant digits, because the last ones of LAPACK differ between CPUs."""
     return np.array([[float(f"{value:.11e}") for value in row] for row in matrix])

@@ -1,21 +1,23 @@
-"""What a source tells, against what it told before: stamps, jumps, and a second source that
-contradicts it. One rule for both hands and the arm:
+"""Plausibility of samples, compared with earlier ones: stamps, jumps, swapped hands, and a second
+source that contradicts the first. The rules are the same for both hands and for the arm:
 
-* A stamp must be another than those before, no older than the newest by more than `LATE_S` (the
-  arm's, newer than that), and no farther ahead of it than the time since then plus the time after
-  which the source is silent. Silence is judged by arrival; after it any stamp is taken, but the
-  same again.
-* Where a sample cannot come from what was known it has jumped. A hand's jump is believed once
-  `CONFIRMED` samples in a row, over `CONFIRMED_S` at least, agree with each other; the arm's never,
-  before it was silent: it has a body.
-* A hand that comes to where the other one was, which is not seen there any more, has not moved: its
-  tracker takes one for the other. That is believed after `hands.swapped_s`, as it may have put
-  itself right.
-* A source is contested from when a quarter of what it told within about a second contradicts the
-  rest, until that is less than a tenth. The arm's contradict that jumped; a hand's, that go to and
-  fro between two places, or jumped as far and the same way as the last that did, with others
-  between: one tracker's jumps do not go on from each other. It is also contested while a hand's
-  samples scatter more than any tracker's, as those of two that are some centimetres apart do.
+* A stamp differs from the newest one. It is at most MAX_LATE_S older than the newest one (the arm's
+  stamps must increase), and is ahead of it by at most the time since the newest sample arrived plus
+  the time after which the source is silent. Silence is judged by arrival; after a silence, any
+  stamp but the newest one is accepted.
+* A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
+  jump is accepted once CONFIRMED_SAMPLES successive samples, over at least CONFIRMED_S, agree with
+  each other. A jump of the arm is accepted only after a silence, because an arm cannot jump.
+* A hand that appears where the other hand was, while that one is no longer seen there, is taken for
+  the other one: the tracker has swapped them. The new position is accepted after `hands.swapped_s`,
+  within which the tracker may correct itself.
+* A source is contested when at least CONTESTED_ON_SHARE of its samples within about
+  CONTESTED_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
+  arm, these are samples that jumped. For a hand, they alternate between two positions, or they
+  jumped by the same offset as the last one that jumped, with accepted samples between them; the
+  jumps of a single tracker do not repeat an offset. A hand is also contested while its samples
+  scatter more than those of any tracker, as do samples of two trackers whose positions differ by
+  some centimetres.
 """
 
 from __future__ import annotations
@@ -45,9 +47,12 @@ from service.core.intake.tuning import (
 
 @compiled
 def is_of_another(states: Records, parameters: Records, side: int, position: Vector, expected: Vector) -> bool:
-    """Whether a hand's sample (3,) [m] that jumped is one more of another source: where it was
-    `expected`, samples came since the last one that jumped, which was as far from them. Those that
-    jump in a row are of one kind.
+    """True if a hand's sample (3,) [m] that jumped comes from a second source; records the jump.
+
+    Its offset from the `expected` position (3,) must equal that of the last sample that jumped,
+    within OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * elapsed time, and that sample must be less than
+    `stale_ticks` old. Between the two, a sample was accepted; in a row of successive jumps, the
+    decision about the first one holds for all.
     """
     state, given, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
@@ -61,8 +66,11 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
 
 @compiled
 def is_swapped(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample (3,) [m], the first after a silence, is the other hand's, or goes on
-    from samples that were.
+    """True if a hand's sample (3,) [m] is rejected as the other hand's. It is the first one after a
+    silence, or follows samples that were rejected as swapped.
+
+    After a silence shorter than `swapped_s`, the sample is the other hand's if it is where that one
+    was (`_is_at_other`). Later samples that continue it are rejected until `swapped_s` has passed.
     """
     state, given = states[0], parameters[0]
     is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
@@ -77,7 +85,12 @@ def is_swapped(states: Records, parameters: Records, side: int, position: Vector
 
 @compiled
 def is_confirmed(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample (3,) [m] that jumped is to be believed, by those just before it."""
+    """True if the jump of a hand to a position (3,) [m] is accepted; counts successive samples that
+    agree.
+
+    Accepted are at least CONFIRMED_SAMPLES samples that agree over CONFIRMED_S; over `swapped_s` if
+    the hand jumped to where the other one was, and that one has not been seen since.
+    """
     state, given = states[0], parameters[0]
     if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
         state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
@@ -94,7 +107,12 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
 
 @compiled
 def _is_at_other(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a hand's sample is where the other hand was, and not where this one was."""
+    """True if a hand's sample (3,) [m] is near the other hand's estimate, and nearer to it than
+    half the distance between the hands.
+
+    Near is within SWAPPED_M + SWAPPED_MPS * the time since the other hand was seen, at most
+    `swapped_s`.
+    """
     state, given = states[0], parameters[0]
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
@@ -104,7 +122,9 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
 
 @compiled
 def _goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
-    """Whether a sample is where a hand can be that was at the newest one that jumped."""
+    """True if a sample (3,) [m] agrees with the newest sample that jumped: it is less than
+    `stale_ticks` later and within AGREE_M + AGREE_MPS * elapsed time.
+    """
     state, given = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
     near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * given.period_s
@@ -113,6 +133,7 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
 
 @compiled
 def _distance(a: Vector, b: Vector) -> float:
+    """Distance [m] between two points (3,)."""
     square = 0.0
     for axis in range(3):
         square += (a[axis] - b[axis]) ** 2
@@ -121,8 +142,11 @@ def _distance(a: Vector, b: Vector) -> float:
 
 @compiled
 def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
-    """Whether lately, before one of this order, another sample was so far (3,) [m] from those
-    around it: a second source is there again, where one tracker's mistake is another each time.
+    """True if an earlier sample deviated by about the same `offset` (3,) [m] from its neighbours.
+
+    The last RETURN_SAMPLES retained samples before number `order` are checked. The deviation of a
+    sample is x_k - (x_(k-1) + x_(k+1)) / 2; it may differ from the offset by SOURCE_SPREAD_SHARE
+    |offset|. A second source repeats its offset, the outliers of one tracker do not.
     """
     state, around = states[0], np.empty((3, 3))
     for before in range(order + 2, min(order + RETURN_SAMPLES, state.kept[side] - 1)):
@@ -136,8 +160,13 @@ def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
 
 @compiled
 def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> bool:
-    """Whether a sample (3,) [m], and the three before it, whose newest is of this order, go to and
-    fro between two places, however uneven their intervals.
+    """True if four samples alternate between two positions: a new one (3,) [m], and the three
+    before it, whose newest has number `order`. Their intervals may be uneven.
+
+    For one of the TO_AND_FRO_PATTERNS, which assign the samples to two sources, samples of
+    different sources are at least SOURCES_APART_M apart, and those of one source differ by at most
+    SOURCE_SPREAD_SHARE of the smallest distance between the sources. A pattern with one sample of
+    the second source also requires that this source was seen before (`_returns`).
     """
     samples = np.empty((4, 3))
     samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
@@ -153,6 +182,6 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
                 else:
                     apart = min(apart, square)
         if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
-            odd = 1 if places == 0b0010 else 2 if places == 0b0100 else 0  # that alone is elsewhere
+            odd = 1 if places == 0b0010 else 2 if places == 0b0100 else 0  # index of the second source's only sample
             return odd == 0 or _returns(states, side, order + odd - 1, samples[odd] - samples[0])
     return False

@@ -1,8 +1,7 @@
-"""Hand and arm samples as they come in: checked, mapped to frame `base`, and filtered to a state at
-the tick.
+"""Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
+at the tick.
 
-The rules by which a sample is believed, in full: `plausibility`. Those that come late:
-`late_samples`.
+`plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
 from service.core.intake.tuning import JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS, MAX_LATE_S, MAX_OUTSIDE_RAD
 
-UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # of `hands.unit`
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
-    """The ticks, at least one, after which a channel's source is silent; rounding of the period
-    does not make it one more.
+    """Number of ticks, at least one, after which a channel's source is silent. The duration is
+    rounded first, so that the period's rounding does not add a tick.
     """
     section, name = BY_KEY[key].stale_after or ("", "")
     duration_ms: float = getattr(getattr(settings, section), name)
@@ -38,8 +37,8 @@ def _stale_ticks(key: str, settings: Settings) -> int:
 
 
 class Refused(NamedTuple):
-    """A sample that was rejected, the stamp [ns] of the newest one accepted before, and for the arm
-    the joints that one measured.
+    """A rejected sample, with the stamp [ns] of the newest accepted sample; for the arm, also with
+    the joint positions of that one.
     """
 
     cause: Cause
@@ -49,10 +48,12 @@ class Refused(NamedTuple):
 
 
 class Intake:
-    """Hand and arm samples into the state: each hand's estimate, the arm's newest sample.
+    """Intake of hand and arm samples into the state: the estimate of each hand, the newest sample
+    of the arm.
 
-    For people only, no part of the state: `rejected` counts (sources, causes) what this intake
-    rejected, and `refused` has the newest of it, by source and cause.
+    Two attributes are for reports only and are no part of the state: `rejected` (sources, causes)
+    counts the rejected samples, and `refused` has the newest rejected sample of each source and
+    cause.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -61,7 +62,7 @@ class Intake:
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
-        # from the sample before to one that is late, and from that to now
+        # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
         joints = settings.joints
@@ -85,21 +86,21 @@ class Intake:
         origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
         self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
         self._in_base = np.eye(3, 4)
-        # a tracker with a frame of its own: what says that it is in base has been mapped already
+        # If the tracker has a frame of its own, samples in frame base have been mapped already.
         self._maps_base = hands.frame in ("", BASE)
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(hands, settings.period_s, self._models)
 
     def begin(self, state: Record) -> None:
-        """Sets in a state of zeros what no sample has reported yet."""
+        """Set the values that hold before the first sample, in a state of zeros."""
         for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
             state[field] = -1
         self._estimator.begin(state)
 
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
-        """Moves the state on by some ticks and takes the samples in; the flags HANDS_KNOWN,
-        ARM_HEARD, ARM_STILL and CONTESTED.
+        """Advance the state by some ticks and take the samples in. Returns the flags of
+        `codes.Known` that `step.report` lists.
         """
         self.advance(state, ticks)
         for event in samples:
@@ -110,12 +111,12 @@ class Intake:
         return int(report(as_array(state), as_array(frame), self._parameters))
 
     def advance(self, state: Record, ticks: int) -> None:
-        """The state moved on by some ticks: fresh hands by their motion, others stand still."""
+        """Advance the state by some ticks: hands seen lately move on, others stand still."""
         state["tick"] += ticks
         self._estimator.advance(state, ticks, int(self._parameters["unseen_ticks"][0]))
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
-        """One hand's sample filtered in, or counted as rejected."""
+        """Filter a sample of one hand, or count it as rejected."""
         if sample.frame_id not in self._frames:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
@@ -134,7 +135,7 @@ class Intake:
             self._note(state, side, cause, sample)
 
     def take_arm(self, state: Record, sample: JointState) -> None:
-        """The arm's sample into the state, or counted as rejected."""
+        """Store a sample of the arm in the state, or count it as rejected."""
         try:
             position, velocity = measured(sample, self._names)
         except WireError:
@@ -146,7 +147,8 @@ class Intake:
             self._note(state, ARM, cause, sample)
 
     def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+        """Count a rejected sample, and retain it for reports."""
         newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
         joints = tuple(state["measured"].tolist()) if source == ARM else ()
         self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
-        self.rejected[source, cause] += 1  # last: who sees it, in another thread, finds the other
+        self.rejected[source, cause] += 1  # last, so that another thread that sees the count finds `refused`

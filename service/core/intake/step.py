@@ -1,4 +1,4 @@
-"""The intake's compiled step: samples are checked, compared and taken into the filters."""
+"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,12 @@ JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm
 
 @compiled
 def is_contested(states: Records, already: bool) -> bool:
-    """Whether some source is contradicted by another; `already`: it was found so before."""
+    """True if a hand or the arm is contested: two sources report it.
+
+    A source is contested if its `contested` share is above CONTESTED_ON_SHARE, or if the noise of a
+    hand's samples is above SCATTER_ON_M. If it was contested `already`, the lower limits
+    CONTESTED_OFF_SHARE and SCATTER_OFF_M apply.
+    """
     share, scatter_m = (CONTESTED_OFF_SHARE, SCATTER_OFF_M) if already else (CONTESTED_ON_SHARE, SCATTER_ON_M)
     state = states[0]
     for side in range(2):
@@ -54,14 +59,17 @@ def is_contested(states: Records, already: bool) -> bool:
 
 @compiled
 def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float) -> int:
-    """The cause for which a stamp is refused, or -1; the newest one came `passed_s` ago, and one
-    may be older than that by `late_s`.
+    """Cause for which a stamp is rejected: REPEATED, AHEAD, OLDER; -1 if it is accepted.
+
+    The newest sample arrived `passed_s` ago with the stamp `newest_ns`. A stamp may be ahead of
+    that by `passed_s` + `silent_s`, and older than that by `late_s`. After a silence (not `fresh`),
+    every stamp but the newest one is accepted.
     """
     if stamp_ns == newest_ns:
         return REPEATED
     if not fresh:
         return -1
-    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of integers may overflow
+    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of two integers may overflow
     if ahead_s > passed_s + silent_s:
         return AHEAD
     return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
@@ -69,14 +77,20 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 @compiled
 def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
-    """Remembers how much a source is contradicted; of two that take turns, however soon one comes
-    after the other, the samples count alike.
+    """Update the share c of a source's recent samples that contradict the others:
+
+        c = c + (1 - exp(-Δ / CONTESTED_MEMORY_S)) (jumped - c)
+
+    Δ is half the time since the tick with a sample before the last one; for a further sample in the
+    same tick, it is the time since the last tick with one. Δ is at most SAMPLE_MAX_S. So the
+    samples of two trackers that take turns have the same weight, however soon one follows the
+    other.
     """
     state = states[0]
     ticks, share = state.sample_ticks[source], state.contested[source]
     passed = float(state.tick - ticks[0])
     if ticks[1] < state.tick:
-        passed *= 0.5  # since the sample before the last
+        passed *= 0.5  # half the time since the sample before the last one
         ticks[0], ticks[1] = ticks[1], state.tick
     passed_s = min(passed * period_s, SAMPLE_MAX_S)
     share += (1.0 - math.exp(-passed_s / CONTESTED_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
@@ -87,8 +101,12 @@ def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
 def has_jumped(
     states: Records, parameters: Records, side: int, position: Vector, expected: Vector, interval_s: float
 ) -> bool:
-    """Whether a sample (3,) [m] of a fresh hand is where that cannot have come to, `interval_s`
-    after the one before, which tells that it was `expected` elsewhere.
+    """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
+    than a hand can move and a tracker's noise explains:
+
+        |x - p| > max(jump + jump_speed * interval, JUMP_NOISE_STDS * noise standard deviation)
+
+    `interval_s` is the time since the sample from which p was predicted.
     """
     state, given = states[0], parameters[0]
     gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
@@ -100,7 +118,13 @@ def has_jumped(
 
 @compiled
 def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
-    """Whether a hand would turn as none can, by two kept samples and one (3,) [m] after them."""
+    """True if a hand at x_0 (3,) [m], h_0 after the retained sample x_1 at ring index `at`, which
+    followed x_2 after h_1, would have accelerated by at least TO_AND_FRO_MPS2:
+
+        |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= TO_AND_FRO_MPS2
+
+    Intervals h are at least LEAST_INTERVAL_S. False if h_0 + h_1 exceeds TO_AND_FRO_S.
+    """
     before_s, past, wanted = states[0].kept_noise[side, at, 3], states[0].kept_past[side, at], 0.0
     if after_s + before_s > TO_AND_FRO_S:
         return False
@@ -113,7 +137,9 @@ def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: 
 
 @compiled
 def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
-    """`Intake.take_arm`: the cause for which it was rejected, or -1."""
+    """Store a sample of the arm's joints (J,) [rad, rad/s] in the state; compiled part of
+    `Intake.take_arm`. Returns the cause for which it was rejected, or -1.
+    """
     state, given = states[0], parameters[0]
     passed = state.tick - state.arm_tick
     passed_s, silent_s = passed * given.period_s, given.silent_ticks * given.period_s
@@ -121,8 +147,8 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
         return NOT_FINITE
-    # Before it is ready, and after a silence, an arm is in the turn that it reports: it may have
-    # started anew. While it is commanded, its turns go on.
+    # Before it is ready, and after a silence, an arm is in the turn that it reports, because it may
+    # have restarted. While it is commanded, its turns are counted on.
     if fresh or (state.arm_ready and state.mode != FAULT):
         unwrap(states, parameters, position)
     near, off, moved = compared(states, parameters, position, velocity)
@@ -156,8 +182,11 @@ def take_hand(
     turn: tuple[float, float, float, float],
     frame: Vector,
 ) -> int:
-    """`Intake.take_hand`, with the tracker's axes and origin (3, 4) in frame base: the cause for
-    which it was rejected, or -1.
+    """Filter a sample of one hand; compiled part of `Intake.take_hand`. Returns the cause for which
+    it was rejected, or -1.
+
+    `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
+    `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
     state, given, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
     for k in range(4):
@@ -202,7 +231,7 @@ def take_hand(
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
             if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
-                another = _turns_hard(states, side, at, in_base, passed_s)  # no more is needed, it would settle late
+                another = _turns_hard(states, side, at, in_base, passed_s)  # a higher share would only decay later
                 another = another and is_to_and_fro(states, side, order, in_base)
             note(states, side, another, period_s)
         elif cause != REPEATED:
@@ -221,7 +250,7 @@ def take_hand(
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
     if order == 0:
         state.jump_count[side] = state.jump_is_swap[side] = 0
-        state.jump_is_swap[1 - side] = 0  # this hand is where it is reported to be
+        state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, frame)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
@@ -230,7 +259,9 @@ def take_hand(
 
 @compiled
 def report(states: Records, frames: Records, parameters: Records) -> int:
-    """Into the frame what is known of the hands; flags of what is."""
+    """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Known` that
+    the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL, CONTESTED.
+    """
     frame, state, given = frames[0], states[0], parameters[0]
     left, right = state.hand_ticks[0], state.hand_ticks[1]
     if left == right:

@@ -33,52 +33,52 @@ LEAST_NOISE_M = 7e-4  # lower limit of the standard deviation; below it, samples
 MAX_NOISE_M = 5e-2  # upper limit
 NOISE_SAMPLES = 60  # samples over which it is averaged
 NOISE_OUTLIER_SHARE = 9.0  # upper limit of one squared difference / variance
-LONE_SAMPLE_S = 1.0  # a sample with none before it within this time is compared with none
+LONE_SAMPLE_S = 1.0  # interval that is assumed before the first sample of a filter
 
-# Stillness, which tells a hand that waits from one on its way.
-STILLNESS_LOWPASS_S = 0.1  # time constant of the velocity, which removes a tremor of 8 to 12 Hz
+# Stillness, which distinguishes a hand that waits from one on its way.
+STILLNESS_LOWPASS_S = 0.1  # time constant of the velocity's lowpass, which removes a tremor of 8 to 12 Hz
 STILLNESS_FALL_S = 0.03  # time constant with which stillness ends
 
-# Samples that come late.
-MAX_LATE_S = 0.1  # a sample may be older than the newest by this, and later than the minimum delay
-DELAY_WINDOW_S = 1.0  # the minimum delay is taken over this window; of 30 delays of up to 60 ms, it is 2 ms
+# Late samples.
+MAX_LATE_S = 0.1  # a sample may be this much older than the newest one, and later than the minimum delay
+DELAY_WINDOW_S = 1.0  # window of the minimum delay; the smallest of 30 delays from 0 to 60 ms is 2 ms on average
 DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this; clocks 1 % apart do not
-MAX_STAMP_DIFFERENCE_NS = 2.0**62  # differences of stamps are clipped to this, so that they do not overflow
+MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow as integers, and are computed as floats
 TICK_ROUNDING = 1e-6  # [ticks] rounding of a lateness, as sums of periods are not exact
 LEAST_INTERVAL_S = 1e-3  # lower limit of the time between two samples, also within a tick
 
 # Jumps, and two sources that contradict each other.
-MAX_HAND_DISTANCE_M = 5.0  # a hand farther from the base plate is a mistake of units
+MAX_HAND_DISTANCE_M = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
 PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the base plate, in the unit that was meant
-JUMP_NOISE_STDS = 6.0  # a deviation of so many standard deviations of the noise is no jump
-CONFIRMED_SAMPLES = 3  # successive samples that agree confirm a jump,
-CONFIRMED_S = 0.02  # over at least this time
-AGREE_M = 0.03  # samples of a hand that jumped agree within this distance,
-AGREE_MPS = 2.0  # which grows at this speed
-SWAPPED_M = 0.05  # a hand this near to where the other one was may be the other one,
-SWAPPED_MPS = 0.2  # a distance that grows at this speed
-SOURCES_APART_M = 0.012  # places of two sources are at least this far apart,
-SOURCE_SPREAD_SHARE = 0.4  # and samples of one source scatter by at most this share of that
-OFFSET_TOLERANCE_M = 0.03  # the offset of one source from the other stays the same within this,
-OFFSET_CHANGE_MPS = 0.5  # which grows at this speed
-TO_AND_FRO_PATTERNS = (0b0010, 0b0100, 0b0110, 0b0101)  # which of four samples are of the second source
-RETURN_SAMPLES = 12  # a source three times as slow as the other returns twice within so many samples
+JUMP_NOISE_STDS = 6.0  # a deviation of at most this number of the noise's standard deviations is no jump
+CONFIRMED_SAMPLES = 3  # a jump is accepted after this number of successive samples that agree
+CONFIRMED_S = 0.02  # successive samples that confirm a jump span at least this time
+AGREE_M = 0.03  # samples that jumped agree within AGREE_M + AGREE_MPS * elapsed time
+AGREE_MPS = 2.0  # speed at which a hand that has jumped may move on
+SWAPPED_M = 0.05  # a hand may be the other one within SWAPPED_M + SWAPPED_MPS * elapsed time of it
+SWAPPED_MPS = 0.2  # speed at which the other hand may have moved since it was seen
+SOURCES_APART_M = 0.012  # smallest distance between the positions that two sources report
+SOURCE_SPREAD_SHARE = 0.4  # largest scatter of one source's samples / distance between the sources
+OFFSET_TOLERANCE_M = 0.03  # offsets of a source agree within OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * elapsed time
+OFFSET_CHANGE_MPS = 0.5  # speed at which the offset may change
+TO_AND_FRO_PATTERNS = (0b0010, 0b0100, 0b0110, 0b0101)  # bit i: source of sample i, counted from the newest
+RETURN_SAMPLES = 12  # a source three times as slow as the other returns twice within this number of samples
 TO_AND_FRO_S = 0.08  # a hand with two sources alternates between them within this time
-TO_AND_FRO_MPS2 = 50.0  # [m/s²] unless a hand could do that with this acceleration
-TO_AND_FRO_MAX_SHARE = 0.5  # upper limit of the contested share through samples that alternate
-CONTESTED_ON_SHARE = 0.25  # a source is contested from this share of jumped samples on,
-CONTESTED_OFF_SHARE = 0.1  # until it is below this one
+TO_AND_FRO_MPS2 = 50.0  # [m/s²] below this acceleration, a single hand could have moved like that
+TO_AND_FRO_MAX_SHARE = 0.5  # alternating samples raise the contested share up to this limit
+CONTESTED_ON_SHARE = 0.25  # a source is contested above this share of contradicting samples
+CONTESTED_OFF_SHARE = 0.1  # a contested source remains so until its share is below this
 CONTESTED_MEMORY_S = 1.0  # time over which the share is averaged
 SAMPLE_MAX_S = 1 / 30  # a sample counts for at most this time, however long the pause before it
-SCATTER_ON_M = 0.012  # a hand whose samples have this standard deviation on each axis is contested,
-SCATTER_OFF_M = 0.010  # until it is below this one
-SCATTER_LEAST_SAMPLES = 30  # it is judged by at least so many samples, as one outlier spoils four of them
+SCATTER_ON_M = 0.012  # a hand is contested above this standard deviation of its samples on each axis
+SCATTER_OFF_M = 0.010  # a contested hand remains so until the standard deviation is below this
+SCATTER_LEAST_SAMPLES = 30  # fewer samples do not show scatter, because one outlier affects four of them
 
 # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
-MAX_JOINT_RADPS = 100.0  # a faster joint is a mistake
-JOINT_JUMP_RAD = 0.2  # a joint may differ by this from its last sample,
-JOINT_JUMP_RADPS = 5.0  # and by this speed times the time since then: an arm can be moved by hand,
-JOINT_JUMP_SPEEDS = 2.0  # or by so many times the fastest joint's speed limit, if that is more
-MAX_OUTSIDE_RAD = 0.2  # a joint farther outside its limits is a mistake, or has to be moved back by hand
-ARM_STILL_RAD = 0.02  # an arm is at rest if its joints stay within this
-ARM_STILL_S = 0.1  # for this time
+MAX_JOINT_RADPS = 100.0  # samples of a faster joint are rejected
+JOINT_JUMP_RAD = 0.2  # a joint may differ from its newest sample by JOINT_JUMP_RAD + jump speed * elapsed time
+JOINT_JUMP_RADPS = 5.0  # smallest jump speed, because an arm can be moved by hand
+JOINT_JUMP_SPEEDS = 2.0  # smallest ratio of the jump speed to the fastest joint's speed limit
+MAX_OUTSIDE_RAD = 0.2  # samples of a joint farther outside its limits are rejected; it must be moved back by hand
+ARM_STILL_RAD = 0.02  # an arm is at rest if no joint moves by more than this within ARM_STILL_S
+ARM_STILL_S = 0.1  # time for which an arm must be at rest before it is ready

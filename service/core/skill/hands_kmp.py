@@ -1,5 +1,5 @@
-"""The paper's skill: a KMP from where the hands are, or also were, or how they are turned, to where
-the tool should be.
+"""Skill of the paper: a kernelised movement primitive (KMP) from the hands' positions, and
+optionally their past and their orientation, to the tool's position.
 """
 
 from __future__ import annotations
@@ -38,28 +38,29 @@ TURN_INPUTS = 18  # the entries of both hands' rotation matrices
 
 @dataclass(frozen=True, eq=False)
 class HandsKMP:
-    """A model whose inputs are both hands' positions (6) [m], then how far behind them rows of
-    their memory are (6 each) [m], then, where they are turned, their rotation matrices times
-    TURN_WEIGHT_M (9 each) [m]; whose outputs are the tool's (3) [m].
+    """Model with the outputs tool position (3,) [m] and these I inputs [m], see `Model`:
 
-    A hand of which nobody says how it is turned is turned as in the mean of the demonstrations. See
-    `Model`.
+    * both hands' positions (6);
+    * for each of `order` rows of their memory, its offset from these positions (6 each);
+    * if `turned`, both hands' rotation matrices times TURN_WEIGHT_M (18).
+
+    A hand of unknown orientation is assumed to have the mean orientation of the demonstrations.
     """
 
     primitive: KMP
-    turned: bool = False  # whether how the hands are turned is an input
+    turned: bool = False  # true if the hands' orientation is an input
 
     measure: ClassVar[str] = "the target's standard deviation"
     formats: ClassVar[tuple[int, ...]] = (1, 2)
     units: ClassVar[str] = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {}
-    gripper_ell: ClassVar[float] = 1000.0  # 2 cm of a hand
+    gripper_ell: ClassVar[float] = 1000.0  # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
     names: ClassVar[tuple[str, ...]] = ()
     delay_s: ClassVar[float] = 0.0
 
     @property
     def order(self) -> int:
-        """How many rows of the memory are inputs."""
+        """Number of rows of the hands' memory that are inputs."""
         return min(max((int(self.primitive.inputs.shape[1]) - TURN_INPUTS * self.turned) // 6 - 1, 0), ORDER)
 
     @property
@@ -68,7 +69,9 @@ class HandsKMP:
 
     @cached_property
     def _usual_turns(self) -> Vector:
-        """How hands are turned (TURN_INPUTS,) in the mean [m]; none where that is no input."""
+        """Mean orientation inputs (TURN_INPUTS,) [m] of the demonstrations; empty if orientation is
+        no input.
+        """
         return np.asarray(self.primitive.base.inputs[:, 6 * (1 + self.order) :].mean(axis=0))
 
     @property
@@ -83,8 +86,10 @@ class HandsKMP:
         return np.zeros(MOST_STAGES)
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
-        """Equation (8) of Huang et al. 2019, its derivatives along the motion, and its covariance,
-        which takes as long as all else.
+        """Motion of the tool: equation (8) of Huang et al. 2019 and its derivatives along the
+        hands' motion.
+
+        The covariance, which takes as long as all else, is computed only if it is not `known`.
         """
         moving = self._moving(seen.moving, seen.past, seen.turns)
         found = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
@@ -114,7 +119,9 @@ class HandsKMP:
         return moving[0], moving[1]
 
     def _moving(self, moving: Vector, past: Vector, turns: Vector) -> Vector:
-        """The inputs of hands that move so (3, 6), and how these move (3, I)."""
+        """Inputs (I,) with their velocity and acceleration, (3, I), for hands with this motion (3,
+        6), memory (ORDER, 6) and orientation filters (TURNS, 18) or (0, 18).
+        """
         if not (self.order or self.turned):
             return moving
         if self.turned and not len(turns):
@@ -124,7 +131,7 @@ class HandsKMP:
         return out
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> HandsKMP:
-        """Algorithm 1 of the paper."""
+        """Model adapted to via-points by Algorithm 1 of Huang et al. 2019."""
         hands, outputs, deviations = neighbourhoods(via_points)
         inputs = self.inputs(hands)
         desired = Gaussians(outputs, weight * deviations[:, None, None] ** 2 * np.eye(3))
@@ -143,7 +150,9 @@ class HandsKMP:
 
 @compiled
 def _rounded(mean: Vector, velocity: Vector, acceleration: Vector, covariance: Vector, out: Vector) -> float:
-    """Rounds a prediction into `out` (6, 3); its standard deviation."""
+    """Round a prediction into `out` (6, 3): position, velocity, acceleration and covariance (3, 3).
+    Returns the standard deviation [m] of the rounded covariance.
+    """
     out[0], out[1], out[2], out[3:] = mean, velocity, acceleration, covariance
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)

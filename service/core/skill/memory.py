@@ -1,6 +1,12 @@
-"""What there is to be remembered of hands: where they were in the last seconds, as a gamma memory
-has it (de Vries and Principe 1992), a row of filters each of which follows the one before; and how
-they are turned, smoothed by such a row.
+"""Memory of the hands: their past positions and their filtered orientation, each by a cascade of
+first-order filters (a gamma memory; de Vries and Principe 1992).
+
+Filter k of K follows the filter before it, with the time constant τ; the first one follows the
+input x:
+
+    τ dm_1/dt = x - m_1,   τ dm_k/dt = m_(k-1) - m_k
+
+So m_k is about x at k τ ago, smoothed, and its derivatives are known without differences.
 """
 
 from __future__ import annotations
@@ -17,7 +23,9 @@ from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, MEMOR
 
 @compiled
 def _follow(now: float, share: float, rows: Vector) -> None:
-    """Each of a row of filters (K,) goes a share of its way to the one before, the first to now."""
+    """Update a cascade m (K,), `rows`, by the input x, `now`, from the first filter to the last:
+    m_1 = m_1 + share (x - m_1), then m_k = m_k + share (m_(k-1) - m_k).
+    """
     for row in range(len(rows)):
         rows[row] += share * (now - rows[row])
         now = rows[row]
@@ -25,8 +33,11 @@ def _follow(now: float, share: float, rows: Vector) -> None:
 
 @compiled
 def remember(states: Records, period_s: float, lag_s: float) -> None:
-    """Hands as they are now enter the memory, whose filters have this lag; of those that come
-    first, it is full.
+    """Update the memory of both hands' positions, with the time constant `lag_s`, and of their
+    orientations, with TURN_LAG_S: share = 1 - exp(-elapsed time / time constant).
+
+    For positions, the elapsed time is at most MEMORY_LONGEST_STEP_S. A hand's first sample is taken
+    into all filters at once.
     """
     state = states[0]
     for side in range(2):
@@ -46,9 +57,12 @@ def remember(states: Records, period_s: float, lag_s: float) -> None:
 
 @compiled
 def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) -> None:
-    """Positions, how far behind them the rows (K, D) of a memory are, and how hands are turned, the
-    last of `turns` (TURNS, E) times TURN_WEIGHT_M, of hands that move so (3, D): with velocity and
-    acceleration into `out` (3, (1 + K) D + E).
+    """Inputs of the primitive with their velocity and acceleration, written to `out` (3, (1 + K) D
+    + E): positions x (D), offsets m_k - x of each row of the `memory` (K, D), and the last row of
+    `turns` (TURNS, E) times TURN_WEIGHT_M.
+
+    `moving` (3, D) is position, velocity and acceleration of the hands. Derivatives are those of
+    the cascades, e.g. dm_k/dt = (m_(k-1) - m_k) / MEMORY_LAG_S.
     """
     width = moving.shape[1]
     for i in range(width):
@@ -73,8 +87,11 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
 
 @compiled
 def delayed(moving: Vector, memory: Vector, late_s: float, out: Vector) -> None:
-    """Hands that move so (3, D) as they were some time ago, into `out` (3, D): by the last row of
-    a memory (K, D) whose lags come to that; or as they will be, where it is less than nothing.
+    """Motion of the hands `late_s` ago, written to `out` (3, D), from their motion (3, D) now.
+
+    It is the last row of the `memory` (K, D), whose time constant is `late_s` / K, with its
+    derivatives. A negative `late_s` extrapolates: x - late_s v, with velocity and acceleration
+    unchanged.
     """
     lag_s = late_s / len(memory)
     out[:] = moving
@@ -90,7 +107,9 @@ def delayed(moving: Vector, memory: Vector, late_s: float, out: Vector) -> None:
 
 @compiled
 def _filtered(values: Vector, share: float, steps: int, out: Vector) -> None:
-    """Into `out` (T, K, D) the rows of filters along values (T, D), so many steps apart."""
+    """Rows of the cascade along values (T, D), written to `out` (T, K, D); each interval between
+    two values is interpolated linearly in some `steps`.
+    """
     rows = np.zeros(out.shape[1:])
     for t in range(len(values)):
         for step in range(steps):
@@ -103,15 +122,18 @@ def _filtered(values: Vector, share: float, steps: int, out: Vector) -> None:
 
 
 def along(values: Vector, period_s: float, lag_s: float, rows: int) -> Vector:
-    """The rows (T, K, D) of filters of this lag along values (T, D)."""
+    """Rows (T, K, D) of a cascade of K = `rows` filters with the time constant `lag_s` along values
+    (T, D).
+    """
     out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / MEMORY_STEP_S))
     _filtered(np.ascontiguousarray(values), 1.0 - math.exp(-period_s / steps / lag_s), steps, out)
     return out
 
 
 def features(hands: Vector, period_s: float, order: int, turns: Vector | None = None) -> Vector:
-    """Positions of hands (T, D) [m], how far behind them `order` rows of their memory are, and how
-    they are turned, where that is given as rotation matrices (T, E): (T, (1 + order) D + E) [m].
+    """Inputs of the primitive along a demonstration, (T, (1 + K) D + E) [m]: positions of the hands
+    (T, D), offsets of the K = `order` rows of their memory, and their filtered rotation matrices
+    (T, E) times TURN_WEIGHT_M, if given.
     """
     parts = [hands, (along(hands, period_s, MEMORY_LAG_S, order) - hands[:, None]).reshape(len(hands), -1)]
     if turns is not None:

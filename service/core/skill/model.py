@@ -1,4 +1,4 @@
-"""What predicts in a skill: one surface, whatever it is made of."""
+"""Interface of the models with which a skill predicts the tool's motion."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 
-MOTION_ROUND_TO = 1e6  # [1/m] micrometres, to which positions and their derivatives are rounded
-COVARIANCE_ROUND_TO = 1e10  # [1/m²] the same for covariances
-LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # of the regions whose reach a skill knows
-CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # that reach, of a normal in space
+MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to micrometres
+COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
+LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the calibrated regions
+CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # χ² with 3 degrees of freedom
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
 
 
 class Regions(NamedTuple):
-    """What makes of a model's covariance one whose regions hold what they say.
+    """Calibration of a model's covariance C, so that its confidence regions contain as many errors
+    as they state.
 
-    It is published `scale` times, with what comes of being early or late added before: the motion
-    of the last TRAIL_S in a deviation `std_s` of the time. `radii` are squared Mahalanobis
-    distances under that covariance, of the regions of LEVELS; that of 95 % is as of a normal.
+    The published covariance is scale (C + std_s² v vᵀ). v is the tool's mean velocity over the last
+    TRAIL_S, and `std_s` the standard deviation of the prediction's timing. `radii` are the squared
+    Mahalanobis distances under it that bound the regions of LEVELS; the one of 95 % is always that
+    of a normal distribution.
     """
 
     scale: float = 1.0
@@ -36,34 +38,36 @@ class Regions(NamedTuple):
 
 
 NORMAL = Regions()
-"""Of a model whose errors are as normal ones with its covariance."""
+"""No calibration: the errors are normally distributed with the model's covariance."""
 
 
 class Motion(NamedTuple):
-    """Where the tool should be, how that moves, and how sure it is; rounded."""
+    """Predicted motion of the tool and its uncertainty, rounded."""
 
     position: Vector  # (3,) [m]
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
-    gate_m: float  # [m] what is compared with the skill's threshold: see `Model.measure`
-    torn: float = 0.0  # how probable it is that the tool should be elsewhere, in another stage
+    gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`
+    torn: float = 0.0  # probability that the tool belongs elsewhere, in another stage
 
 
 class Seen(NamedTuple):
-    """What is known of both hands."""
+    """Motion, memory and belief of both hands: all that a model predicts from."""
 
-    moving: Vector  # (3, 6) position, velocity and acceleration, as the teacher saw them
-    stillness: Vector  # (2,) of each hand, 0 to 1
-    past: Vector  # (ORDER, 6) [m] the memory of where they were, as `remember` keeps it
-    turns: Vector  # (TURNS, 18) how they are turned; (0, 18) where nobody says so
-    now: Vector  # (3, 6) how they move at this moment, which the gate is about
-    belief: Vector  # (MOST_STAGES,) how probable each stage is; zeros: not yet known
-    period_s: float  # that has passed since it was so: it is brought up to date
+    moving: Vector  # (3, 6) position, velocity and acceleration of the hands, `delay_s` less the lead ago
+    stillness: Vector  # (2,) stillness of each hand, 0 to 1
+    past: Vector  # (ORDER, 6) [m] memory of the hands' positions, see `remember`
+    turns: Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
+    now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
+    belief: Vector  # (MOST_STAGES,) probability of each stage; zeros: not yet known
+    period_s: float  # time since the belief was updated; 0: it is not updated
 
 
 class Target(NamedTuple):
-    """Where the tool is to go [m, m/s, m/s²], and whether that is not quite what was asked for."""
+    """Target of the tool [m, m/s, m/s²]; `clamped` is true if the prediction was outside the
+    workspace.
+    """
 
     position: Vector
     velocity: Vector
@@ -72,105 +76,108 @@ class Target(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """What the skill asks for: the target in the workspace, and how the tool is to turn there."""
+    """Request of the skill to the stages after it: target in the workspace, and orientation."""
 
     target: Target
     orientation: Vector  # (4,) quaternion x y z w
     turning: Vector  # (3,) [rad/s]
-    gate_m: float  # what is compared with the skill's threshold
-    torn: bool  # it is not known which stage of the task it is
-    needs: bool  # a hand that is not seen: the tool may be far from where it is to be
+    gate_m: float  # [m] distance that is compared with the skill's threshold
+    torn: bool  # true if the stage of the task is ambiguous
+    needs: bool  # true if a hand that is not seen may move the target far
 
 
 class Model(Protocol):
-    """From the motion of two hands to the tool's; immutable.
+    """Map from the motion of two hands to the motion of the tool; immutable.
 
-    Hands are (T, 6) [m], the left one's x y z first. I inputs of its primitive and of those beside
-    it, orientation and gripper. Where hands rest at via-points, their `names` tell which, of
-    those at which hands are alike.
+    Hands are (T, 6) [m]: left x y z, right x y z. I is the number of inputs of the model's
+    primitive, and of the primitives for orientation and gripper. Where hands rest at via-points,
+    `names` are the via-points' names; they distinguish via-points at which the hands are alike.
     """
 
     measure: ClassVar[str]
-    """In words, what `gate_m` is."""
+    """Name of the distance `gate_m`."""
     formats: ClassVar[tuple[int, ...]]
-    """Of its file: without figures, with figures."""
+    """Numbers of its file formats: without evaluation figures, then with them."""
     units: ClassVar[str]
-    """Of its primitive, as its file says them."""
+    """Units of its primitive, as its file states them."""
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]]
-    """Least, greatest and unit of the numbers in each array that it stores beside its primitive."""
+    """Minimum, maximum and unit of the numbers in each array stored beside its primitive."""
     gripper_ell: ClassVar[float]
-    """[1 / (unit of the inputs)²] of a gripper's kernel: it opens and closes where hands arrive."""
+    """Scale of the gripper's kernel [1 / (unit of the inputs)²]; it acts where the hands arrive."""
 
     @property
     def primitive(self) -> KMP:
-        """What was fitted to demonstrations."""
+        """Primitive that was fitted to the demonstrations."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Inputs and outputs that its primitive must have."""
+        """Numbers of inputs and outputs that the primitive must have."""
 
     @property
     def hands(self) -> Vector:
-        """Hands (M, 6) [m] that it knows."""
+        """Hands (M, 6) [m] of the demonstrations."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The via-points that it learned by their names, in the order of its stages."""
+        """Names of the via-points that were learned, in the order of the stages."""
 
     @property
     def delay_s(self) -> float:
-        """How late the teacher was whom it does not know of: it was learned as if he were not."""
+        """Delay [s] of the demonstrated tool behind the hands: the model predicts the tool from the
+        hands' motion this long ago.
+        """
 
     @property
     def remembers(self) -> bool:
-        """Whether it is a function of where hands were too."""
+        """True if the hands' past positions are inputs."""
 
     def belief(self, hands: Vector) -> Vector:
-        """The belief (MOST_STAGES,) in each stage of hands (6,) at rest, and nothing before."""
+        """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
-        """The motion of the tool. A covariance (3, 3) that is `known` is handed back; it takes long
-        to find.
+        """Predict the motion of the tool. A covariance (3, 3) that is `known` is returned as it is,
+        because computing one takes long.
         """
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """The tool (T, 3) [m] for hands that have been where they are; so in all that follows."""
+        """Tool positions (T, 3) [m] for hands (T, 6) that have always been at rest, as in all
+        methods below.
+        """
 
     def covariances(self, hands: Vector) -> Vector:
-        """How sure `mean` is, (T, 3, 3) [m²]."""
+        """Covariances (T, 3, 3) [m²] of `mean`."""
 
     def gates_m(self, hands: Vector) -> Vector:
-        """What is compared with the threshold, (T,) [m]."""
+        """Distances (T,) [m] that are compared with the skill's threshold."""
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """The primitives' inputs (T, I)."""
+        """Inputs (T, I) of the primitives."""
 
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
-        """The primitives' input (I,), and its velocity (I,)."""
+        """Input (I,) of the primitives for moving hands, and its velocity (I,)."""
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> Self:
-        """One that goes through these via-points and no others. Raises ValueError.
-
-        `weight` multiplies their variances.
+        """Model adapted to these via-points and no others, whose variances are multiplied by
+        `weight`. Raises ValueError.
         """
 
     def unadapted(self) -> Self:
-        """As it was learned."""
+        """Model as it was learned, without adaptation to via-points."""
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        """What it stores beside its primitive, by name."""
+        """Arrays by name that a skill's file has beside the primitive."""
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> Self:
-        """What was stored in these arrays. Raises ValueError, KeyError."""
+        """Model stored in the arrays of a skill's file. Raises ValueError, KeyError."""
 
 
 def standard_deviations(covariances: Vector) -> Vector:
-    """Standard deviations (...) of covariances (..., 3, 3), root mean square over the axes."""
+    """Standard deviations (...) of covariances (..., 3, 3): sqrt(trace / 3)."""
     return np.asarray(np.sqrt(np.maximum(np.trace(covariances, axis1=-2, axis2=-1), 0.0) / 3))
 
 
 @compiled
 def standard_deviation(covariance: Vector) -> float:
-    """As `standard_deviations`, of one that was rounded."""
+    """Standard deviation sqrt(trace / 3) of one rounded covariance (3, 3)."""
     return math.sqrt((covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / 3.0)

@@ -1,5 +1,5 @@
-"""What a skill knows of the tool besides where it is: how it is turned, and whether the gripper is
-closed. Both from the same input as the position.
+"""Orientation of the tool and state of the gripper: a skill's predictions in addition to the
+position.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from service.core.skill.tuning import GRIPPER_CLOSE_ABOVE, GRIPPER_MOVES_S, GRIP
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
-    """UNKNOWN, OPEN or CLOSED: what becomes of a gripper, which changed so long ago, where such a
-    closure is predicted and the tool is so far off [m].
+    """State of the gripper, UNKNOWN, OPEN or CLOSED, for a predicted `closure`.
 
-    With hysteresis, and not before it can have moved: what trembles about the middle changes
-    nothing. Not on the way: a tool that is late would open or close elsewhere.
+    Its last change was `since_s` ago, and the tool is `off` [m] from its target. Hysteresis ignores
+    a closure that trembles about the middle; the gripper is left alone until it has had time to
+    move (GRIPPER_MOVES_S), and while the tool is more than GRIPPER_THERE_M from its target, because
+    a late tool would open or close it elsewhere.
     """
     if closure == NO_GRIPPER:
         return gripper
@@ -33,15 +34,15 @@ def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: flo
     return CLOSED if closure > GRIPPER_CLOSE_ABOVE else OPEN
 
 
-TURN_ROUND_TO = 1e6  # [1/rad] microradians, to which orientations and angular velocities are rounded
-COVARIANCE_ROUND_TO = 1e10  # [1/rad²] the same for covariances
-CLOSURE_ROUND_TO = 1e6  # the same for closures
+TURN_ROUND_TO = 1e6  # [1/rad] orientations and angular velocities are rounded to microradians
+COVARIANCE_ROUND_TO = 1e10  # [1/rad²] covariances are rounded to 1e-10 rad²
+CLOSURE_ROUND_TO = 1e6  # closures are rounded to 1e-6
 NO_GRIPPER = -1.0  # the closure that a skill without a gripper predicts
-UNKNOWN, OPEN, CLOSED = 0, 1, 2  # of a gripper
+UNKNOWN, OPEN, CLOSED = 0, 1, 2  # state of a gripper
 
 
 class Turn(NamedTuple):
-    """How the tool should be turned, how that changes, and how sure it is."""
+    """Predicted orientation of the tool, its rate and its uncertainty."""
 
     orientation: Vector  # (4,) quaternion x y z w
     velocity: Vector  # (3,) [rad/s] angular velocity, in frame base
@@ -50,16 +51,16 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LearnedOrientation:
-    """A primitive of zeta = log(q conj(q_a)) (3 outputs, half the angle [rad]), as
-    `kmp.orientation` has it.
+    """Primitive with 3 outputs ζ = log(q conj(q_a)), half the rotation vector [rad], see
+    `kmp.orientation`.
     """
 
     primitive: KMP
     auxiliary: Vector  # (4,) q_a, quaternion x y z w
 
     def predict(self, at: Vector, velocity: Vector, *, covariance: Vector | None = None) -> Turn:
-        """The orientation at an input (I,) that moves so. One covariance that was predicted just
-        before may be given (3, 3) [rad²]. Rounded (1 µrad), as positions are.
+        """Orientation at an input (I,) with its velocity (I,), rounded to 1 µrad. A `covariance`
+        (3, 3) [rad²] that was predicted before may be given; it is then returned as it is.
         """
         found = self.primitive.predict_motion(at, velocity, np.zeros_like(at), covariance=covariance is None)
         quaternion, turning = self.auxiliary.copy(), np.empty(3)
@@ -74,27 +75,35 @@ class LearnedOrientation:
 
 @dataclass(frozen=True, eq=False)
 class LearnedGripper:
-    """A primitive of how far the gripper is closed, 0 to 1 (1 output)."""
+    """Primitive with 1 output, the closure of the gripper: 0 (open) to 1 (closed)."""
 
     primitive: KMP
 
     def predict(self, at: Vector) -> float:
-        """How far it should be closed at an input (I,), 0 (open) to 1 (closed)."""
+        """Closure at an input (I,), clipped to 0 ... 1 and rounded."""
         found = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
         return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
 
 
-_NOTHING = np.zeros((3, 3))  # in place of a covariance that is known
+_NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be computed
 
 
 @compiled
 def _turned(
     zeta: Vector, rate: Vector, covariance: Vector, quaternion: Vector, turning: Vector, turned: Vector
 ) -> None:
-    """Turns the auxiliary quaternion (4,) by 2 zeta, in place; into turning (3,) the angular
-    velocity, into turned (3, 3) the covariance of small rotations.
+    """Orientation from the primitive's output ζ (3,), its rate (3,) and its covariance C (3, 3), as
+    in `kmp.orientation`. `quaternion` (4,) holds q_a, and is changed in place.
 
-    As `kmp.orientation`: by the left Jacobian of the rotation.
+        φ = 2 ζ,   quaternion = exp(φ / 2) q_a,   J = 2 J_l(φ)
+        turning = J dζ/dt,   turned = J C Jᵀ
+
+    J_l is the left Jacobian of SO(3), with θ = |φ|:
+
+        J_l = I + (1 - cos θ) / θ² [φ]× + (θ - sin θ) / θ³ [φ]×²
+
+    `turning` (3,) is the angular velocity [rad/s], `turned` (3, 3) the covariance of small
+    rotations [rad²], both in frame base.
     """
     vector, per_zeta, part = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     square = 0.0

@@ -1,5 +1,5 @@
-"""The skill as the loop uses it: from the motion of two hands to where the tool should be, how that
-moves, and how sure it is.
+"""Skill as the control loop uses it: predict from the motion of two hands the motion of the tool,
+its orientation and the gripper's closure; clamp targets to the workspace.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientati
 from service.core.skill.staged import StagedKMP
 from service.core.skill.tuning import MAX_TARGET_M
 
-NEVER = -(2**60)  # a tick so long ago that nothing is left of it
+NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
 
 
 def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach) -> Target:
-    """The target (3,) [m], [m/s], [m/s²] brought into the box (2, 3) [m] and the reach.
+    """Clamp a target (3,) [m], [m/s], [m/s²] to the box (2, 3) [m] and to the reach.
 
-    Where it was outside, the parts of velocity and acceleration that lead out are removed.
+    For a position outside, the outward components of velocity and acceleration are removed.
     """
     if _is_inside(position, box, _numbers(reach)):
         return Target(position, velocity, acceleration, clamped=False)
@@ -48,15 +48,13 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
 
 @functools.cache
 def _numbers(reach: Reach) -> Vector:
-    """A reach (7,) for `_is_inside`: centre, inner and outer radius, least x and z [m]."""
+    """Reach (7,) for `_is_inside`: centre, inner and outer radius, least x and z [m]."""
     return np.array([*reach.centre, reach.inner, reach.outer, reach.min_x, reach.min_z])
 
 
 @compiled
 def _is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
-    """Whether a position (3,) [m] lies inside the box (2, 3) and the reach, whose `numbers` are
-    given.
-    """
+    """True if a position (3,) [m] is inside the box (2, 3) and the reach (7,) of `_numbers`."""
     square = 0.0
     for i in range(3):
         if not box[0, i] <= position[i] <= box[1, i]:
@@ -67,13 +65,17 @@ def _is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
 
 
 def is_reachable(position: Vector, reach: Reach) -> bool:
-    """Whether a position (3,) [m] lies inside the reach."""
+    """True if a position (3,) [m] is inside the reach."""
     return not _nearest(position, reach)[1]
 
 
 def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
-    """A reachable point near a point, (3,) [m], and the outward normals (3,) of the boundaries that
-    it was moved to.
+    """Reachable point near a point (3,) [m], and the outward normals (3,) of the boundaries to
+    which it was moved.
+
+    The boundaries are applied in this order: least x and z, outer sphere, inner sphere. Where a
+    sphere moves the point across a plane, it is put on the circle in which they meet. So the point
+    is reachable, but not always the nearest one.
     """
     x, y, z = (point - reach.centre).tolist()
     inner, outer, min_x, floor = reach.inner, reach.outer, reach.min_x - reach.centre[0], reach.min_z - reach.centre[2]
@@ -111,8 +113,8 @@ def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
 
 
 def _without(vector: Vector, normals: list[Vector]) -> Vector:
-    """A vector (3,) without its parts along the outward normals; where two meet, alternating until
-    none is left.
+    """Remove the components of a vector (3,) along the outward normals (3,); for several normals,
+    by up to 20 alternating projections.
     """
     for _ in range(20 if len(normals) > 1 else 1):
         for normal in normals:
@@ -120,47 +122,46 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
     return vector
 
 
-UNTOLD = np.empty((0, 18))  # of hands of which nobody says how they are turned
+UNTOLD = np.empty((0, 18))  # orientation of hands if it is not known
 MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
-"""All that a skill may predict with."""
+"""All types of models."""
 Known: TypeAlias = tuple[Vector, Vector, float]
-"""What was predicted at the newest sample of a hand: covariances of position (3, 3) [m²] and
-orientation (3, 3) [rad²], and the closure of the gripper."""
+"""Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], and closure of the gripper, as
+predicted at the newest sample of a hand."""
 
 
 class Prediction(NamedTuple):
-    """Where the tool should be, how that moves, and how sure it is."""
+    """Predicted motion of the tool, its orientation, the gripper's closure, and uncertainties."""
 
     position: Vector  # (3,) [m]
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
-    covariance: Vector  # (3, 3) [m²] as the model says it: see `Regions`
-    gate_m: float  # [m] what is compared with the skill's threshold, see `Model.measure`
-    torn: float  # how probable it is that the tool should be elsewhere, in another stage
+    covariance: Vector  # (3, 3) [m²] of the model, before the calibration by `Regions`
+    gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
+    torn: float  # probability that the tool belongs elsewhere, in another stage
     turn: Turn
-    closure: float  # of the gripper, 0 (open) to 1 (closed); NO_GRIPPER where the skill has none
+    closure: float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 
 
 @dataclass(frozen=True, eq=False)
 class Skill(Immutable):
-    """A model of how the tool goes with both hands, and what belongs to it.
-
-    Made by `service.learning`, which learns, adapts and stores it.
+    """Model of the tool's motion as a function of both hands' motion, with its threshold,
+    workspace, orientation and gripper. `service.learning` learns, adapts and stores skills.
     """
 
     name: str
     model: Model
-    orientation: Vector  # (4,) of the tool where none was learned, quaternion x y z w
-    workspace: Vector  # (2, 3) lower and upper corner for targets [m]
+    orientation: Vector  # (4,) quaternion x y z w of the tool if no orientation was learned
+    workspace: Vector  # (2, 3) lower and upper corner of the box for targets [m]
     threshold: float  # [m] hands whose `gate_m` is above it are far from the demonstrations
     learned_from: str  # hash of the demonstrations
-    components: int = 0  # of the mixture that it was learned with, 0 for none
+    components: int = 0  # components of the Gaussian mixture of the demonstrations; 0: no mixture
     via_points: tuple[ViaPoint, ...] = ()
     turn: LearnedOrientation | None = None
     gripper: LearnedGripper | None = None
-    tolerance: float = TOLERANCE_M  # [m] a reference point nearer to a via-point gives way
-    digest: bytes = bytes(16)  # 16 bytes of its file that tell it from any other
-    conductor: int | None = None  # side of the hand that conducts alone: the other makes no difference
+    tolerance: float = TOLERANCE_M  # [m] a via-point replaces reference points within this distance
+    digest: bytes = bytes(16)  # 16 bytes that identify the skill's file
+    conductor: int | None = None  # side of the hand that leads alone; None: both hands matter
     regions: Regions = NORMAL
 
     def __post_init__(self) -> None:
@@ -180,17 +181,21 @@ class Skill(Immutable):
         period_s: float = 0.0,
         lead_s: float = 0.0,
     ) -> Prediction:
-        """The prediction for hands (2, 3) [m] that move so and are so still (2,), `lead_s` earlier
-        than the teacher.
+        """Predict tool, orientation and gripper for the hands' positions, velocities and
+        accelerations (2, 3) [m, m/s, m/s²] and stillness (2,), `lead_s` earlier than the
+        demonstrated tool.
 
-        Covariances take as long as all else; what was predicted just `before` may be given.
-        `past` (ORDER, 2, 3) [m] is the memory of the hands, `belief` (MOST_STAGES,) that in each
-        stage; they have been there all along where these are not given. `turns` (TURNS, 2, 9) is
-        how they are turned, as `remember` keeps it; else as in the demonstrations. A belief that
-        is `period_s` old is brought up to date.
+        * `before`: covariances and closure of an earlier prediction. They are then returned as they
+          are, because computing covariances takes as long as all else.
+        * `past` (ORDER, 2, 3) [m]: memory of the hands. Without it, the hands have always been
+          where they are.
+        * `turns` (TURNS, 2, 9): filters of the hands' rotation matrices, see `remember`. Without
+          it, the orientation is the mean of the demonstrations.
+        * `belief` (MOST_STAGES,): probability of each stage, updated in place if `period_s` > 0.
+          Without it, the hands have always been at rest.
 
-        Rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines that differ in the last bits agree on all
-        that follows.
+        The result is rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines whose last bits differ agree
+        in all that follows.
         """
         now = self._moving(hands, velocities, accelerations)
         behind = np.tile(now[0], (ORDER, 1)) if past is None else self._conducting(past).reshape(ORDER, 6)
@@ -216,33 +221,39 @@ class Skill(Immutable):
         return Prediction(*motion, turn, self.gripper.predict(at))
 
     def _moving(self, hands: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Both hands' motion (3, 6)."""
+        """Motion (3, 6) of both hands: positions, velocities, accelerations."""
         return self._conducting(np.array([hands, velocities, accelerations])).reshape(3, 6)
 
     def _conducting(self, both: Vector) -> Vector:
-        """Of both hands (M, 2, D), one that makes no difference is where the other is."""
+        """Arrays of both hands (M, 2, D). If one hand leads alone, the other hand's values are
+        replaced by its values.
+        """
         return both if self.conductor is None else both[:, [self.conductor] * 2]
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """The tool (T, 3) [m] for hands (T, 6) [m] at rest; at these via-points, if given."""
+        """Tool positions (T, 3) [m] for hands (T, 6) [m] at rest; `names` are the via-points at
+        which they rest, if given.
+        """
         return self.model.mean(self.conducting(hands), names)
 
     def conducting(self, hands: Vector) -> Vector:
-        """Hands (T, 6) [m] of which one that makes no difference is where the other is."""
+        """Hands (T, 6) [m]; if one hand leads alone, the other one is put where it is."""
         return self._conducting(np.reshape(hands, (-1, 2, 3))).reshape(-1, 6)
 
     @property
     def hands(self) -> Vector:
-        """Hands (M, 6) [m] that it knows."""
+        """Hands (M, 6) [m] of the demonstrations."""
         return self.model.hands
 
     @cached_property
     def constant_turn(self) -> Turn:
-        """What is predicted where no orientation was learned."""
+        """Orientation that is predicted if none was learned."""
         return Turn(np.array(self.orientation, np.float64), np.zeros(3), np.zeros((3, 3)))
 
     @cached_property
     def demonstrated(self) -> Vector:
-        """Least and greatest corner (2, 2, 3) of where it knows the left and the right hand [m]."""
+        """Lower and upper corner (2, 2, 3) [m] of the boxes of the left and right hand in the
+        demonstrations.
+        """
         hands = self.hands.reshape(-1, 2, 3)
         return np.stack([hands.min(axis=0), hands.max(axis=0)])

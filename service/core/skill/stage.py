@@ -1,4 +1,4 @@
-"""The skill in force, as a stage of the core: it predicts at each sample of a hand."""
+"""The core's stage of the skill: predict the tool at each sample of a hand."""
 
 from __future__ import annotations
 
@@ -25,23 +25,26 @@ from service.core.skill.tuning import (
 )
 from service.core.skill.unseen import off_m
 
-NO_STAGE = -1  # of a frame
+NO_STAGE = -1  # stage in a frame while it is not known
 
 
 class SkillStage:
-    """The skill in force; what it predicted at the newest sample of a hand is kept in the state."""
+    """Skill in force; its prediction at the newest sample of a hand is kept in the state."""
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
         self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
         self._take(skill)
 
     def _take(self, skill: Skill) -> None:
+        """Put a skill into force, with the time constant of the hands' memory that it needs."""
         self.skill = skill
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
 
     def adopt(self, state: Record, skill: Skill) -> None:
-        """Another skill from now on; of one with the same via-points the stage is known already."""
+        """Replace the skill. The belief is kept if the new skill has the same via-points, and the
+        memory of the hands if it has the same filters.
+        """
         if skill.model.names != self.skill.model.names:
             state["stage_belief"] = 0.0
         if skill.model.remembers != self.skill.model.remembers or skill.model.delay_s != self.skill.model.delay_s:
@@ -52,8 +55,9 @@ class SkillStage:
         state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
 
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
-        """What the skill asks for with the hands, which must be known; `unseen` is the side of one
-        that is not seen now. Covariances and gripper are predicted anew at new samples only.
+        """Request of the skill for the hands in the state, which must be known; `unseen` is the
+        side of a hand that is not seen now. Covariances and closure are computed at new samples
+        only.
         """
         remember(as_array(state), self._period_s, self._lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
@@ -91,13 +95,15 @@ class SkillStage:
         return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn, off > UNSURE_M)
 
     def set_stage(self, state: Record, name: str) -> None:
-        """The task has come to the via-point of this name. One that it has not changes nothing."""
+        """Set the belief to the stage that begins at the via-point of this name (at the last
+        via-point, the stage that ends there). Unknown names are ignored.
+        """
         if name in (names := self.skill.model.names):
             state["stage_belief"] = 0.0
             state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
 
     def nothing(self, state: Record, frame: Record) -> None:
-        """Into the frame that nothing is predicted: the target is the setpoint."""
+        """Write into the frame that nothing is predicted: the target is the setpoint."""
         state["unsure"], state["sure_tick"] = 0, state["tick"]
         frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
         frame["closure"] = state["closure"]
@@ -105,7 +111,7 @@ class SkillStage:
 
 
 def _tell_stage(belief: Vector, frame: Record) -> None:
-    """Into the frame which stage it is, most probably, and how probable that is."""
+    """Write the most probable stage and its probability into the frame."""
     most = int(belief.argmax())
     frame["stage_belief"] = belief[most]
     frame["stage"] = most if belief[most] > 0.0 else NO_STAGE

@@ -1,5 +1,5 @@
-"""A skill between via-points, which holds wherever these are: a KMP from how far along a stage of
-the task each hand is to how far the tool is.
+"""Skill between named via-points, which moves with them: a KMP from the share of a stage that each
+hand has covered to the share that the tool covers.
 """
 
 from __future__ import annotations
@@ -37,20 +37,24 @@ from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Tas
 from service.core.skill.tuning import BELIEF_PERIODS, MOTION_STEP_S, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.core.skill.via_points import bent
 
-NO_PULLS = frozen(np.empty((0, 9)))  # where nothing else is taught
-NO_ERRORS = frozen(np.empty((0, 6)))  # where no covariance is wanted
+NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
+NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placed(Immutable):
-    """K stages where they are, R centres, M errors, X hands.
+    """Stages of a task at their via-points in a scene, with the primitive as plain arrays: K
+    stages, R centres, M errors, X pulls.
 
-    rows: (R, 3 + 4) how far along each hand is, the stage, and weights. errors: (M, 3 + 3) the
-    same and by how much [m] the tool was off. pulls: (X, 9) [m] hands around which the tool is
-    moved besides, and weights, see `via_points.bent`.
+    * `rows` (R, 3 + 4): a centre's shares x (2,) of left and right hand, its stage, and its weights
+      (4,).
+    * `errors` (M, 3 + 3): shares x (2,), stage, and the tool's error [m] in held-out
+      demonstrations.
+    * `pulls` (X, 9): hands (6,) [m] and weight (3,) [m] of the kernels by which other via-points
+      move the tool, see `via_points.bent`.
 
-    All arrays are read-only, wherever they come from: for others loops would be compiled once more,
-    while they run.
+    All arrays are read-only: for writable ones, the compiled functions would be compiled once more
+    while the loop runs.
     """
 
     stages: Records  # (K,) of STAGE
@@ -65,7 +69,9 @@ class Placed(Immutable):
 
     @classmethod
     def of(cls, task: Task, at: NamedViaPoints, off: Vector, primitive: KMP, errors: Vector) -> Placed:
-        """A task's via-points, how far hands (K, 2) are off their ways, a KMP and its errors."""
+        """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
+        from their segments, root mean square; `errors` (M, 6) those of the primitive.
+        """
         sizes = structured(1, PLACED)
         sizes["scale"], sizes["likeness"] = scale_of(primitive), likeness(primitive)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
@@ -74,7 +80,7 @@ class Placed(Immutable):
         return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), NO_PULLS)
 
     def belief(self, hands: Vector) -> Vector:
-        """The belief (MOST_STAGES,) in each stage, of hands (6,) at rest and nothing before."""
+        """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
         out, moving = np.zeros(MOST_STAGES), np.zeros((3, 6))
         out[: len(self.stages)] = 1.0 / len(self.stages)
         moving[0] = hands
@@ -83,8 +89,8 @@ class Placed(Immutable):
         return out
 
     def mean(self, hands: Vector, beliefs: Vector, stillness: Vector | None = None) -> Vector:
-        """The tool (T, 3) [m] for hands (T, 6) that are so still (T, 2), or wholly, and beliefs (T,
-        K or more).
+        """Expected tool positions (T, 3) [m] for hands (T, 6) with these beliefs (T, K or more) and
+        stillness (T, 2); without it, the hands are still.
         """
         out = np.empty((len(hands), 3))
         for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
@@ -93,18 +99,21 @@ class Placed(Immutable):
         return out
 
     def _tools(self, hands: Vector, still: Vector, belief: Vector, pulls: Vector) -> Vector:
-        """The tools (K, 3) [m] in the stages that are believed in, for hands (6,)."""
+        """Tool positions (K, 3) [m] for hands (6,) in all stages with at least
+        LEAST_STAGE_PROBABILITY.
+        """
         out = np.empty((len(self.stages), 3))
         tools_at(np.ascontiguousarray(hands), still, belief, self.stages, self.sizes, self.rows, pulls, out)
         return out
 
     def gates_m(self, hands: Vector) -> Vector:
-        """How far the farther one of hands (T, 6) is off all its ways, (T,) [m]."""
+        """Distances (T,) [m] of hands (T, 6) from the task, see `stages.off_all`."""
         return np.array([off_all(np.ascontiguousarray(one), self.stages) for one in hands])
 
     def covariance(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
-        """(3, 3) [m²] for hands (6,), a belief, and how still they are (2,): the scatter of errors
-        near there, that of the stages' tools and that of the via-points.
+        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6,), a belief and stillness (2,),
+        see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
+        via-points' variance.
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
         tools = self._tools(hands, still, belief, NO_PULLS)
@@ -113,24 +122,26 @@ class Placed(Immutable):
 
 
 def scale_of(primitive: KMP) -> float:
-    """Of its kernel exp(-scale |difference|²)."""
+    """Scale of the primitive's kernel exp(-scale |difference|²)."""
     return float(primitive.kernel.coordinates(1)[0])
 
 
 def likeness(primitive: KMP) -> float:
-    """What a centre of another stage counts, by how far stages are apart."""
+    """Factor of the kernel between two stages, exp(-2 scale STAGE_DISTANCE²): stages are inputs
+    STAGE_DISTANCE along axes of their own.
+    """
     return math.exp(-2.0 * scale_of(primitive) * STAGE_DISTANCE**2)
 
 
 @dataclass(frozen=True, eq=False)
 class StagedKMP:
-    """A model whose inputs are how far along a stage the left and the right hand are, and which of
-    K stages it is (2 + K), whose outputs are how far along it the tool is, and an offset [m] (4).
-    See `Model`.
+    """Model with the inputs share of a stage that the left and the right hand have covered, and the
+    stage (2 + K), and the outputs share that the tool covers, and its offset [m] (4). See `Model`.
 
-    nominal: where the via-points were in the mean of the demonstrations. off: (K, 2) [m] how far
-    hands are off their ways, root mean square. errors: (M, 6) by how much [m] the tool was off at
-    some inputs when demonstrations were left out. delay_s: how late the teacher was.
+    * `nominal`: mean via-points of the demonstrations.
+    * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
+    * `errors` (M, 6): inputs and the tool's errors [m] in held-out demonstrations, see `Placed`.
+    * `delay_s`: delay of the demonstrated tool behind the hands.
     """
 
     primitive: KMP
@@ -158,29 +169,33 @@ class StagedKMP:
 
     @cached_property
     def hands(self) -> Vector:
-        """Hands at every via-point."""
+        """Hands (K + 1, 6) [m] at the via-points."""
         begins, way = (self._unpulled.stages[name].reshape(-1, 6) for name in ("begins", "way"))
         return np.concatenate([begins, begins[-1:] + way[-1:]])
 
     @cached_property
     def placed(self) -> Placed:
-        """The stages between the via-points in force; those of other names pull."""
+        """Stages between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
         return replace(self._unpulled, pulls=np.hstack(bent(self._resting, self.hands, others)))
 
     @cached_property
     def _unpulled(self) -> Placed:
+        """Stages between the via-points in force, without pulls."""
         at = self.nominal.moved(self.via_points)
         return Placed.of(self.task, at, self.off, self.primitive, self.errors)
 
     def _resting(self, hands: Vector) -> Vector:
+        """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
         return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]))
 
     def belief(self, hands: Vector) -> Vector:
         return self.placed.belief(hands)
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
-        """Equation (8) of Huang et al. 2019, differences along the motion, scatter of errors."""
+        """Motion of the tool: equation (8) of Huang et al. 2019, differences along the hands'
+        motion, and the covariance of errors in held-out demonstrations, see `stages.predicted`.
+        """
         at, out, hands = self.placed, np.empty((6, 3)), np.zeros(1, SEEN)
         hands["moving"], hands["now"] = seen.moving, seen.now
         hands["stillness"], hands["period_s"] = seen.stillness, seen.period_s
@@ -199,7 +214,9 @@ class StagedKMP:
         return self.placed.gates_m(hands)
 
     def _beliefs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """The beliefs (T, MOST_STAGES) of hands that rest, at the via-points of these names."""
+        """Beliefs (T, MOST_STAGES) for hands (T, 6) at rest. At a via-point named in `names`, the
+        belief is the stage that ends there; at the first one, the stage that begins there.
+        """
         out = np.array([self.placed.belief(one) for one in hands]).reshape(-1, MOST_STAGES)
         for row, name in zip(out, names, strict=bool(names)):
             if name in self.names:
@@ -221,14 +238,18 @@ class StagedKMP:
         return now, (ahead - behind) / (2.0 * MOTION_STEP_S)
 
     def _input(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
-        """How far along each hand is in the most probable stage; and the belief."""
+        """Input (2 + K,) of orientation and gripper: shares of the most probable stage, and the
+        belief times STAGE_DISTANCE_BESIDE.
+        """
         most = int(belief.argmax())
         stage, hands = self.placed.stages[most], np.ascontiguousarray(hands)
         along = along_both(hands, still, stage)
         return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)])])
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> StagedKMP:
-        """Nothing is solved: via-points of a known name are where the task is, others pull."""
+        """Model in a scene with these via-points. Nothing is solved: those of a known name move the
+        stages, the others pull the tool.
+        """
         return replace(self, via_points=tuple(via_points))
 
     def unadapted(self) -> StagedKMP:

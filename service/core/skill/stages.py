@@ -1,5 +1,11 @@
-"""Stages of a task, each from one via-point to the next: how far along it the hands are, in which
-one (a filtered belief, which tells visits of a place apart), and where the tool should be then.
+"""Stages of a task, each between two successive via-points: the share of the stage that the hands
+have covered, the belief in each stage, and the tool's position with its covariance.
+
+In a stage, each hand moves along a segment from its first via-point to its second one. The belief
+is filtered over time, so it distinguishes several visits to the same via-point.
+
+Symbols: hand h (3,) [m]; its first via-point b (3,), segment w (3,) [m] and root-mean-square
+distance from that segment σ [m] (`begins`, `way` and `off` of STAGE); belief p_k in stage k of K.
 """
 
 from __future__ import annotations
@@ -43,31 +49,31 @@ from service.core.skill.tuning import (
     WITH_HAND_POWER,
 )
 
-MOST_STAGES = 64  # that a state has room for
-STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # a hand's way squared that does not move; what the tool goes with
-OUTPUTS = 4  # how far along the tool is, and its offset
-# One stage, in compiled loops: its ends, for the left and the right hand and the tool.
+MOST_STAGES = 64  # stages for which the state has room
+STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
+OUTPUTS = 4  # outputs of the primitive: the tool's share of its segment, and its offset x y z [m]
+# One stage as compiled functions read it: segments of the left and the right hand and of the tool.
 STAGE = np.dtype(
     [
-        ("begins", np.float64, (2, 3)),  # [m] where each hand is at its begin,
-        ("way", np.float64, (2, 3)),  # [m] and how it goes to its end
-        ("square", np.float64, (2,)),  # [m²] of the way; STAYS
-        ("off", np.float64, (2,)),  # [m] how far each hand is off that way, root mean square
-        ("tool", np.float64, (3,)),  # [m] where the tool is at its begin,
-        ("tool_way", np.float64, (3,)),  # [m] and how it goes
-        ("follow", np.int64, (2,)),  # the hand that the tool goes with, at its begin and at its end
+        ("begins", np.float64, (2, 3)),  # [m] each hand's first via-point
+        ("way", np.float64, (2, 3)),  # [m] each hand's segment, from the first via-point to the second one
+        ("square", np.float64, (2,)),  # [m²] squared length of the segment; STAYS for a hand that rests
+        ("off", np.float64, (2,)),  # [m] each hand's distance from its segment, root mean square
+        ("tool", np.float64, (3,)),  # [m] the tool's first via-point
+        ("tool_way", np.float64, (3,)),  # [m] the tool's segment
+        ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the stage
     ]
 )
-# What is of one size in all stages, in compiled loops.
+# Numbers that hold in all stages, as compiled functions read them.
 PLACED = np.dtype(
     [
-        ("scale", np.float64),  # of the kernel exp(-scale |difference|²)
-        ("likeness", np.float64),  # what a centre of another stage counts
-        ("std", np.float64),  # [m] how sure the via-points' positions are, of each axis
-        ("prior", np.float64, (OUTPUTS,)),  # far from all data
+        ("scale", np.float64),  # scale of the kernel exp(-scale |difference|²)
+        ("likeness", np.float64),  # factor of the kernel for a centre of another stage
+        ("std", np.float64),  # [m] standard deviation of the via-points on each axis
+        ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
     ]
 )
-# What is known of the hands, in compiled loops: see `model.Seen`.
+# The hands' motion as compiled functions read it: see `model.Seen`.
 SEEN = np.dtype(
     [
         ("moving", np.float64, (3, 6)),
@@ -80,9 +86,12 @@ SEEN = np.dtype(
 
 @compiled
 def on_way(hand: Vector, stage: Record, side: int) -> tuple[float, float]:
-    """How far along its way in a stage a hand (3,) is, 0 to 1, and how far off it [m].
+    """Share λ, 0 to 1, of its segment that a hand h (3,) has covered, and its distance d [m] from
+    the segment:
 
-    A hand that stays is there.
+        λ = clip((h - b)·w / |w|², 0, 1),   d = |h - b - λ w|
+
+    A hand that rests in this stage (w = 0) has covered the whole segment: the share is 1.
     """
     begins, way, square = stage["begins"][side], stage["way"][side], stage["square"][side]
     along = 0.0
@@ -98,7 +107,15 @@ def on_way(hand: Vector, stage: Record, side: int) -> tuple[float, float]:
 
 @compiled
 def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
-    """As `on_way`, of a hand (3,) that is so still, 0 to 1: one that rests near an end is there."""
+    """Share of its segment that a hand (3,) with the stillness s has covered, attracted to the ends
+    while the hand rests.
+
+    With λ of `on_way`, the size c = clip(|w| / FULL_SEGMENT_M, LEAST_SEGMENT_SHARE, 1) and the
+    scaled distance r = min(λ, 1 - λ) |w| / c from the nearer end:
+
+        near = clip((SEGMENT_MIDDLE_M - r) / (SEGMENT_MIDDLE_M - SEGMENT_END_M), 0, 1)
+        n = 1 + (REST_SHARPNESS - 1) near s,   share = λⁿ / (λⁿ + (1 - λ)ⁿ)
+    """
     along, _ = on_way(hand, stage, side)
     square = stage["square"][side]
     if square <= STAYS:
@@ -115,13 +132,15 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
 
 @compiled
 def along_both(hands: Vector, still: Vector, stage: Record) -> tuple[float, float]:
-    """How far along a stage both hands (6,) are, that are so still (2,)."""
+    """Shares of the stage, by `along_way`, of both hands (6,) with the stillness (2,)."""
     return along_way(hands[:3], still[0], stage, 0), along_way(hands[3:], still[1], stage, 1)
 
 
 @compiled
 def _near(hands: Vector, stage: Record) -> float:
-    """How near (0 to 1) both hands (6,) are to where a stage begins."""
+    """Proximity, 0 to 1, of both hands to the begin of a stage: exp(-½ Σ |h - b|² / STAGE_END_M²),
+    summed over the hands.
+    """
     square = 0.0
     for side in range(2):
         for i in range(3):
@@ -131,7 +150,13 @@ def _near(hands: Vector, stage: Record) -> float:
 
 @compiled
 def _likely(moving: Vector, stage: Record) -> float:
-    """The logarithm of how probable hands are in a stage that move so (3, 6)."""
+    """Log likelihood of the hands' motion (3, 6) in a stage, summed over both hands:
+
+        -½ min(d² / σ², MAX_SQUARED_DEVIATION) + DIRECTION_WEIGHT tanh(u / DIRECTION_SPEED_MPS)
+
+    d is the distance of `on_way`. u is the speed along the segment, v·w / |w|; for a hand that
+    rests in this stage, u = -RESTLESS_WEIGHT |v|.
+    """
     out = 0.0
     for side in range(2):
         here = slice(3 * side, 3 * side + 3)
@@ -148,9 +173,22 @@ def _likely(moving: Vector, stage: Record) -> float:
 
 @compiled
 def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) -> None:
-    """The belief (K or more,) in each of K stages, a period later, of hands that move so (3, 6).
+    """Update the belief (K or more,) in K stages by the hands' motion (3, 6), one period Δ later,
+    in place.
 
-    A forward filter of a hidden Markov model (Rabiner 1989). One of zeros begins anew.
+    This is the forward filter of a hidden Markov model (Rabiner 1989). Transitions, with n_k =
+    `_near` of stage k, each moving at most half of a probability:
+
+        k to k + 1:      STAGE_FORWARD_PER_S Δ n_(k+1) p_k
+        k + 1 to k:      STAGE_BACK_PER_S Δ n_(k+1) p_(k+1)
+        last to first:   STAGE_CYCLE_PER_S Δ n_0 p_(K-1)
+        to all stages:   p_k = p_k + STAGE_ASTRAY_PER_S Δ (1 / K - p_k)
+
+    Evidence, with the log likelihoods L_k of `_likely`: p_k ∝ p_k exp(c L_k), where c = min(Δ /
+    SAMPLE_CORRELATION_S, 1), as successive samples are correlated.
+
+    A belief of zeros starts anew: the first stage is FIRST_STAGE_ODDS times as probable as any
+    other, and c = FIRST_SAMPLE_WEIGHT.
     """
     count, hands = len(stages), moving[0]
     total, share = 0.0, min(period_s / SAMPLE_CORRELATION_S, 1.0)
@@ -188,7 +226,9 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
 
 @compiled
 def off_all(hands: Vector, stages: Records) -> float:
-    """How far the farther of both hands (6,) is off its ways in all stages, rounded [m]."""
+    """Distance [m] of the hands (6,) from the task: for each hand the distance from the nearest of
+    its segments in all stages, then the larger one of both hands. Rounded to MOTION_ROUND_TO.
+    """
     farther = 0.0
     for side in range(2):
         nearest = math.inf
@@ -200,7 +240,15 @@ def off_all(hands: Vector, stages: Records) -> float:
 
 @compiled
 def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> None:
-    """Adds to `out` (3,) by how much the tool goes with hands (6,), where it is so far along."""
+    """Add to `out` (3,) the offset with which the tool follows the hands (6,), at a `share` s of a
+    stage:
+
+        out = out + (1 - s)ⁿ (h_0 - q_0) + sⁿ (h_1 - q_1)
+
+    h_0 is the hand that the tool follows at the stage's begin and q_0 that hand's via-point there;
+    h_1 and q_1 are the same at its end. n = 1 if it is one hand, else WITH_HAND_POWER. An end at
+    which the tool follows no hand adds nothing.
+    """
     follow = stage["follow"]
     power = 1 if follow[0] == follow[1] else WITH_HAND_POWER
     for end in range(2):
@@ -215,7 +263,18 @@ def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> Non
 def _tool_in(
     hands: Vector, still: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
 ) -> None:
-    """The tool into `out` (3,) in one stage: equation (8) of Huang et al. 2019, and back."""
+    """Tool position in stage k for hands (6,) with the stillness (2,), written to `out` (3,) [m].
+
+    With the hands' shares x (2,) of the stage, the primitive gives the tool's share s and its
+    offset δ (3,) [m] by equation (8) of Huang et al. 2019, over its R centres c_r with the weights
+    W_r (4,):
+
+        (s, δ) = prior + Σ_r g_r exp(-scale |x - c_r|²) W_r,   g_r = 1 in stage k, else `likeness`
+        tool = t + s u + δ
+
+    t and u are the tool's first via-point and its segment. Added are the hands that the tool
+    follows (`add_followed`) and the `pulls` (X, 9) of other via-points (`via_points.bent`).
+    """
     stage, found = stages[k], np.empty(OUTPUTS)
     one, other = along_both(hands, still, stage)
     found[:] = size["prior"]
@@ -244,7 +303,9 @@ def tools_at(
     pulls: Vector,
     out: Vector,
 ) -> None:
-    """The tools into `out` (K, 3) in the stages that are believed in."""
+    """Tool positions in all stages with at least LEAST_STAGE_PROBABILITY, by `_tool_in`, written to
+    `out` (K, 3). The rows of other stages are left as they are.
+    """
     for k in range(len(stages)):
         if belief[k] >= LEAST_STAGE_PROBABILITY:
             _tool_in(hands, still, k, stages, sizes[0], rows, pulls, out[k])
@@ -252,7 +313,9 @@ def tools_at(
 
 @compiled
 def expected(belief: Vector, tools: Vector, out: Vector) -> None:
-    """The mean of the tools (K, 3) in all stages into `out` (3,)."""
+    """Mean of the tool positions t_k (K, 3), written to `out` (3,): Σ p_k t_k / Σ p_k, over the
+    stages with at least LEAST_STAGE_PROBABILITY.
+    """
     total = 0.0
     out[:] = 0.0
     for k in range(len(tools)):
@@ -266,7 +329,11 @@ def expected(belief: Vector, tools: Vector, out: Vector) -> None:
 
 @compiled
 def _torn(belief: Vector, tools: Vector) -> float:
-    """How probable stages are whose tool (K, 3) is elsewhere than in the most probable one."""
+    """Probability that the tool belongs elsewhere: the sum of p_k over the stages whose tool
+    position (K, 3) is more than AMBIGUOUS_M from that of the most probable stage.
+
+    Stages below LEAST_STAGE_PROBABILITY are left out.
+    """
     most = 0
     for k in range(len(tools)):
         if belief[k] > belief[most]:
@@ -284,8 +351,12 @@ def _torn(belief: Vector, tools: Vector) -> float:
 
 @compiled
 def _around(moving: Vector, out: Vector) -> None:
-    """Hands that move so (3, 6) a step ago, now and a step ahead, into `out` (3, 6). One that only
-    trembles stays.
+    """Hands' positions one step h = MOTION_STEP_S ago, now and one step ahead, written to `out` (3,
+    6), for the hands' motion (3, 6):
+
+        x - h g v + ½ h² g a,   x,   x + h g v + ½ h² g a,   g = 1 - exp(-(|v| / CALM_MPS)⁴)
+
+    g makes a hand stay that only trembles.
     """
     for side in range(2):
         square = 0.0
@@ -308,8 +379,16 @@ def scatter(
     std: float,
     out: Vector,
 ) -> None:
-    """The mean square (3, 3) of errors near there, what the stages' tools (K, 3) differ by, and
-    what via-points are off by.
+    """Covariance C (3, 3) [m²] of the expected tool position, written to `out`:
+
+        C = Σ_k p_k ((t_k - t)(t_k - t)ᵀ + E_k) / Σ_k p_k + (std² + LEAST_STD_M²) I
+        E_k = Σ_m g_km e_m e_mᵀ / Σ_m g_km
+        g_km = exp(-½ |x_k - x_m|² / ERROR_WIDTH²), times OTHER_STAGE_ERROR_WEIGHT in another stage
+
+    t_k are the stages' tool positions (K, 3) with the mean t; x_k are the hands' shares (2,) of
+    stage k. `errors` (M, 6) are rows of x_m (2), stage and the tool's error e_m (3) [m] in held-out
+    demonstrations. `std` [m] is the standard deviation of the via-points. Stages below
+    LEAST_STAGE_PROBABILITY are left out.
     """
     out[:] = 0.0
     mean, weights, in_all = np.empty(3), np.empty(len(errors)), 0.0
@@ -350,10 +429,19 @@ def predicted(
     errors: Vector,
     out: Vector,
 ) -> tuple[float, float]:
-    """Brings the belief up to date; tool, velocity, acceleration and covariance, rounded, into
-    `out` (6, 3), the last none without errors; what the gate compares [m], and how torn it is.
+    """Prediction of the tool for `seen` (1,) of SEEN: the belief is updated in place by the hands'
+    motion `now`, `period_s` after its last update, and the tool is predicted for the motion
+    `moving`.
 
-    Velocity and acceleration are by differences along the hands' motion.
+    Written to `out` (6, 3), rounded: position, velocity, acceleration, and the covariance (3, 3) of
+    `scatter`, which is zero without `errors`. With the expected positions t_-, t_0, t_+ at the
+    three times of `_around`, h = MOTION_STEP_S apart:
+
+        velocity = (t_+ - t_-) / (2 h)
+        acceleration = clip((t_+ - 2 t_0 + t_-) / h², ±MAX_TARGET_MPS2)
+
+    Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
+    the threshold, and the probability that the tool belongs elsewhere (`_torn`).
     """
     one, hands, steps = seen[0], np.empty((3, 6)), np.empty((3, 3))
     still, tools = one["stillness"], np.empty((3, len(stages), 3))

@@ -1,4 +1,4 @@
-"""A task between named via-points: the order in which they come, and where they are."""
+"""A task: the order of its named via-points, and their positions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.core.frame import Records, Vector, structured
 from service.core.skill.stages import MOST_STAGES, NONE, RIGHT, STAGE, STAYS
 from service.core.skill.tuning import LEAST_SEGMENT_M, MAX_SKILL_DISTANCE_M
 
-MOST_NAMES = MOST_STAGES + 1  # via-points of a task
+MOST_NAMES = MOST_STAGES + 1  # largest number of via-points of a task
 TASK_UNITS = (
     "inputs: how far along the left and the right hand are, the stage; outputs: how far along the tool is, its "
     "deviation x y z [m]; frame base"
@@ -28,15 +28,16 @@ TASK_RANGES = {
     "errors": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "delay": (0.0, 1.0, "s"),
 }
-"""Least, greatest and unit of the numbers in the arrays of a task's model."""
+"""Minimum, maximum and unit of the numbers in the arrays of a task's model."""
 Indices = NDArray[np.int64]
 
 
 class Task(NamedTuple):
-    """The via-points of a task, in the order in which they are come to; N of them, N - 1 stages.
+    """Order of the N via-points of a task, between which there are N - 1 stages.
 
-    corners: (N, 2) at which of its own positions the left and the right hand is. follow: (N,) the
-    hand that the tool goes with there, NONE, LEFT or RIGHT.
+    * `corners` (N, 2): index of the position of the left and the right hand at each via-point. A
+      hand that returns to a position has the same index.
+    * `follow` (N,): the hand that the tool follows at each via-point: NONE, LEFT or RIGHT.
     """
 
     names: tuple[str, ...]
@@ -44,8 +45,11 @@ class Task(NamedTuple):
     follow: Indices
 
     def stages(self, points: NamedViaPoints, off: Vector) -> Records:
-        """The stages (N - 1,) of STAGE where this task's via-points are: a position of a hand that
-        several share is the mean of those that are known. `off` (N - 1, 2) [m]: see STAGE.
+        """Stages (N - 1,) of STAGE between these via-points. `off` (N - 1, 2) [m] is its field.
+
+        A position that a hand shares between via-points is the mean over those that are known in
+        the scene, or over all if none is. A hand whose via-points are nearer than LEAST_SEGMENT_M
+        rests.
         """
         rows = [points.names.index(name) for name in self.names]
         at, known = points.at[rows], np.array([not points.known or name in points.known for name in self.names])
@@ -65,13 +69,13 @@ class Task(NamedTuple):
         return out
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """What a skill's file has of it."""
+        """Arrays of the task in a skill's file."""
         names = np.array(msgspec.json.encode(self.names).decode())
         return {"names": names, "corners": self.corners, "follow": self.follow}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Task:
-        """What was stored in these arrays. Raises ValueError, KeyError."""
+        """Task stored in the arrays of a skill's file. Raises ValueError, KeyError."""
         names = msgspec.json.decode(str(arrays["names"]), type=tuple[Name, ...])
         count = len(names)
         check_shapes(arrays, {"corners": (count, 2), "follow": (count,)})
@@ -85,15 +89,15 @@ class Task(NamedTuple):
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raises ValueError where an array has another shape, or nothing in it."""
+    """Raise ValueError if an array is empty or has another shape."""
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not shape[0]:
             raise ValueError(f"{name} has shape {arrays[name].shape}, {shape} needed")
 
 
 class NamedViaPoints(NamedTuple):
-    """Via-points by their names: hands and tool (N, 9) [m] at each; how sure that is, of each axis
-    [m]; and which of them are known in this scene, none: all alike.
+    """Via-points by name: hands and tool `at` (N, 9) [m], standard deviation `std` [m] on each
+    axis, and the names `known` in this scene; an empty `known` makes no difference between them.
     """
 
     names: tuple[str, ...]
@@ -103,14 +107,14 @@ class NamedViaPoints(NamedTuple):
 
     @staticmethod
     def of(points: Sequence[ViaPoint]) -> NamedViaPoints:
-        """Those of a list."""
+        """Via-points of a list, with the largest of their standard deviations."""
         at = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
         return NamedViaPoints(
             tuple(point.name for point in points), at, max((point.std for point in points), default=0.0)
         )
 
     def moved(self, points: Sequence[ViaPoint]) -> NamedViaPoints:
-        """These via-points, each where one of the same name is, if there is one."""
+        """These via-points, each replaced by the given one of the same name, if there is one."""
         other = NamedViaPoints.of([point for point in points if point.name in self.names])
         at = self.at.copy()
         at[[self.names.index(name) for name in other.names]] = other.at

@@ -8,8 +8,8 @@ STAGE_DISTANCE_BESIDE = 0.5  # the same for orientation and gripper, which belon
 REST_SHARPNESS = 4.0  # exponent of the share of a segment of a resting hand
 SEGMENT_END_M = 0.05  # on a full segment, a hand that rests this near to an end is at that end
 SEGMENT_MIDDLE_M = 0.10  # one that rests this far from both ends waits on its way
-FULL_SEGMENT_M = 0.3  # on a shorter segment these distances shrink in proportion,
-LEAST_SEGMENT_SHARE = 0.1  # down to this share
+FULL_SEGMENT_M = 0.3  # on a shorter segment, SEGMENT_END_M and SEGMENT_MIDDLE_M shrink in proportion
+LEAST_SEGMENT_SHARE = 0.1  # smallest factor by which distances shrink on a short segment
 LEAST_SEGMENT_M = 0.01  # a hand whose via-points are nearer to each other than this rests
 WITH_HAND_POWER = 4  # exponent of the share with which the tool moves with a hand to or from a via-point
 STAGE_END_M = 0.08  # a stage ends, and the next begins, within this distance of a via-point
@@ -17,7 +17,7 @@ STAGE_FORWARD_PER_S = 1.5  # [1/s] rate of transitions to the next stage while t
 STAGE_BACK_PER_S = 1.0  # [1/s] rate of transitions to the stage before
 STAGE_ASTRAY_PER_S = 1e-4  # [1/s] rate of transitions to any other stage, so that a wrong belief recovers
 STAGE_CYCLE_PER_S = 0.2  # [1/s] rate of transitions from the last stage to the first, while hands are at its begin
-FIRST_STAGE_ODDS = 10.0  # the first stage is so many times as probable as any other at the start
+FIRST_STAGE_ODDS = 10.0  # probability of the first stage / probability of any other, at the start
 SAMPLE_CORRELATION_S = 0.2  # samples within this time carry the same evidence
 FIRST_SAMPLE_WEIGHT = 3.0  # weight of the first sample, before which nothing is known
 MAX_SQUARED_DEVIATION = 9.0  # larger deviations from a segment carry no more evidence
@@ -25,7 +25,7 @@ DIRECTION_WEIGHT = 1.0  # weight of a hand's direction along the segment
 DIRECTION_SPEED_MPS = 0.15  # speed at which it has half of that weight
 RESTLESS_WEIGHT = 0.7  # weight of the speed of a hand that rests in a stage, against that stage
 LEAST_STAGE_PROBABILITY = 0.01  # a less probable stage is left out of the prediction
-BELIEF_PERIODS = 20  # the belief of hands at rest has converged after so many periods
+BELIEF_PERIODS = 20  # number of updates after which the belief of hands at rest has converged
 AMBIGUOUS_M = 0.05  # tools of two stages farther apart than this are different via-points
 AMBIGUOUS_PROBABILITY = 0.3  # the skill is ambiguous if the tool belongs elsewhere with this probability
 AMBIGUOUS_OFF_SHARE = 0.5  # it is no longer ambiguous below this share of it
@@ -41,7 +41,7 @@ TRAIL_S = 0.2  # the tool's motion over this time counts as error: a late tool i
 
 # Motion of the target.
 MOTION_STEP_S = 0.02  # step of the differences along the hands' motion
-CALM_MPS = 0.2  # a slower hand trembles: its velocity does not tell where the tool will be
+CALM_MPS = 0.2  # a slower hand trembles: its velocity does not predict its motion
 MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration
 MAX_TARGET_M = 1e3  # targets are clipped to this distance
 MAX_SKILL_DISTANCE_M = 10.0  # largest distance of anything in a skill's file from the base plate
@@ -56,7 +56,7 @@ MEMORY_STEP_S = 0.004  # step of the filters along a demonstration, as fine as t
 MEMORY_LONGEST_STEP_S = 0.1  # upper limit of a step: a hand that is not seen does not fade from memory
 
 # The gripper.
-GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure,
-GRIPPER_CLOSE_ABOVE = 0.9  # closes above this one, and stays as it is between them
+GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure
+GRIPPER_CLOSE_ABOVE = 0.9  # the gripper closes above this closure; between both, it does not move
 GRIPPER_MOVES_S = 0.5  # it is left alone for this time after a command
 GRIPPER_THERE_M = 0.01  # it moves only if the tool is this near to its target

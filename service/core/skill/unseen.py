@@ -1,4 +1,4 @@
-"""What a hand that is not seen for a moment means for the tool: how far that may be off."""
+"""Uncertainty of the tool's target because a hand is not seen at the moment."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from service.core.skill.model import REGION_95
 if TYPE_CHECKING:
     from service.core.skill.skill import Skill
 
-CHANGES_RATE = float(MODE_SWITCH_RATES_PER_S.max())  # [1/s] at which one moves otherwise than it did: nobody sees it
-STANDS = np.zeros((2, 3))  # both hands: how they move makes no difference to where the tool should be
+CHANGES_RATE = float(MODE_SWITCH_RATES_PER_S.max())  # [1/s] rate at which an unseen hand changes its motion
+STANDS = np.zeros((2, 3))  # velocities and accelerations of both hands: not needed for the position
 
 
 @compiled
 def deviation_m(states: Records, side: int, period_s: float) -> float:
-    """The standard deviation [m], each axis, of where a hand is, which may have begun to move, or
-    to rest, since it was seen.
+    """Standard deviation [m] on each axis of the position of a hand that is not seen, τ after its
+    newest sample:
+
+        σ² = Σ_j (s μ_j + (1 - s) ρ_j) P_j[0, 0],   s = exp(-CHANGES_RATE τ)
+
+    μ_j and P_j are probability and covariance of mode j, ρ is MODE_PRIOR: since it was seen, the
+    hand may have begun to move, or to rest.
     """
     state, variance = states[0], 0.0
     stay = math.exp(-CHANGES_RATE * (state.tick - state.hand_ticks[side]) * period_s)
@@ -33,13 +38,17 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
 
 
 def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
-    """How far the tool may be off [m], as one hand is not seen: 95 % of what that may make of it,
-    at once even where the skill is late.
+    """Possible error [m] of the target because one hand is not seen.
+
+    With d = sqrt(REGION_95) * `deviation_m`, the prediction is repeated with that hand moved by d
+    along each axis; the result is the norm of the three differences (3, 3). The skill's delay is
+    left out.
     """
     by_m = math.sqrt(REGION_95) * deviation_m(as_array(state), side, period_s)
     known = state["covariance"], state["orientation_covariance"], float(state["closure"])
 
     def tool(hands: Vector) -> Vector:
+        """Predicted position (3,) [m] of the tool for hands (2, 3) [m] at rest."""
         return skill.predict(
             hands,
             STANDS,

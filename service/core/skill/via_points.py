@@ -1,4 +1,4 @@
-"""What via-points are made of; and how a tool that is told where to be goes through others too."""
+"""Via-points as data of a primitive, and as pulls on the tool of another model."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.skill.tuning import LEAST_PULL_VARIANCE_SHARE, PULL_SHARPNESS_PER_M2
 
-NEIGHBOURS = 12  # of a via-point with a radius: one either way along each of both hands' coordinates
+NEIGHBOURS = 12  # of a via-point with a radius: two along each coordinate of both hands
 
 
 def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vector]:
-    """Inputs (V, 6), outputs (V, 3) and standard deviations (V,) of via-points: each alone, or with
-    its neighbours.
+    """Inputs (V, 6) [m], outputs (V, 3) [m] and standard deviations (V,) [m] of via-points.
+
+    A via-point with a radius has NEIGHBOURS more rows: each coordinate of its hands moved by the
+    radius both ways, and the tool by as much if it follows that hand.
     """
     inputs: list[Vector] = []
     outputs: list[Vector] = []
@@ -31,9 +33,16 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
 
 
 def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector]:
-    """Centres (X, 6) [m] and weights (X, 3) [m] of kernels of PULL_SHARPNESS_PER_M2, by which a
-    mean of hands at rest, (T, 6) to (T, 3) [m], passes through via-points, and stays at `kept`
-    hands (K, 6).
+    """Kernels that make the mean f of a model, (T, 6) to (T, 3) [m], pass through via-points, and
+    leave it as it is at the hands `kept` (K, 6).
+
+    Returns centres c (X, 6) [m] and weights W (X, 3) [m] of
+
+        f(h) + Σ_x exp(-k |h - c_x|²) W_x,   k = PULL_SHARPNESS_PER_M2
+        W = (G + diag(σ²) + LEAST_PULL_VARIANCE_SHARE I)⁻¹ E,   G_xy = exp(-k |c_x - c_y|²)
+
+    The centres are the via-points' hands with E = tool - f(c) and the via-points' variance σ² [m²],
+    and `kept` with E = 0 and σ = 0. Without via-points, there are no kernels.
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     if not len(inputs):
