@@ -8,51 +8,51 @@ from service.contract.records import Mode, Reason
 
 
 class Known(enum.IntFlag):
-    """What is known at a tick of hands and arm."""
+    """Conditions of hands, arm and task that hold at a tick."""
 
     HANDS = 1  # both hands are seen
-    ARM_HEARD = 2  # the arm has reported its joints lately enough
-    ARM_STILL = 4  # the arm has reported one posture for a while
+    ARM_HEARD = 2  # the arm has reported its joints recently
+    ARM_STILL = 4  # the arm has reported the same posture for a while
     CONTESTED = 8  # two sources report a hand or the arm
-    LEFT_UNSEEN = 16  # the left hand was seen a moment ago; the right one is seen
-    RIGHT_UNSEEN = 32  # the right hand was seen a moment ago; the left one is seen
+    LEFT_UNSEEN = 16  # the left hand is out of sight for a moment; the right hand is seen
+    RIGHT_UNSEEN = 32  # the right hand is out of sight for a moment; the left hand is seen
     ARM_INSIDE = 64  # a part of the arm is inside of a thing, or of another part
-    ONE_HAND = 128  # the leading hand is seen, and the other one has never been, or has disappeared
+    ONE_HAND = 128  # the leading hand is seen; the second hand was never seen, or has disappeared
     STAGE_AMBIGUOUS = 256  # the stage of the task is not known
-    UNSEEN_HAND_NEEDED = 512  # the target depends on the hand that is not seen
+    UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
 
 
 class Start(enum.IntEnum):
-    """Where the arm's motion starts, as the decision says."""
+    """Posture at which the arm's motion starts."""
 
-    ASSUMED = 1  # at the configured posture
-    MEASURED = 2  # where the arm has just reported its joints
+    ASSUMED = 1  # the configured posture
+    MEASURED = 2  # the posture that the arm has just reported
 
 
 class ArmReady(enum.IntEnum):
-    """Whether the arm may follow."""
+    """Readiness of the arm to follow."""
 
-    READY = 1  # it is within its limits, and inside of nothing
-    RETURNING = 2  # it is on its way to that
+    READY = 1  # the arm is within its limits, and inside of nothing
+    RETURNING = 2  # the arm moves back into its limits, or out of a thing
 
 
 class Stuck(enum.IntEnum):
-    """A tool that comes no nearer to its target."""
+    """State of a tool that does not approach its target."""
 
-    NOTICED = 1  # it still follows
-    HELD = 2  # it holds, or follows a way out
+    NOTICED = 1  # the arm still follows
+    HELD = 2  # the arm holds, or moves along a way out
 
 
 class SetpointStep(enum.IntEnum):
-    """What limited a step of the setpoint."""
+    """Limitation of a step of the setpoint."""
 
-    PLANNED = 1  # a bound was met in planning
-    STOPPED = 2  # the stop began
+    PLANNED = 1  # the tracker's jerk was reduced to keep a bound
+    STOPPED = 2  # the setpoint began its stop
     WRONG = 3  # a bound was broken
 
 
-# The same as plain integers: compiled functions need them, and in Python an enumeration's members
-# cost a microsecond each.
+# The same codes as plain integers: compiled functions need them, and in Python each access to a
+# member of an enumeration takes a microsecond.
 HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Known.HANDS), int(Known.ARM_HEARD), int(Known.ARM_STILL)
 CONTESTED, UNSEEN = int(Known.CONTESTED), (int(Known.LEFT_UNSEEN), int(Known.RIGHT_UNSEEN))
 ARM_INSIDE, ONE_HAND = int(Known.ARM_INSIDE), int(Known.ONE_HAND)

@@ -1,7 +1,7 @@
-"""Quaternions x y z w, and distances of segments and boxes; arrays in, arrays out; [m], frame base.
+"""Quaternions x y z w, and distances of segments and boxes; arrays in and out, [m], frame base.
 
-What is found of a pair of shapes is written to `near` (9,): the point on the first, the point on
-the second, and the unit normal from the first to the second.
+Functions of two shapes write to `near` (9,): the nearest point of the first shape, the nearest
+point of the second, and the unit normal from the first to the second.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 
-ROUND_TO = 1e9  # of quaternions: machines that differ in the last bits agree
-_TINY = 1e-12  # a sine below it has no direction
+ROUND_TO = 1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
+_TINY = 1e-12  # a smaller sine is rounding
 
 
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
-    """The rotation matrix (3, 3) of a quaternion x y z w, normalised first."""
+    """Rotation matrix (3, 3) of a quaternion x y z w, which is normalised first."""
     x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
     return np.array(
         [
@@ -30,13 +30,14 @@ def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
 
 
 def angles(a: Vector, b: Vector) -> Vector:
-    """Angles (...) [rad] of the turns between quaternions (..., 4) of norm 1."""
+    """Angles (...) [rad] between quaternions (..., 4) of norm 1: 2 arccos |a · b|."""
     return np.asarray(2.0 * np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0.0, 1.0)))
 
 
 def off_target(tool: Vector, target: Vector, *, direction: bool) -> Vector:
-    """By how much tools (..., 4) are turned from their targets [rad]; only of where +z points, if
-    that `direction` alone is followed.
+    """Angles (...) [rad] between tools and their targets, quaternions (..., 4) of norm 1.
+
+    With `direction`, only the angle between their +z axes.
     """
     if not direction:
         return angles(tool, target)
@@ -45,15 +46,16 @@ def off_target(tool: Vector, target: Vector, *, direction: bool) -> Vector:
 
 
 def _axes(quaternions: Vector) -> Vector:
-    """Where quaternions (..., 4) of norm 1 turn +z, (..., 3)."""
+    """Directions (..., 3) of +z after the rotation by quaternions (..., 4) of norm 1."""
     x, y, z, w = np.moveaxis(quaternions, -1, 0)
     return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 @compiled
 def quaternion_of(matrix: Vector, out: Vector) -> None:
-    """Into out (4,) the quaternion of a rotation matrix (3, 3), rounded; by its largest component
-    (Shepperd 1978).
+    """Write into out (4,) the quaternion of a rotation matrix (3, 3), rounded.
+
+    The largest component is computed first (Shepperd 1978).
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     largest, most = 3, trace
@@ -74,7 +76,7 @@ def quaternion_of(matrix: Vector, out: Vector) -> None:
 
 @compiled
 def normalise(quaternion: Vector) -> None:
-    """Gives a quaternion (4,) norm 1, w at least 0, and rounds it, in place."""
+    """Scale a quaternion (4,) to norm 1 with w >= 0, and round it, in place."""
     length = 0.0
     for i in range(4):
         length += quaternion[i] * quaternion[i]
@@ -85,7 +87,10 @@ def normalise(quaternion: Vector) -> None:
 
 @compiled
 def axis_of(quaternion: Vector, out: Vector) -> None:
-    """Into out (3,) where a quaternion (4,) turns +z; nowhere (0) where it has no length."""
+    """Write into out (3,) the direction of +z after the rotation by a quaternion (4,).
+
+    The result is 0 if the quaternion is 0 or not finite.
+    """
     largest = max(abs(quaternion[0]), abs(quaternion[1]), abs(quaternion[2]), abs(quaternion[3]))
     out[:] = 0.0
     if not 0.0 < largest < math.inf:
@@ -98,8 +103,10 @@ def axis_of(quaternion: Vector, out: Vector) -> None:
 
 @compiled
 def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
-    """Into out (3,) [rad] the shortest turn from a direction (3,) of norm 1 to where a quaternion
-    (4,) turns +z; 0 where one has no length, or where they are opposite and no way is nearer.
+    """Write into out (3,) [rad] the shortest rotation from a direction (3,) to a quaternion's +z.
+
+    The direction has norm 1. The result is a rotation vector; it is 0 if one of the two has no
+    length, or if they are opposite, where no direction is shorter.
     """
     end = np.empty(3)
     axis_of(quaternion, end)
@@ -115,8 +122,9 @@ def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
 
 @compiled
 def turn_between(start: Vector, end: Vector, out: Vector) -> None:
-    """Into out (3,) [rad] the shortest turn from one quaternion (4,) to another; 0 where one has no
-    length.
+    """Write into out (3,) [rad] the shortest rotation vector between two quaternions (4,).
+
+    The result is 0 if one of them is 0.
     """
     ax, ay, az, aw = start[0], start[1], start[2], start[3]
     bx, by, bz, bw = end[0], end[1], end[2], end[3]
@@ -133,7 +141,7 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
 
 @compiled
 def turn_on(quaternion: Vector, turn: Vector) -> None:
-    """Turns a quaternion (4,) by a rotation vector (3,) [rad] of the world, in place."""
+    """Rotate a quaternion (4,) by a rotation vector (3,) [rad] of the base frame, in place."""
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     size = 0.5 if angle < 1e-6 else math.sin(0.5 * angle) / angle
     ax, ay, az, aw = size * turn[0], size * turn[1], size * turn[2], math.cos(0.5 * angle)
@@ -145,8 +153,8 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
     normalise(quaternion)
 
 
-LEAST = 1e-9  # [m] segments nearer than this meet; [m²] shorter ones are points
-HALVINGS = 40  # of a segment, to the nearest point of a box: to 1e-12 of its length
+LEAST = 1e-9  # [m] segments at a smaller distance intersect; [m²] a segment of smaller squared length is a point
+HALVINGS = 40  # bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
 CAPSULE = np.dtype(
     [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]
 )
@@ -154,8 +162,9 @@ CAPSULE = np.dtype(
 
 @compiled
 def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
-    """Into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m]; its capsules
-    are ordered by link.
+    """Write into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m].
+
+    The capsules are ordered by link.
     """
     turn, at = np.eye(3), np.zeros(3)
     own, moved, there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -195,7 +204,7 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
 
 @compiled
 def _about(axis: Vector, angle: float, out: Vector) -> None:
-    """Into out (3, 3) the rotation about a unit axis [rad]."""
+    """Write into out (3, 3) the rotation about a unit axis by an angle [rad]."""
     x, y, z = axis[0], axis[1], axis[2]
     s, c = math.sin(angle), math.cos(angle)
     v = 1.0 - c
@@ -206,14 +215,16 @@ def _about(axis: Vector, angle: float, out: Vector) -> None:
 
 @compiled
 def _unit(share: float) -> float:
+    """Limit a share to 0 ... 1."""
     return min(max(share, 0.0), 1.0)
 
 
 @compiled
 def between_segments(one: Vector, other: Vector, near: Vector) -> float:
-    """Distance of two segments (2, 3), after Ericson, Real-Time Collision Detection, 5.1.9.
+    """Distance [m] between two segments (2, 3), and their nearest points and normal.
 
-    Where they meet the normal is that between their middles.
+    After Ericson, Real-Time Collision Detection, 5.1.9. If the segments intersect, the normal
+    points from the middle of the first to the middle of the second; downward if these coincide.
     """
     a = b = c = d = e = 0.0
     for i in range(3):
@@ -260,9 +271,7 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:
 
 @compiled
 def carry_back(near: Vector, then: Vector, now: Vector) -> None:
-    """Moves the first point of `near` from where it is on a segment (2, 3) to the same point of the
-    segment now.
-    """
+    """Move the first point of `near` from the segment `then` (2, 3) to the same share of `now`."""
     long = whole = 0.0
     for i in range(3):
         way = then[1, i] - then[0, i]
@@ -275,8 +284,10 @@ def carry_back(near: Vector, then: Vector, now: Vector) -> None:
 
 @compiled
 def nearest_to_box(segment: Vector, box: Vector) -> float:
-    """Where along a segment (2, 3), 0 to 1, it is nearest to a box (2, 3) of lower and upper
-    corner: the root of the distance's slope, which grows along the segment.
+    """Share, 0 to 1, of a segment (2, 3) at its point nearest to a box (2, 3).
+
+    The box is given by its lower and upper corner. The slope of the squared distance grows along
+    the segment; bisection finds its root.
     """
     if _slope(segment, box, 0.0) >= 0.0:
         return 0.0
@@ -294,6 +305,10 @@ def nearest_to_box(segment: Vector, box: Vector) -> float:
 
 @compiled
 def _slope(segment: Vector, box: Vector, share: float) -> float:
+    """Half the slope of the squared distance from a box, at the point p at a share of a segment.
+
+    (p - nearest point of the box) · (end - start)
+    """
     total = 0.0
     for i in range(3):
         way = segment[1, i] - segment[0, i]
@@ -304,8 +319,10 @@ def _slope(segment: Vector, box: Vector, share: float) -> float:
 
 @compiled
 def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
-    """Distance of the point at a share of a segment (2, 3) from a box (2, 3); below 0 inside, where
-    the nearest face is the way out.
+    """Signed distance [m] of the point at a share of a segment (2, 3) from a box (2, 3).
+
+    Inside of the box it is negative, minus the distance to the nearest face, and the normal points
+    from that face inward.
     """
     square, least, face, side = 0.0, math.inf, 2, -1.0
     for i in range(3):
@@ -330,9 +347,9 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
 
 @compiled
 def round_to(values: Vector, parts: float) -> None:
-    """Rounds values (3, 3) to so many parts of a unit, in place.
+    """Round values (3, 3) to `parts` parts of a unit, in place.
 
-    Machines that differ in the last bits agree on all that follows.
+    Results that follow are then equal on machines that differ in the last bits.
     """
     for i in range(3):
         for j in range(3):

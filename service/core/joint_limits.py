@@ -1,4 +1,4 @@
-"""What follows from joint limits for the stages that plan joint motion."""
+"""Quantities derived from joint limits, for the stages that plan joint motion."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ LIMIT_MARGIN_RAD = 1e-6  # distance kept from the position limits; rounding alon
 
 
 def acceleration_rate(limits: JointSettings) -> float:
-    """Jerk by acceleration [1/s] of the joint that changes its acceleration most slowly."""
+    """Smallest ratio of jerk to acceleration [1/s], over the joints."""
     return float((np.array(limits.jerk) / np.array(limits.acceleration)).min())
 
 
 def approach_gain(limits: JointSettings) -> Vector:
-    """Greatest speed toward a position limit per distance to it, (J,) [1/s].
+    """Largest speed toward a position limit per distance to it, (J,) [1/s].
 
-    Braking along it takes at most half of the acceleration and a quarter of the jerk.
+        gain = min(acceleration / velocity, sqrt(jerk / velocity)) / 2
+
+    At this gain, braking takes at most half of the acceleration and a quarter of the jerk.
     """
     velocity = np.array(limits.velocity)
     gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))

@@ -1,4 +1,4 @@
-"""The arm at some joints, and what its joints' motion means for the tool."""
+"""Kinematics of the arm at some joints: the tool's pose, and its motion as the joints move."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.core.frame import Records, Vector
 
 
 class Kinematics:
-    """The arm at some joints, as one record (1,), see `Arm.at`."""
+    """The arm at some joints, as one record (1,); `Arm.at` computes it."""
 
     __slots__ = ("record",)
 
@@ -21,43 +21,50 @@ class Kinematics:
 
     @property
     def joints(self) -> Vector:
-        """(J,) [rad]."""
+        """Joint positions (J,) [rad, m]."""
         return self.record["joints"][0]  # type: ignore[no-any-return]
 
     @property
     def position(self) -> Vector:
-        """The tool's (3,) [m], frame base."""
+        """Position of the tool (3,) [m], frame base."""
         return self.record["position"][0]  # type: ignore[no-any-return]
 
     @property
     def rotation(self) -> Vector:
-        """The tool's (3, 3), frame base."""
+        """Rotation of the tool (3, 3), frame base."""
         return self.record["rotation"][0]  # type: ignore[no-any-return]
 
     @property
     def tasks(self) -> Vector:
-        """(5 or 6, J): the tool's velocity by the joints', and what turns it, in its own axes,
-        times the turn lever [m].
+        """Task matrix (5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity.
+
+        Rows 0 to 2 are linear, in frame base; the others turn the tool about its own x, y (and z).
         """
         return self.record["tasks"][0]  # type: ignore[no-any-return]
 
     @property
     def damping(self) -> float:
-        """Of the tasks [m²]."""
+        """Damping of the tasks [m²]."""
         return float(self.record["damping"][0])
 
     @property
     def jacobian(self) -> Vector:
-        """The tool's (6, J), velocity before turning, frame base."""
+        """Jacobian of the tool (6, J), linear before angular rows, frame base."""
         return self.record["jacobian"][0]  # type: ignore[no-any-return]
 
 
 @compiled
 def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float, float]:
-    """Speed of the tool now; the greater of it and the speed once each joint has brought its
-    acceleration to 0; and the sum of what the joints contribute to that [m/s].
+    """Speed of the tool now, its maximum as accelerations are ended, and a bound of both [m/s].
 
-    The sum bounds the speed whatever the joints' motions cancel of each other now.
+    With Jv (3, J) the first rows of the tasks:
+
+        now   = |Jv dq|
+        crest = max(now, |Jv (dq + ddq |ddq| / 2 jerk)|)
+        total = sum over the joints of |Jv_j| (|dq_j| + ddq_j² / (2 jerk_j))
+
+    The second term of crest is the speed once each joint has brought its acceleration to 0. The
+    total is a bound even if the motions of the joints no longer cancel each other.
     """
     tasks = heres[0].tasks
     now = crest = total = 0.0
@@ -77,16 +84,16 @@ def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[
 
 @compiled
 def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
-    """Speed of the tool [m/s] at joint velocities dq (J,), once the joints have moved by `way` (J,)
-    [rad, or m of a sliding joint].
+    """Speed of the tool [m/s] at joint velocities dq (J,), after displacements `way` (J,) [rad, m].
 
-    Exact, by the product of exponentials: joint i is a screw with axis w and moment u = o × w, or
-    with w = 0 and direction u where it slides, as the Jacobian has them now. The joints before it
-    carry both along, by (R, s) = exp(screw_1 way_1) ... exp(screw_(i-1) way_(i-1)):
+    It is exact, by the product of exponentials. A revolute joint i is a screw with axis w and
+    moment u = o × w, o a point of the axis; a prismatic joint has w = 0 and the direction u. Both
+    follow from the present Jacobian. The joints before i move its screw by (R, s) = exp(screw_1
+    way_1) ... exp(screw_(i-1) way_(i-1)):
 
         w' = R w,  u' = R u + s × w',  and with all joints  tool' = R tool + s
 
-    and the speed is |sum dq (u' + w' × tool')|.
+    The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
     """
     here, joints = heres[0], len(dq)
     jacobian, tool = here.jacobian, here.position
@@ -138,9 +145,15 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
 
 @compiled
 def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
-    """Into out (3, 3, J): what a tool velocity, acceleration and jerk cost of each joint's planned
-    limit, by damped least squares that spare the joints with less of it; by order of the
-    derivative, then by axis. The tool turns where that spares joints.
+    """Write the share of each joint's planned limit per unit of tool motion into out (3, 3, J).
+
+    The first index is the order: velocity, acceleration, jerk. The second is the axis i. With Jv
+    (3, J) the first rows of the tasks, S = diag(spared) of the order, and M = Jv S:
+
+        out[order, i] = S M^T (M M^T + damping I)^-1 e_i / (PLANNED_LIMIT_SHARES[order] joint limit)
+
+    These are the damped least-squares joint motions that move the tool along one axis and leave its
+    orientation free. S makes joints with higher limits move more.
     """
     arm, here = arms[0], heres[0]
     joints = here.tasks.shape[1]

@@ -1,4 +1,4 @@
-"""Fastest stops: of one axis, and of several that come to rest together."""
+"""Fastest stops: of one axis, and of several axes that come to rest at the same time."""
 
 from __future__ import annotations
 
@@ -9,24 +9,35 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 
-LEAST_BRAKE_SHARE = 1e-3  # of its acceleration with which an axis waits for the slowest
-BRAKE_SHARE_HALVINGS = 40  # in which that share is found
+LEAST_BRAKE_SHARE = 1e-3  # an axis that waits for the slowest one brakes with at least this share of its limit
+BRAKE_SHARE_HALVINGS = 40  # bisection steps for the share of an axis
 
 
 @compiled
 def fastest_stop(
     velocity: float, acceleration: float, max_acceleration: float, max_jerk: float, dt: float, out: Vector
 ) -> None:
-    """The fastest stop of one axis within `max_acceleration` and `max_jerk`.
+    """Compute the time-optimal change of one axis to rest: velocity 0 and acceleration 0.
 
-    out (6,): velocity, acceleration and way after dt, least and greatest way until rest, duration.
+    The limits are A = `max_acceleration` and J = `max_jerk`. If the acceleration a were brought to
+    0 at once, the velocity would be v + a |a| / 2J. The stop accelerates against the sign of this
+    value. With v and a taken positive in the direction of that acceleration, it has three phases:
+
+        1  jerk J from a to p               p = min(sqrt(a² / 2 - J v), A), at least a
+        2  constant acceleration p          for (-v + (a² - 2 A²) / 2J) / A, if p = A; else none
+        3  jerk -J from p to 0              for p / J
+
+    If a > A, phase 1 has the jerk -J from a to A, and phase 2 lasts (-v - a² / 2J) / A.
+
+    out (6,): velocity, acceleration and displacement after dt; smallest and largest displacement
+    until rest, with 0 among them; duration [s].
     """
     then = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
-    sign = -1.0 if then > 0.0 else 1.0  # with it the stop is a push in positive direction
+    sign = -1.0 if then > 0.0 else 1.0  # in this direction the stop accelerates
     v, a = sign * velocity, sign * acceleration
     peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
     hold = 0.0
-    if a > max_acceleration:  # beyond its limit it comes down to that first
+    if a > max_acceleration:  # an acceleration beyond the limit is first reduced to it
         peak = max_acceleration
         hold = max(-v - a * a / (2.0 * max_jerk), 0.0) / max_acceleration
     elif peak > max_acceleration:
@@ -51,7 +62,7 @@ def fastest_stop(
             after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
             after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
             found = True
-        # the least and greatest way inside the phase are where the velocity is 0
+        # the displacement is extreme where the velocity is 0, or at an end of the phase
         disc = a * a - 2.0 * jerk * v
         for root in (-1.0, 1.0):
             h = 0.0
@@ -78,10 +89,11 @@ def fastest_stop(
 def stop_together(
     velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, dt: float
 ) -> Vector:
-    """One dt of a stop at whose end all axes (J,) come to rest at once, as soon as the slowest can.
+    """One period dt of a stop at whose end all axes (J,) come to rest at the same time.
 
-    (3, J): ways, velocities, accelerations. The others brake less than they could, so that what
-    they move together slows down on its way.
+    Returns (3, J): displacements, velocities, accelerations. The stop lasts as long as the fastest
+    stop of the slowest axis. The other axes brake less than they could (`braking_together`), so
+    that the tool they move slows down along its path.
     """
     count = len(velocities)
     out, stop, slower = np.zeros((3, count)), np.zeros(6), np.empty(count)
@@ -96,7 +108,13 @@ def stop_together(
 def braking_together(
     velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, out: Vector
 ) -> None:
-    """Into out (J,) the accelerations with which all axes come to rest at once."""
+    """Write into out (J,) the deceleration limits with which all axes stop at the same time.
+
+        out_j = share_j max_acceleration_j
+
+    share_j is the smallest share, found by bisection, with which the stop of axis j lasts no longer
+    than the longest of the fastest stops. Axes at rest keep their full limit.
+    """
     stop, duration = np.zeros(6), 0.0
     for i in range(len(velocities)):
         fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], 0.0, stop)

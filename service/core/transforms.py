@@ -1,4 +1,4 @@
-"""The frames by which viewers draw a cell: where arm, tool, setpoint, target and hands are."""
+"""Coordinate frames with which viewers draw a cell: arm, tool, setpoint, target and hands."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from service.contract.records import SIDES
 from service.core.frame import Frame
 from service.urdf import Urdf
 
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # not turned at all
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w without rotation
 
 
 class Frames:
-    """Where viewers find the arm's links, its tool, setpoint, target and hands: each in a parent,
-    all of them one tree. `fixed` are those that never move; `links`: whether the arm's are told.
+    """Transforms of the arm's links, the tool, setpoint, target and hands to their parents.
+
+    All frames form one tree. `fixed`: the transforms that never change. `links`: the arm's links
+    are published too.
     """
 
     def __init__(self, settings: Settings, description: str, *, links: bool = True) -> None:
@@ -29,10 +31,11 @@ class Frames:
             self.fixed.append(Transform(BASE, urdf.root, (0.0, 0.0, 0.0), _UPRIGHT))
 
     def _at(self, joints: Sequence[float]) -> list[Transform]:
+        """Transforms of the arm's links at joints [rad], in chain order; none without `links`."""
         return self._urdf.transforms(dict(zip(self._names, joints, strict=False))) if self._links else []
 
     def moving(self, frame: Frame, joints: Sequence[float]) -> list[Transform]:
-        """Of a frame, with the joints [rad] in chain order; what is not known is left out."""
+        """Transforms of a frame at joints [rad], in chain order; unknown ones are left out."""
         found = [one for one in self._at(joints) if one.child not in self._still]
         setpoint, turn, target, target_turn = (
             tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")

@@ -1,6 +1,4 @@
-"""A rehearsal before there is a deadline: what the loop compiles, or loads compiled from disk, is
-then there.
-"""
+"""Rehearsal of the loop, which compiles or loads all its functions before there are deadlines."""
 
 from __future__ import annotations
 
@@ -26,16 +24,17 @@ from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 from service.core.skill.unseen import deviation_m
 
-FOLLOWED_TICKS = 30  # after the arm is believed
-SAMPLE_EVERY = 5  # ticks, of the hands
+FOLLOWED_TICKS = 30  # ticks of the rehearsal, once the arm's posture is trusted
+SAMPLE_EVERY = 5  # ticks between two samples of the hands
 
 
 def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
-    """Lets a controller that is thrown away follow two hands for a moment, and stop.
+    """Run a temporary controller that follows two hands for a moment, then stops.
 
-    The first hand that a loop sees would otherwise stop it for a fifth of a second, the first ever
-    for many seconds. A skill that is loaded later may know of orientation and gripper: so does the
-    one rehearsed with.
+    Without this, the first hand that a loop receives would delay it by a fifth of a second, or by
+    many seconds on a new machine, where the functions are not compiled yet. A skill that is loaded
+    later may contain an orientation and a gripper. The rehearsal therefore runs with and without
+    them.
     """
     arm = msgspec.structs.replace(settings.arm, source="state")
     plain = replace(skill, threshold=math.inf)
@@ -52,8 +51,10 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
 
 
 def _rarely(settings: Settings, urdf: str) -> None:
-    """What the loop runs only near the tool's greatest speed, on a way out, and with a skill that
-    remembers or whose teacher was late.
+    """Call the functions that the loop needs rarely.
+
+    They run only near the tool's largest speed, on a way out, and with a skill that depends on the
+    past or whose teacher was late.
     """
     limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
     still = np.zeros(len(posture))
@@ -65,6 +66,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
 
 
 def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
+    """Follow two resting hands for FOLLOWED_TICKS, lose sight of one, and hold."""
     controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
     count = still_ticks(settings) + FOLLOWED_TICKS
@@ -74,12 +76,12 @@ def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         controller.step(Tick(index, (*hands, measured)))
-    deviation_m(as_array(controller.state), 0, settings.period_s)  # of a hand that is not seen for a moment
+    deviation_m(as_array(controller.state), 0, settings.period_s)  # runs only for a hand out of sight
     controller.step(Tick(count, (order("hold"),)))
 
 
 def _flat(skill: Skill, outputs: int) -> KMP:
-    """A primitive of the skill's input that says 0 everywhere."""
+    """Primitive with the skill's input whose outputs are 0 everywhere."""
     inputs = skill.model.primitive.inputs[:1]
     nothing = Gaussians(np.zeros((1, outputs)), np.eye(outputs)[None])
     return KMP.fit(inputs, nothing, kernel=GaussianKernel(1.0), lambda_mean=1.0)

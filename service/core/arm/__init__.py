@@ -1,4 +1,4 @@
-"""Stage 6, arm: where the tool is, and the joint velocities that bring it to the setpoint."""
+"""Stage 6, arm: the pose of the tool, and the joint velocities that move it to the setpoint."""
 
 from __future__ import annotations
 

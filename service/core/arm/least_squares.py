@@ -1,5 +1,12 @@
-"""Damped least squares within bounds and under linear inequalities, compiled: active-set methods of
-bounded length, whose answer keeps bounds and limits whatever happens.
+"""Compiled damped least squares with bounds and linear inequalities, by active-set methods.
+
+The variable is x (J,). With tasks (N, J), wanted (N,), posture (J,) and damping > 0, the cost is
+
+    |tasks x - wanted|² + damping |x - posture|²
+
+subject to bounds[0] <= x <= bounds[1] and rows (K, J) x <= limits (K,). The problem is strictly
+convex. The number of rounds is bounded; the result keeps bounds and non-negative limits even if a
+method ends early.
 """
 
 from __future__ import annotations
@@ -23,7 +30,7 @@ from service.core.frame import Vector
 
 @compiled
 def factorise(tasks: Vector, damping: float, root: Vector) -> None:
-    """The lower Cholesky factor of tasks tasks^T + damping I, (N, N) for tasks (N, J)."""
+    """Write the lower Cholesky factor (N, N) of tasks tasks^T + damping I, for tasks (N, J)."""
     for i in range(tasks.shape[0]):
         for j in range(i + 1):
             total = damping if i == j else 0.0
@@ -36,7 +43,7 @@ def factorise(tasks: Vector, damping: float, root: Vector) -> None:
 
 @compiled
 def substitute(root: Vector, right: Vector) -> None:
-    """Solves the equations of a Cholesky factor, in place."""
+    """Solve root root^T y = right, with y in place of `right`."""
     size = len(right)
     for i in range(size):
         for k in range(i):
@@ -59,8 +66,9 @@ def solve(
     limits: Vector,
     x: Vector,
 ) -> bool:
-    """Into x (J,) the solution of `least_squares`, brought under rows (K, J) x <= limits (K,);
-    whether it was not there.
+    """Write into x (J,) the solution under bounds and rows (K, J) x <= limits (K,).
+
+    Returns True if a row changed the solution of `least_squares`.
     """
     least_squares(tasks, wanted, posture, damping, bounds, x)
     return keep_under(tasks, wanted, posture, damping, bounds, rows, limits, x)
@@ -70,8 +78,10 @@ def solve(
 def least_squares(
     tasks: Vector, wanted: Vector, posture: Vector, damping: float, bounds: Vector, result: Vector
 ) -> None:
-    """Into result the x (J,) in bounds (2, J) with least |tasks x - wanted|² + damping |x -
-    posture|², by an active-set method.
+    """Write into `result` (J,) the minimum of the cost within bounds (2, J), without rows.
+
+    A primal active-set method: joints that would leave their bounds are held there; a held joint is
+    released if the cost falls toward the inside.
     """
     joints, count = len(posture), len(wanted)
     free, best = np.ones(joints), np.empty(joints)
@@ -105,7 +115,7 @@ def least_squares(
             rest[i] = -wanted[i]
             for j in range(joints):
                 rest[i] += tasks[i, j] * result[j]
-        leaving, most = -1, LEAST_BOUND_GAIN  # the bound whose inside is better by most
+        leaving, most = -1, LEAST_BOUND_GAIN  # the bound with the steepest descent to its inside
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
@@ -124,8 +134,12 @@ def least_squares(
 def _solve(
     tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
 ) -> None:
-    """The best x (J,) whose joints that are not free (0) stay as held, by the dual of as
-    many equations as there are tasks.
+    """Write into out (J,) the minimum of the cost with some joints held, without bounds.
+
+    Joints with free = 0 keep the value in `held`. With F = diag(free) and x0 the posture of the
+    free joints and the values of the held ones, the dual has as many equations as there are tasks:
+
+        x = x0 + F tasks^T (tasks F tasks^T + damping I)^-1 (wanted - tasks x0)
     """
     joints, count = len(posture), len(wanted)
     part, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
@@ -153,12 +167,14 @@ def keep_under(
     limits: Vector,
     x: Vector,
 ) -> bool:
-    """Brings the solution x (J,) of `least_squares` under rows (K, J) x <= limits (K,); whether it
-    was not there.
+    """Change the solution x (J,) of `least_squares` so that rows (K, J) x <= limits (K,) hold.
 
-    Bounds hold 0. Limits below 0, of what is to be left, are for where all can be kept: else they
-    are taken to be 0. Were the method to end early even so, as its rounds are bounded, the joints
-    are slowed down together until they keep them all.
+    The bounds contain 0. Negative limits demand motion away from something. If not all limits can
+    be kept, negative ones are replaced by 0, so that x = 0 is feasible. If the method still ends
+    early, because its rounds are bounded, x is scaled down until bounds and non-negative limits
+    hold.
+
+    Returns True if x had to be changed.
     """
     if _farthest(bounds, rows, limits, x, LEAST_EXCESS) < 0:
         return False
@@ -183,8 +199,11 @@ def _solve_under(
     limits: Vector,
     x: Vector,
 ) -> None:
-    """`keep_under` by the dual active-set method of Goldfarb and Idnani (Mathematical Programming
-    27, 1983), with the bounds as further rows; as far as it comes where not all can be kept.
+    """Solve the problem of the module, bounds as further rows, by a dual active-set method.
+
+    The method is that of Goldfarb and Idnani (Mathematical Programming 27, 1983): it starts from
+    the minimum without constraints, and adds the most violated one in each round. If not all can be
+    kept, it ends where it could not proceed.
     """
     joints = len(x)
     turned, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
@@ -195,7 +214,7 @@ def _solve_under(
             x[j] += tasks[i, j] * wanted[i]
     factorise(turned, damping, root)
     substitute(root, x)
-    # of those that are met: which, their normals, these by the inverse of the squares, their forces
+    # active constraints: numbers, normals, normals times the inverse Hessian, multipliers
     met, size, force = np.empty(joints, np.int64), 0, np.zeros(joints)
     normals, moved = np.zeros((joints, joints)), np.zeros((joints, joints))
     normal, way, yielding = np.empty(joints), np.empty(joints), np.empty(joints)
@@ -221,7 +240,7 @@ def _solve_under(
         if slope > LEAST_SLOPE and size < joints and beyond <= step * slope:
             leaving, step = -1, beyond / slope
         elif leaving < 0:
-            break  # by rounding, or as not all can be kept
+            break  # not all constraints can be kept, or the rest is rounding
         if slope > LEAST_SLOPE:
             for j in range(joints):
                 x[j] -= step * way[j]
@@ -241,7 +260,7 @@ def _solve_under(
 
 @compiled
 def _share_within(bounds: Vector, rows: Vector, limits: Vector, x: Vector) -> float:
-    """How much of x (J,) keeps bounds and limits, those below 0 taken to be 0."""
+    """Largest share, at most 1, of x (J,) that keeps bounds and limits; limits are at least 0."""
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]
@@ -259,8 +278,10 @@ def _share_within(bounds: Vector, rows: Vector, limits: Vector, x: Vector) -> fl
 
 @compiled
 def _farthest(bounds: Vector, rows: Vector, limits: Vector, x: Vector, least: float) -> int:
-    """The number of the constraint that x (J,) passes by most, -1 if none by more than `least`:
-    upper bounds first, then lower ones, then rows.
+    """Number of the constraint that x (J,) exceeds most; -1 if no excess is above `least`.
+
+    Upper bounds have the numbers 0 ... J - 1, lower bounds J ... 2 J - 1, rows the numbers from 2
+    J.
     """
     joints, found, most = len(x), -1, least
     for j in range(joints):
@@ -279,8 +300,9 @@ def _farthest(bounds: Vector, rows: Vector, limits: Vector, x: Vector, least: fl
 
 @compiled
 def _constraint(number: int, bounds: Vector, rows: Vector, limits: Vector, normal: Vector) -> float:
-    """The limit of a constraint, by the number that `_farthest` gives it; into normal (J,) what of
-    x stays under it.
+    """Limit of the constraint with this number of `_farthest`; write its normal (J,).
+
+    The constraint is normal · x <= limit.
     """
     joints = len(normal)
     if number >= 2 * joints:
@@ -296,7 +318,13 @@ def _constraint(number: int, bounds: Vector, rows: Vector, limits: Vector, norma
 
 @compiled
 def _yield_to(way: Vector, normals: Vector, moved: Vector, size: int, out: Vector) -> None:
-    """Into out how the forces of those that are met change along a way (J,) that they hold back."""
+    """Write into out (size,) the change of the active multipliers per unit of the entering one.
+
+    With the active normals A (size, J), their images M = A H^-1, the direction `way` = H^-1 n of
+    the entering normal n, and H = tasks^T tasks + damping I:
+
+        out = (A M^T)^-1 A way
+    """
     root = np.empty((size, size))
     right = np.empty(size)
     for a in range(size):

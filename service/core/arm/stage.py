@@ -1,6 +1,4 @@
-"""The arm's kinematics: where the tool is, which targets it can reach, and the joint velocities
-that bring it there.
-"""
+"""The arm: kinematics of the tool, and the joint velocities that move it to the setpoint."""
 
 from __future__ import annotations
 
@@ -41,11 +39,10 @@ from service.urdf import Urdf
 
 
 class Solution(NamedTuple):
-    """Joint velocities (J,) [rad/s], and the accelerations (J,) [rad/s²] with which they change as
-    the tool's does.
+    """Joint velocities (J,) [rad/s] and accelerations (J,) [rad/s²] that follow the setpoint.
 
-    Whether they were scaled down to the speed limits; whether a joint is within 0.1 rad of a
-    position limit; whether something is so near that they are others for it.
+    `speed_limited`: the velocities were scaled down to the speed limits. `near_limit`: a joint is
+    within 0.1 rad of a position limit. `separated`: separation changed the velocities.
     """
 
     velocity: Vector
@@ -56,8 +53,10 @@ class Solution(NamedTuple):
 
 
 class Closing(NamedTuple):
-    """How the tool closes in on a position that is far: braking [m/s²], greatest speed [m/s], and
-    the damping [s²] by which it is steady at unreachable ones.
+    """Approach of the tool to a distant position.
+
+    `braking` [m/s²] and `speed` [m/s] limit the closing speed; `far_damping` [s²] damps the joints
+    when the position is out of reach.
     """
 
     braking: float
@@ -68,9 +67,8 @@ class Closing(NamedTuple):
 class Arm:
     """The arm that a URDF describes, with a tool on its plate.
 
-    Stateless: every answer follows from the arguments.
-
-    J joints, in the order of the settings; all others of the description stay at 0.
+    It has no state: every result depends on the arguments only. J joints, in the order of the
+    settings; all other joints of the description stay at 0.
     """
 
     def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
@@ -146,7 +144,7 @@ class Arm:
         self._unseparated = Separation.constraints_for(joints, 0)
 
     def at(self, q: Vector) -> Kinematics:
-        """The arm at joints q (J,) [rad, m]."""
+        """Kinematics of the arm at joints q (J,) [rad, m]."""
         q = np.minimum(np.maximum(q, -MAX_JOINT_RAD), MAX_JOINT_RAD)
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
@@ -157,23 +155,25 @@ class Arm:
         return Kinematics(here)
 
     def costs(self, here: Kinematics) -> Vector:
-        """What a tool velocity, acceleration and jerk cost of each joint's limit, 1 for all of it.
+        """Share of each joint's planned limit per unit of tool velocity, acceleration and jerk.
 
-        (3, 3, J): by order of the derivative, then by axis. The tool turns where it spares joints.
+        (3, 3, J): by order of the derivative, then by axis. See `joint_costs`.
         """
         out = np.empty((3, 3, len(self._jerk)))
         joint_costs(self.parameters, here.record, out)
         return out
 
     def speeds(self, here: Kinematics, dq: Vector, ddq: Vector) -> tuple[float, float]:
-        """Speed of the tool [m/s] at joint velocities and accelerations (J,) [rad/s, rad/s²]; and
-        the most it comes to as these accelerations are brought to 0.
+        """Speed of the tool [m/s], and its maximum as the joints' accelerations are ended.
+
+        The maximum is the larger one of the speed now, and the speed once each joint has brought
+        its acceleration to 0. Joint velocities and accelerations are (J,) [rad/s, rad/s²].
         """
         now, crest, _ = _tool_speeds(here.record, dq, ddq, self._jerk)
         return now, crest
 
     def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
-        """Joint velocities that bring the tool to the state's setpoint, as `step` says."""
+        """Joint velocities that move the tool to the state's setpoint; see `step`."""
         out = np.empty((2, len(self._jerk)))
         constraints, count = separation.constraints, separation.count
         return _solution(
@@ -191,14 +191,16 @@ class Arm:
         moving: Vector | None = None,
         separation: Separation | None = None,
     ) -> Solution:
-        """Joint velocities that bring the tool to `position` (3,) [m] one period later, at
-        `velocity` (3,) [m/s].
+        """Joint velocities that move the tool to `position` (3,) [m] in one period.
 
-        The tool turns to `orientation` (4,), which turns at `turning` (3,) [rad/s]: all of it or,
-        as the settings say, its +z only, at any angle about it. Position goes before orientation,
-        both before the posture; where joints that are `moving` (J,) [rad/s] cannot have both at
-        once, it turns later. `separation` was updated there and goes before all. Never raises nor
-        returns NaN for finite arguments.
+        It then moves at `velocity` (3,) [m/s]. The tool also turns to `orientation` (4,), which
+        itself turns at `turning` (3,) [rad/s]. If the settings say so, it turns only its +z there,
+        at any angle about it. The constraints of `separation`, which must be those of joints q,
+        have the highest priority; then position, orientation, posture. If joints that move at
+        `moving` (J,) [rad/s] cannot reach the velocities for both position and orientation soon,
+        the turn is delayed.
+
+        Never raises, and never returns NaN for finite arguments.
         """
         goal, out = self._goal[0], np.empty((2, len(self._jerk)))
         goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation

@@ -1,8 +1,8 @@
-"""The arm's differential inverse kinematics, compiled.
+"""Compiled differential inverse kinematics of the arm.
 
-One step is a strictly convex least-squares problem with a bound on each joint's speed toward its
-limits, so that its solution is unique and continuous: unreachable targets and singular postures
-slow the arm, without chatter.
+A step minimises a strictly convex quadratic cost, with bounds on the speed of each joint toward its
+limits. The solution is therefore unique and continuous in position and velocity: at unreachable
+targets and near singular postures the arm slows down without chatter.
 """
 
 from __future__ import annotations
@@ -25,16 +25,21 @@ from service.core.arm.tuning import (
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
 
-SPEED = 1  # flag of a step: a joint's speed limit was met
-NEAR = 2  # a joint is near its position limit
-SEPARATED = 4  # separation asked for other velocities
+SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
+NEAR = 2  # flag of a step: a joint is near its position limit
+SEPARATED = 4  # flag of a step: separation changed the velocities
 
 
 @compiled
 def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) -> None:
-    """Into the kinematics at some joints the tool's Jacobian (6, J), rotation (3, 3), and tasks (5
-    or 6, J), of which the sixth turns it about its +z; their damping [m²]: small, and growing
-    smoothly where the tool's position becomes singular.
+    """Write Jacobian, rotation, task matrix and damping of the arm at some joints.
+
+    With the tool's Jacobian (6, J) = (Jv; Jw), rotation R (3, 3) and the turn lever l [m]:
+
+        tasks (5 or 6, J) = (Jv; l R^T Jw)                row 5, if present, is the turn about +z
+        damping [m²] = damping0 + singular_damping max(1 - sqrt(det(Jv Jv^T)) / singular_volume, 0)²
+
+    With 5 tasks, the last row of R^T Jw is left out.
     """
     arm, here = arms[0], heres[0]
     joints, square, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
@@ -64,8 +69,11 @@ def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) 
 
 @compiled
 def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
-    """Adds to a forward speed (3,) [m/s] as much of a closing speed as keeps the sum at most
-    `most`.
+    """Add to `forward` (3,) [m/s] the largest share of the velocity `closing` within a speed limit.
+
+        forward + share closing,    0 <= share <= 1,    norm <= most
+
+    If `forward` alone exceeds `most`, it is first scaled down to it.
     """
     ff = fc = cc = 0.0
     for i in range(3):
@@ -89,7 +97,7 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 def follow(
     arms: Records, heres: Records, states: Records, goals: Records, constraints: Records, count: int, out: Vector
 ) -> int:
-    """`joint_step` toward the state's setpoint, for joints that move as the state's."""
+    """Run `joint_step` toward the state's setpoint, with the state's joint velocities."""
     state, goal = states[0], goals[0]
     goal.position[:], goal.velocity[:] = state.setpoint[0], state.setpoint[1]
     goal.orientation[:], goal.turning[:] = state.orientation, state.turning
@@ -99,7 +107,38 @@ def follow(
 
 @compiled
 def joint_step(arms: Records, heres: Records, goals: Records, constraints: Records, count: int, out: Vector) -> int:
-    """`Arm.step` into out (2, J) [rad/s, rad/s²], under the first `count` constraints; flags."""
+    """Write joint velocities and accelerations into out (2, J) [rad/s, rad/s²]; return flags.
+
+    The quadratic programme, with T = tasks S and S = diag(scale):
+
+        minimise    |T x - (v; l R^T w)|² + damping |x - h|²
+        subject to  -approach_gain max(q - lower, 0) <= S x <= approach_gain max(upper - q, 0)
+                    row_k S x <= planned_k,    k < count        (separation)
+
+        x (J,)      joint velocities divided by `scale`
+        v (3,)      target velocity of the tool [m/s], see below
+        w (3,)      target angular velocity of the tool [rad/s], from `_turn`
+        l, R        turn lever [m] and rotation (3, 3) of the tool
+        h (J,)      velocities toward the configured posture, at most POSTURE_SPEED_RADPS each
+        damping     of `describe`, plus far_damping max(rate |e| - FAR_SPEED_MPS, 0)²
+
+    With u the goal's velocity, e = goal position - position - period u, g the position gain and B
+    the closing braking:
+
+        v     = u + share rate e / (1 + g period),    0 <= share <= 1,    |v| <= max_tool_speed
+        rate  = g                                                         if |e| <= B / g²
+        rate  = min(sqrt(2 B (|e| - B / 2g²)), closing_speed) / |e|       otherwise
+
+    If a row changed the solution, the programme is solved again with more damping, by
+    singular_damping m / (m + kept_speed²), where m = |v - T x|² in the first three rows of T.
+
+    If no row changed it, and the joints cannot reach it soon (`_can_have`), `_turn_less` moves it
+    toward the solution of the first three rows alone, in which idle joints brake.
+
+    Finally all velocities are scaled down together to the speed limits. The accelerations minimise
+    |T y - (goal acceleration)|² + damping |y|², in the first three rows, within the acceleration
+    limits.
+    """
     arm, here, goal = arms[0], heres[0], goals[0]
     tasks, scale, damping = here.tasks, arm.scale, here.damping
     count_of_tasks, joints = tasks.shape
@@ -110,14 +149,14 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M) - arm.period_s * linear[i]
         distance += error[i] * error[i]
     distance = math.sqrt(distance)
-    # in proportion to the error when near, braking evenly from afar
+    # rate is constant for small errors; large errors are closed at constant deceleration
     near = arm.closing_braking / arm.position_gain**2
     rate = arm.position_gain
     if distance > near:
         rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
     excess = max(rate * distance - FAR_SPEED_MPS, 0.0)
     damping += arm.far_damping * excess * excess
-    for i in range(3):  # the error decays as it will be, not as it is
+    for i in range(3):  # implicit step: in proportion to the error at the end of the period
         error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)
     _add_closing(linear, error, arm.max_tool_speed)
     _turn(arms, here.rotation, goal.orientation, goal.turning, count_of_tasks == 6, turn)
@@ -133,7 +172,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
         off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED_RADPS * arm.per_rad[j]
-        if arm.is_continuous[j]:  # in whichever turn; 0 half a turn away, as no direction is shorter there
+        if arm.is_continuous[j]:  # any number of turns away; 0 at half a turn, where no direction is shorter
             off = math.sin(off)
         home[j] = min(max(POSTURE_GAIN_PER_S * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
@@ -152,13 +191,13 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     near = _can_have(arms, goals, velocity)
     scaled[3:], wanted[3:] = 0.0, 0.0
-    if not near:  # it turns as far as costs its position nothing
+    if not near:  # the turn is reduced, so that the position is kept
         free = np.empty(joints)
         for j in range(joints):
             brake = IDLE_BRAKE_SHARE * arm.period_s * arm.acceleration[j]
             home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
-        if not kept:  # what keeps distances was found for this solution, not for one on the way to it
+        if not kept:  # a mixture of two solutions need not keep the rows as well as the first one
             _turn_less(arms, goals, velocity, free)
     excess = _excess(arms, velocity)
     wanted[:3], home[:] = goal.acceleration, 0.0
@@ -175,9 +214,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
 
 @compiled
 def _missing(tasks: Vector, wanted: Vector, x: Vector) -> float:
-    """The square of the tool's velocity [m²/s²] that a solution x (J,) lacks: |wanted - tasks x|²,
-    over the first three rows of tasks (N, J).
-    """
+    """Squared error [m²/s²] of the tool's velocity at x (J,): |wanted - tasks x|², linear rows."""
     total = 0.0
     for i in range(3):
         lacks = wanted[i]
@@ -189,7 +226,7 @@ def _missing(tasks: Vector, wanted: Vector, x: Vector) -> float:
 
 @compiled
 def _excess(arms: Records, out: Vector) -> float:
-    """How many times its greatest speed the fastest joint needs; NaN where one is not finite."""
+    """Largest ratio of a joint's speed to its limit; NaN if a velocity is not finite."""
     excess = 0.0
     for j in range(len(out)):
         if not math.isfinite(out[j]):
@@ -200,7 +237,10 @@ def _excess(arms: Records, out: Vector) -> float:
 
 @compiled
 def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
-    """Whether the joints can soon have the velocities of a solution (J,)."""
+    """True if the joints can reach the velocities of a solution (J,) within horizon_s.
+
+    |S x| <= max_velocity    and    |S x - moving| <= horizon_s acceleration
+    """
     arm, goal = arms[0], goals[0]
     for j in range(len(out)):
         wanted = out[j] * arm.scale[j]
@@ -212,8 +252,13 @@ def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
 
 @compiled
 def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None:
-    """Brings a solution (J,) as near to that of a tool that is free to turn as it has to be for
-    joints that can have it.
+    """Move a solution x (J,) toward `free` (J,) until the joints can reach its velocities.
+
+        x = free + share (x - free)
+
+    with the largest share in 0 ... 1 at which each joint is within the velocities that it can reach
+    in horizon_s, or no further outside than at `free`. `free` is the solution in which the tool may
+    turn as it likes.
     """
     arm, goal, share = arms[0], goals[0], 1.0
     for j in range(len(out)):
@@ -231,8 +276,12 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
 
 @compiled
 def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector) -> None:
-    """Into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,) that
-    turns itself (3,) [rad/s]: all of it, also `about` its +z, or that the shortest way.
+    """Write into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,).
+
+        turn_gain e + turning, scaled down to max_turn_speed
+
+    e (3,) [rad] is the rotation vector to the orientation or, unless `about` is set, the shortest
+    turn of +z to its +z. The result is 0 if it is not finite.
     """
     here, max_speed = np.empty(4), arms[0].max_turn_speed
     if about:

@@ -1,11 +1,13 @@
-"""The last stage: joint commands that hold every limit, whatever is wanted.
+"""Limiter stage, the last one: joint commands within all limits, for any wanted velocities.
 
-Each joint moves by one tick at constant jerk toward the wanted velocity where its limits leave room
-for that, and by Ruckig's time-optimal profile where they do not. That profile ends on the ramp by
-which the wanted velocity goes on: one that ended at rest on it would be late all along the ramp. A
-step is taken only if a stop after it stays within the position limits; else the joint stops now. As
-the step before was taken on the same condition, that stop is feasible too: the limits hold by
-induction, for any sequence of wanted velocities.
+In a tick each joint moves at constant jerk toward the wanted velocity, if its limits allow this. If
+not, it follows Ruckig's time-optimal profile. That profile ends on the ramp of the wanted velocity,
+in a frame that moves with the ramp: a profile that ended without acceleration would lag behind the
+ramp.
+
+A step is taken only if a stop after it stays within the position limits; otherwise the joint begins
+its stop in this tick. The step before was taken on the same condition, so this stop is feasible
+too. The limits therefore hold by induction, for any sequence of wanted velocities.
 """
 
 from __future__ import annotations
@@ -37,8 +39,9 @@ from service.core.stops import stop_together
 
 
 class Limited(NamedTuple):
-    """The joints one period later, (J,) each [rad, rad/s, rad/s²]; whether a limit kept them from
-    what was wanted.
+    """Joint positions, velocities and accelerations (J,) [rad, rad/s, rad/s²] one period later.
+
+    `limited`: a limit kept the joints from the wanted velocity.
     """
 
     position: Vector
@@ -50,9 +53,10 @@ class Limited(NamedTuple):
 class Limiter:
     """Position, velocity, acceleration and jerk limits of J joints.
 
-    Keeps nothing from tick to tick: it continues bit for bit from its output. The limits hold from
-    any state that a stop can still save. A joint at rest outside its position limits may move
-    inwards only; one that comes faster than its limits is brought back into them as jerk allows.
+    It has no memory: it continues from its own output, bit for bit. The limits hold from every
+    state from which a stop can still keep them. A joint at rest outside of its position limits may
+    only move inward. A joint that starts faster than its limits is brought back into them within
+    its jerk limit.
     """
 
     def __init__(self, limits: JointSettings, period_s: float) -> None:
@@ -77,11 +81,12 @@ class Limiter:
         self._trajectory = ruckig.Trajectory(count)
 
     def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
-        """The joints one period later on the way to `velocity`, which goes on by
-        `acceleration`, or stays; all (J,) [rad, rad/s, rad/s²].
+        """Joints one period later, on the way to `velocity`, which changes at `acceleration`.
 
-        A NaN in either means stop. A state that is not finite stays as it is, at velocity 0.
-        Never raises.
+        All arguments are (J,) [rad, rad/s, rad/s²]; without `acceleration` the velocity is
+        constant. A NaN in either of the two requests a stop. Joints in a state that cannot be
+        calculated with (not finite, or too large) keep their positions, at velocity 0. Never
+        raises.
         """
         state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.zeros((2, len(q)))
         state[0], state[1], state[2] = q, dq, ddq
@@ -92,24 +97,27 @@ class Limiter:
             return _stuck(q)
         if met & CHASED:
             self._chase(state, wanted, moved)
-            if forget_fast(state, moved, self._parameters):  # where the wanted velocity does not change as was said
+            if forget_fast(state, moved, self._parameters):  # joints that become too fast: again, without the ramp
                 wanted[1] = 0.0
                 self._chase(state, wanted, moved)
             make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=met > 0)
 
     def together(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector) -> Limited | None:
-        """As `step`, by velocities between those now and those wanted: an inequality that both keep
-        is kept on the way. None where the joints' accelerations do not allow for that.
+        """Joints one period later, all by the same share of the change to `velocity` (J,).
+
+        The new velocities lie between the present ones and the wanted ones. So a linear inequality
+        that both satisfy is satisfied on the way too. Returns None if the joints' accelerations do
+        not allow a common share.
         """
         share = common_share(np.stack((q, dq, ddq, velocity)), self._parameters)
         return self.step(q, dq, ddq, dq + share * (velocity - dq)) if share >= 0.0 else None
 
     def stop(self, q: Vector, dq: Vector, ddq: Vector) -> Limited:
-        """The joints one period later on the way to rest, at which all come at once and as soon as
-        they can: so the tool slows down along its way. `limited` until they are there.
+        """Joints one period later in a stop, in which all joints come to rest at the same time.
 
-        Never raises.
+        The stop is as fast as the slowest joint allows, and the tool slows down along its path.
+        `limited` is true until the joints rest. Never raises.
         """
         state = np.stack((q, dq, ddq))
         if not is_usable(state):
@@ -121,24 +129,26 @@ class Limiter:
         return _frozen(moved, limited=bool(moved[1].any()))
 
     def speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
-        """The greatest speed [m/s] of the tool in a stop after a step that brought the arm here."""
+        """Largest speed [m/s] of the tool in a stop after the step `moved`, from `here` on."""
         speed: float = speed_in_stop(*moved[1:3], here.record, self._parameters)
         return speed
 
     def _chase(self, state: Vector, wanted: Vector, moved: Vector) -> None:
-        """Puts those joints of `moved` (3, J) that are NaN one period along Ruckig's profile to the
-        wanted velocities, as seen from what moves at these and their accelerations (2, J); or on
-        the fastest stop where there is none.
+        """Move the joints that are NaN in `moved` (3, J) one period along Ruckig's profile.
+
+        The profile ends at the wanted velocities and accelerations (2, J). It is computed in a
+        frame that moves with them: there it ends at rest, and the acceleration limits are shifted
+        by the ramp. If Ruckig finds no profile, the joints stay NaN, and `make_safe` stops them.
         """
         dt, most, ramp = self._period, self._parameters["max_acceleration"][0], wanted[1]
-        velocity = wanted[0] - dt * ramp  # now: they are wanted a period later
+        velocity = wanted[0] - dt * ramp  # wanted[0] is the velocity at the end of the period
         self._input.current_position = state[0].tolist()
         self._input.current_velocity = (state[1] - velocity).tolist()
         self._input.current_acceleration = (state[2] - ramp).tolist()
         self._input.max_acceleration, self._input.min_acceleration = (most - ramp).tolist(), (-most - ramp).tolist()
         try:
             self._ruckig.calculate(self._input, self._trajectory)
-        except (ruckig.RuckigError, ValueError):  # ValueError: a result that the binding has no name for
+        except (ruckig.RuckigError, ValueError):  # ValueError: a result code that the Python binding lacks
             return
         chased = np.array(self._trajectory.at_time(dt))
         chased[0] += dt * (velocity + 0.5 * dt * ramp)
@@ -148,28 +158,33 @@ class Limiter:
 
 
 def _stuck(q: Vector) -> Limited:
+    """Joints at rest at the positions q (J,)."""
     return _frozen(np.stack((q, np.zeros(len(q)), np.zeros(len(q)))), limited=True)
 
 
 def _frozen(moved: Vector, *, limited: bool) -> Limited:
+    """Read-only `Limited` of joints `moved` (3, J)."""
     moved.setflags(write=False)
     return Limited(moved[0], moved[1], moved[2], limited)
 
 
 class Moved(NamedTuple):
-    """What came of a step: where the arm is then; whether a limit kept the joints from what was
-    wanted, and whether that was separation; the tool's speed [m/s] where it is too fast, else 0.
+    """Result of a step of the stage.
+
+    `here`: kinematics at the new joints. `limited`: a limit kept the joints from the wanted
+    velocities. `separated`: this limit was separation. `too_fast`: speed of the tool [m/s] if it
+    exceeds max_speed, else 0. `moving`: the joints moved before the step.
     """
 
     here: Kinematics
     limited: bool
     separated: bool
     too_fast: float
-    moving: bool  # before
+    moving: bool
 
 
 class LimiterStage:
-    """Moves the state's joints (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
+    """Joints of the state (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm, self._max_speed = arm, settings.tool.max_speed
@@ -177,17 +192,21 @@ class LimiterStage:
         self._still, self._jerk = np.zeros(len(settings.joints.names)), np.array(settings.joints.jerk)
 
     def begin(self, state: Record, joints: Vector) -> None:
-        """The joints (J,) [rad] at rest where the arm is."""
+        """Start with the joints (J,) [rad] at rest."""
         state["joints"] = 0.0
         state["joints"][0] = joints
 
     def step(self, state: Record, frame: Record, wanted: Vector, ramp: Vector, separation: Separation) -> Moved:
-        """Moves the joints on toward wanted velocities (J,) [rad/s], which go on by a ramp (J,)
-        [rad/s²].
+        """Move the joints one period toward velocities `wanted` (J,), which change at `ramp` (J,).
 
-        They brake where the tool would pass its greatest speed, and one that does all the same is
-        too fast. Where they would approach something too fast on the way, which each goes as fast
-        as it can, they go it together, or brake, or, where that brakes less, change the least.
+        If the step exceeds an `allowed` limit of separation, try in order: the synchronised step
+        (`Limiter.together`), if it exceeds none; a stop; the smallest correction of the present
+        velocities (`Separation.less`), if the stop exceeds as much as the step. The result is taken
+        if it exceeds less than the step.
+
+        If the tool would come too near its speed limit, in the step or in the stop after it, the
+        joints stop. If the tool exceeds its limit in this stop, its speed is reported as
+        `too_fast`.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted, ramp)
@@ -197,7 +216,7 @@ class LimiterStage:
             other = self._limiter.together(q, dq, ddq, wanted)
             if other is None or separation.excess(*other[1:3]) > 0.0:
                 other = self._limiter.stop(q, dq, ddq)
-            if separation.excess(*other[1:3]) >= excess:  # these two in turn would be neither
+            if separation.excess(*other[1:3]) >= excess:  # alternating between step and stop would end neither
                 other = self._limiter.step(q, dq, ddq, separation.less(dq, moved[1:3]))
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
@@ -211,8 +230,11 @@ class LimiterStage:
         return Moved(here, limited, separated, too_fast, moving)
 
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
-        """Move the joints one period on their way to rest: all together, or each as fast as it can
-        where that approaches things less and does not bring the tool beyond its speed limit.
+        """Move the joints one period further in a stop.
+
+        All joints come to rest at the same time. If this exceeds a limit of separation, each joint
+        stops as fast as it can instead, provided that this exceeds less, and that the tool keeps
+        its speed limit or is no faster than in the common stop.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.stop(q, dq, ddq)
@@ -228,10 +250,14 @@ class LimiterStage:
         return Moved(here, limited=False, separated=False, too_fast=0.0, moving=moving)
 
     def _comes_to(self, moved: Limited, here: Kinematics) -> float:
-        """Greatest speed [m/s] of the tool if the joints stop after a step.
+        """Largest speed [m/s] of the tool if the joints stop after the step `moved`.
 
-        The stop is sampled only where it may pass the limit. That includes all speeds above 77 % of
-        the limit, since the sum of what the joints contribute is at least the speed.
+        The stop is sampled only if the tool may exceed its limit there:
+
+            speed + CANCELLED_MOTION_SHARE total > max_speed
+
+        where total, the sum of the joints' contributions, is at least the speed. All speeds above
+        max_speed / (1 + CANCELLED_MOTION_SHARE), 77 % of the limit, are therefore sampled.
         """
         _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
         most = self._max_speed

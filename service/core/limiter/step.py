@@ -1,4 +1,4 @@
-"""The limiter's compiled step: see `stage` for the method."""
+"""Compiled step of the limiter: `stage` describes the method."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from service.core.kinematics import tool_speed_after
 from service.core.limiter.tuning import INSIDE_LIMIT_SHARE, LARGEST_USABLE, LEAST_CHANGE_RADPS, STOP_SAMPLES
 from service.core.stops import braking_together, fastest_stop
 
-BOUNDED = 1  # flag of a step: the wanted velocity was cut
-CHASED = 2  # some joint cannot have it in a tick
-UNSAFE = 4  # some joint could not have stopped after it
-UNUSABLE = -1  # the state cannot be calculated with
+BOUNDED = 1  # flag of a step: a wanted velocity was limited
+CHASED = 2  # flag of a step: a joint cannot reach its velocity in a tick at constant jerk
+UNSAFE = 4  # flag of a step: a joint could not stop within its limits after the step, so it stops now
+UNUSABLE = -1  # result of a step: the state is not finite, or too large
 
 
 @compiled
 def step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
-    """As `_toward`, and made safe where no joint is to be chased; UNUSABLE for such a state."""
+    """Run `_toward`, and `make_safe` if no joint needs Ruckig's profile; return the flags.
+
+    Returns UNUSABLE, and changes nothing, if the state cannot be calculated with.
+    """
     if not is_usable(state):
         return UNUSABLE
     met = _toward(state, velocity, parameters, wanted, moved)
@@ -33,12 +36,25 @@ def step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, m
 
 @compiled
 def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
-    """Into `wanted` (2, J) the velocity within speed limits, slower near position limits, and as
-    much of its acceleration, which it is given, as keeps it there; into `moved` (3, J) each joint
-    one tick on at the jerk that reaches it, NaN where a limit forbids.
+    """Move each joint one period toward its wanted velocity at constant jerk; return flags.
 
-    A smooth input passes without lag: its ramps leave the acceleration as it is. A time-optimal
-    profile, which ends without acceleration, would lag behind them by acceleration² / 2 jerk.
+    With q, v, a of a joint, u its wanted velocity and r the ramp of u (wanted[1] on entry):
+
+        lowest  = max(-max_velocity, approach_gain min(lower - q, 0))
+        highest = min( max_velocity, approach_gain max(upper - q, 0))
+        aim     = u, limited to lowest ... highest
+        ramp    = r, limited to ± min(max_acceleration, sqrt(2 max_jerk room))
+        a' = (aim - v) / dt,    jerk = (a' - a) / dt
+        v' = v + dt (a + a') / 2
+        q' = q + dt v + dt² (a / 3 + a' / 6)
+
+    room is the distance of aim from `highest` (from `lowest` for a negative ramp). `wanted` (2, J)
+    receives aim and ramp; `moved` (3, J) receives q', v', a', or NaN where jerk, acceleration,
+    speed, or the speed once a' has been brought to 0, exceed a limit (CHASED). Outside of the
+    position limits that speed must point inward. A NaN among u or r requests a stop of all joints.
+
+    A smooth input passes without lag: on a ramp, a' = a and v' = aim. A time-optimal profile that
+    ends without acceleration would lag behind it by acceleration² / 2 jerk.
     """
     given, met, stopping = parameters[0], 0, False
     dt = given.period_s
@@ -58,7 +74,7 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
         wanted[0, i], wanted[1, i] = aim, min(max(ramp, -most), most)
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
-        crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # when acceleration has come to 0
+        crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # speed once the acceleration is 0
         outside = int(q > given.upper[i]) - int(q < given.lower[i])
         if (
             outside * crest <= 0.0
@@ -76,8 +92,10 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
 
 @compiled
 def forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
-    """Makes those joints of `moved` (3, J) NaN that pass their greatest speed on the way from where
-    they are, or as their acceleration comes to 0; whether there are some.
+    """Set the joints of `moved` (3, J) that exceed their speed limit to NaN; True if there are any.
+
+    The velocity counts at the end of the period, on average over it, and once the acceleration has
+    been brought to 0.
     """
     given, found = parameters[0], False
     for i in range(moved.shape[1]):
@@ -91,8 +109,15 @@ def forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
 
 @compiled
 def common_share(state: Vector, parameters: Records) -> float:
-    """The greatest share of the way to the wanted velocities, the last row of state (4, J), that
-    all joints can go in a tick without passing these, as their acceleration comes to 0; -1: none.
+    """Largest share of the change of velocity that all joints can make in a tick; -1 for none.
+
+    `state` (4, J): position, velocity v, acceleration a, wanted velocity u. With d = u - v, a taken
+    positive along d, and a' = share |d| / dt the acceleration after the tick, each joint needs
+
+        a - max_jerk dt <= a' <= min(a + max_jerk dt, max_acceleration)
+        dt (a + a') / 2 + a'² / (2 max_jerk) <= |d|,    so that it does not pass u
+
+    and 0 <= share <= 1.
     """
     given, least, most = parameters[0], 0.0, 1.0
     dt = given.period_s
@@ -109,8 +134,13 @@ def common_share(state: Vector, parameters: Records) -> float:
 
 @compiled
 def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
-    """Rounds the moved joints (3, J); those that could not stop within their position limits after
-    it, or that are NaN, go on the fastest stop instead. Whether there were none.
+    """Round the positions, and replace the step of each joint that could not stop after it.
+
+    A step is replaced if the stop after it would leave the position limits, or if it is NaN. In
+    `moved` (3, J) the joint then moves along its fastest stop from `state`. For a joint outside of
+    its limits, its position is the limit.
+
+    Returns True if no joint was replaced.
     """
     given, safe, stop = parameters[0], True, np.empty(6)
     dt = given.period_s
@@ -128,7 +158,7 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
 
 @compiled
 def is_usable(state: Vector) -> bool:
-    """Whether a state (3, J) is finite, and small enough to calculate with: false for NaN too."""
+    """True if all numbers of a state (3, J) are finite and smaller than LARGEST_USABLE."""
     for row in state:
         for value in row:
             if not abs(value) < LARGEST_USABLE:
@@ -138,11 +168,11 @@ def is_usable(state: Vector) -> bool:
 
 @compiled
 def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) -> float:
-    """Greatest speed [m/s] of the tool at STOP_SAMPLES times of a stop that lasts D, at
+    """Largest speed [m/s] of the tool at STOP_SAMPLES - 1 times of a stop with the duration D:
 
-        t_k = D (k / STOP_SAMPLES)²,    k = 1 ... STOP_SAMPLES - 1,
+        t_k = D (k / STOP_SAMPLES)²,    k = 1 ... STOP_SAMPLES - 1
 
-    close together at its begin, where the joints end their accelerations.
+    The times are dense at the beginning, where the joints end their accelerations.
     """
     given, joints = parameters[0], len(dq)
     braking, stop, way, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
@@ -164,7 +194,10 @@ def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) 
 def take(
     states: Records, frames: Records, heres: Records, position: Vector, velocity: Vector, acceleration: Vector
 ) -> bool:
-    """Into state and frame the joints, and where they put the tool; whether they moved before."""
+    """Write the new joints into state and frame, and the tool's pose into the frame.
+
+    Returns True if the joints moved before.
+    """
     state, frame, here, moving = states[0], frames[0], heres[0], False
     for joint in range(len(position)):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0

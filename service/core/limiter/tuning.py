@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-LARGEST_USABLE = 1e6  # a state with a larger number is not calculated with
-STOP_SAMPLES = 16  # times along the braking trajectory at which the tool's speed is checked
+LARGEST_USABLE = 1e6  # a state with a larger number is rejected
+STOP_SAMPLES = 16  # the tool's speed is checked at 15 times, which divide the stop into 16 parts
 STOP_SPEED_SHARE = 0.99  # the joints stop when the tool's speed in a stop would exceed this share of max_speed
 # Joints end their accelerations at different times in a stop, so their motions cancel less of each
 # other: the tool gains at most this share of the sum of what they contribute (0.16 seen).

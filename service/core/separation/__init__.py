@@ -1,4 +1,4 @@
-"""Stage 4, separation: how fast the parts of the arm may approach hands, things and each other."""
+"""Stage 4, separation: speed limits of the arm's parts toward hands, things and each other."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from service.contract.records import Field, Layout
 
 STATE: Layout = ()
 FRAME = (
-    Field("hand_distance", "float64"),  # from the nearest hand to the arm, before this tick's motion; 3 at most [m]
-    Field("hand_limit", "float64"),  # least speed toward a hand that is allowed at some part of the arm [m/s]
+    Field("hand_distance", "float64"),  # [m] from the arm to the nearest hand, before this tick's motion; at most 3
+    Field("hand_limit", "float64"),  # [m/s] smallest of the speeds at which the arm's parts may approach a hand
 )

@@ -1,7 +1,8 @@
-"""The arm's body: capsules around the collision shapes of its links, and which of them could meet.
+"""The arm's body: capsules around the shapes of its links, and the pairs that can collide.
 
-A capsule covers its shape: box and cylinder with the least volume that does, a mesh as it says. A
-link without a shape is a capsule from its joint to the next, of a configured radius.
+Each capsule covers one shape. For a box, along its longest side, and for a cylinder it has the
+least volume; for a mesh the description gives it. A link without a shape gets a capsule from its
+joint to the next one, with a configured radius.
 """
 
 from __future__ import annotations
@@ -20,18 +21,19 @@ from service.urdf import Joint, Shape, Urdf
 
 
 def own_clearance(settings: Settings) -> float:
-    """How far parts of the arm keep from each other [m]."""
+    """Distance [m] kept between parts of the arm."""
     return min(settings.obstacles.clearance, OWN_CLEARANCE_M)
 
 
 class Body(NamedTuple):
-    """Capsules of an arm of J joints, and how they move.
+    """Capsules of an arm of J joints, and how the joints move them.
 
-    `frames` (J, 3, 4): each joint in the frame of the one before, at 0; `axes` (J, 4) in its own,
-    then 1 for a joint that slides along it, 0 for one that turns about it.
-    `capsules` (N,): `link`, how many joints move it; `ends` (2, 3) [m] in the frame of the last of
-    these joints, or in base; `radius` [m]; `max_speed` [m/s], which no point of its axis passes.
-    `pairs` (P, 2): capsules that are kept apart.
+    `frames` (J, 3, 4): pose of each joint in the frame of the joint before it, at position 0.
+    `axes` (J, 4): axis of each joint in its own frame, then 1 for a prismatic and 0 for a revolute
+    joint. `capsules` (N,): `link`, the number of joints that move the capsule; `ends` (2, 3) [m] in
+    the frame of the last of these joints, or in base for none; `radius` [m]; `max_speed` [m/s], an
+    upper bound of the speed of every point of its axis. `pairs` (P, 2): numbers of the capsules
+    that are kept apart.
     """
 
     frames: Vector
@@ -41,11 +43,12 @@ class Body(NamedTuple):
 
 
 def body_of(settings: Settings, description: str) -> Body:
-    """The body of the arm that a URDF describes, with the tool on its plate.
+    """Body of the arm that a URDF describes, with the tool on its plate.
 
-    Kept apart are capsules of links that do not follow each other, but for those that cannot move
-    against each other, and those that belong together: they are nearer than their own clearance in
-    the configured posture, or about that near around meshes with one link between them.
+    Capsules of links that do not follow each other are kept apart. Left out are pairs that the
+    joints cannot move against each other, and pairs that belong together: in the configured posture
+    they are nearer than the arm's own clearance or, around meshes with one link between them, than
+    this clearance and CAPSULE_EXCESS_M.
     """
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
@@ -62,7 +65,7 @@ def body_of(settings: Settings, description: str) -> Body:
         if number not in known:
             end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
             found.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
-            if number < len(chain) and chain[number].kind == "prismatic":  # what guides the next link
+            if number < len(chain) and chain[number].kind == "prismatic":  # the guide of the next link
                 travel = np.outer(
                     [chain[number].lower, chain[number].upper], frames[number][:, :3] @ chain[number].axis
                 )
@@ -91,7 +94,13 @@ def body_of(settings: Settings, description: str) -> Body:
 
 
 def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> float:
-    """A bound of the speed [m/s] of any point between the ends (2, 3) [m]."""
+    """Upper bound of the speed [m/s] of all points between the ends (2, 3) [m] of a link.
+
+        sum of velocity_j lever_j over the joints before the link
+
+    lever_j is 1 for a prismatic joint. For a revolute joint it is the largest distance from joint j
+    that the link lengths, and the travel of prismatic joints, allow.
+    """
     lever, speed, joints = float(np.linalg.norm(ends, axis=1).max()), 0.0, settings.joints
     for joint in range(link - 1, -1, -1):
         if joints.every_kind[joint] == "prismatic":
@@ -104,8 +113,9 @@ def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> f
 
 
 def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
-    """Two postures (J,) [rad, m] on both sides of the configured one: the limits; of a joint that
-    turns on and on, a part of a turn, as others may be the same.
+    """Two postures (J,) [rad, m] on both sides of the configured one: lower and upper limits.
+
+    A continuous joint turns by a part of a turn only, because its limits can be the same posture.
     """
     posture, is_continuous = np.array(settings.arm.posture), np.array(settings.joints.every_kind) == "continuous"
     lower, upper = np.array(settings.joints.lower), np.array(settings.joints.upper)
@@ -116,13 +126,15 @@ def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
 
 
 def _origin(joint: Joint) -> Vector:
-    """Where a joint sits in its parent link (3, 4)."""
+    """Pose (3, 4) of a joint in its parent link."""
     return np.column_stack((rotation(joint.rotation), joint.translation))
 
 
 def _in_joint(urdf: Urdf, names: tuple[str, ...], link: str, placed: Vector) -> tuple[int, Vector]:
-    """What is placed (3, 4) in a link, in the frame of the joint that moves the link; its number
-    from 1, or 0 for base. Joints without a name among `names` stay at 0.
+    """Express a pose (3, 4), given in a link, in the frame of the joint that moves the link.
+
+    Joints that are not among `names` stay at 0. Also returns the joint's number from 1, or 0 for
+    base.
     """
     while (joint := urdf.above(link)) is not None:
         if joint.name in names:
@@ -152,7 +164,14 @@ def _capsule(shape: Shape) -> tuple[Vector, float]:
 
 
 def _around(half: float, radius: float) -> tuple[float, float]:
-    """Half the axis and the radius of the smallest capsule around a cylinder [m]."""
+    """Half length of the axis and radius [m] of the smallest capsule around a cylinder.
+
+    With `half` and `radius` of the cylinder, the capsule has
+
+        R(h) = sqrt(radius² + (half - h)²),    volume = π R² (2 h + 4 R / 3),
+
+    and the best of CAPSULE_FITS values of h in [0, half] is taken.
+    """
     axes = np.linspace(0.0, half, CAPSULE_FITS)
     radii = np.hypot(radius, half - axes)
     best = int(np.argmin(radii**2 * (2.0 * axes + 4.0 / 3.0 * radii)))

@@ -1,4 +1,4 @@
-"""How far an arm at some joints is from people, from things and from itself."""
+"""Distance of an arm, at given joints, from people, from things and from itself."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
 from service.core.separation.tuning import FARTHEST_REPORTED_M
 
-PEOPLE, THINGS, ITSELF = 0, 1, 2  # of a rule's parameters
-NEAR_HAND, NEAR_ITSELF = -1, -2  # what a capsule is nearest to, but for boxes
-NOBODY = np.empty((0, 3))  # hands
+PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s`, `clearance` and `room`
+NEAR_HAND, NEAR_ITSELF = -1, -2  # the nearest object, if it is not a box; boxes are numbered from 0
+NOBODY = np.empty((0, 3))  # no hands
 
 
 @compiled
 def clearance(
     joints: Vector, hands: Vector, parameters: Records, capsules: Records, pairs: Vector, boxes: Vector
 ) -> tuple[float, int, int]:
-    """`Separation.clearance`."""
+    """Smallest distance [m] of the arm beyond its clearances; see `Separation.clearance`.
+
+    min over pairs of (distance of the capsules' axes - their radii - clearance of the rule)
+    """
     given, near, forearm = parameters[0], np.empty(9), np.empty((2, 3))
     placed = np.empty((len(capsules), 2, 3))
     place(joints, given.frames, given.axes, capsules, placed)

@@ -1,15 +1,15 @@
-"""How fast the parts of the arm may approach hands, things and each other: the speed-and-separation
-rule of ISO/TS 15066, as inequalities of the joints' velocities.
+"""Separation stage: the speed-and-separation rule of ISO/TS 15066 as limits of joint velocity.
 
-A pair of parts whose points nearest to each other lie `distance` apart gives one row: the speed at
-which the arm's joints bring these together is at most what the rule allows there. What leaves has a
-negative speed and is never limited. The tool may touch a hand gently where a taught place says that
-the tool goes with that hand, while the hands are at that place.
+For each pair of nearby parts there is a row, `row · dq <= limit`. It limits the speed at which the
+joints move the nearest points of the pair toward each other. Parts that move away from each other
+have a negative speed and are not limited. Inside of a clearance of things or of the arm itself, the
+planned limit is negative: the parts must return. The tool may touch a hand gently at a via-point
+where the skill says that the tool goes with that hand, while the hands are at that via-point.
 
-Where a hand and a part pass each other, what leads past the hand now may lead into it a moment
-later, as the direction between them turns faster than joints brake. So the rule is also asked about
-moments ahead, as if hands and joints went on as they do; what can still be braked until then is
-allowed on top.
+When a hand and a part pass each other, the direction between them can turn faster than joints
+brake: motion past the hand becomes motion toward it. So the rule is also evaluated a moment ahead,
+at positions that are extrapolated for hands and joints. The speed that can be braked until then is
+added to the limit there. `separation.step` has the formulas.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("sid
 
 
 class Separation:
-    """What the rule says at a tick.
+    """Separation's constraints at a tick.
 
-    `constraints` (K,), of which the first `count` are in force: `row` (J,) times joint velocities
-    is at most `planned` [m/s] where motion is planned, and `allowed` [m/s] at all. `nearest_m` of
-    the hands, the least `speed_limit` [m/s] toward one, and `setpoint_share`, the greatest share of
-    the setpoint's speed at which the tool could go along.
+    `constraints` (K,), of which the first `count` are active: `row` (J,) times the joint velocities
+    [rad/s, m/s] is at most `planned` [m/s] in planned motion, and at most `allowed` [m/s] in every
+    motion. `nearest_m`: distance of the nearest hand. `speed_limit` [m/s]: smallest allowed speed
+    toward a hand. `setpoint_share`: largest share of the setpoint's speed at which the tool can
+    follow.
     """
 
     def __init__(self, settings: Settings, urdf: str) -> None:
@@ -90,13 +91,11 @@ class Separation:
 
     @staticmethod
     def constraints_for(joints: int, count: int) -> Records:
-        """So many constraints of an arm with so many joints."""
+        """Allocate `count` constraints for an arm of `joints` joints."""
         return structured(count, [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)])
 
     def set_contacts(self, via_points: Iterable[ViaPoint]) -> None:
-        """From now on the tool may touch a hand at those of the via-points where it goes with that
-        hand.
-        """
+        """Allow the tool to touch a hand at the via-points where it goes with that hand."""
         found = [
             (np.array([p.left, p.right]), p.radius, ("left", "right").index(p.follow))
             for p in via_points
@@ -106,7 +105,7 @@ class Separation:
         self._contacts[:] = found
 
     def step(self, state: Record, frame: Record, here: Records) -> None:
-        """Finds what the rule says for the state's hands at the arm's kinematics `here` (1,)."""
+        """Update the constraints for the state's hands and the arm's kinematics `here` (1,)."""
         self.count, self.nearest_m, self.speed_limit, self.setpoint_share = step(
             as_array(state),
             here,
@@ -120,9 +119,10 @@ class Separation:
         frame["hand_distance"], frame["hand_limit"] = self.nearest_m, self.speed_limit
 
     def clearance(self, joints: Vector, hands: Vector) -> tuple[float, int, int]:
-        """How far the arm at joints (J,) [rad] is from people with hands (H, 3) [m], from things
-        and from itself, less what is kept from them [m]; the capsule that is nearest, and to what:
-        the number of a box, the table's is 0, or NEAR_HAND or NEAR_ITSELF.
+        """Smallest distance [m] beyond the clearances, at joints (J,) [rad, m], hands (H, 3) [m].
+
+        People, things and the arm itself count. Also returns the number of the nearest capsule, and
+        what it is nearest to: the number of a box (0 is the table), NEAR_HAND or NEAR_ITSELF.
         """
         found: tuple[float, int, int] = clearance(
             joints, hands, self._parameters, self._capsules, self._pairs, self._boxes
@@ -130,25 +130,34 @@ class Separation:
         return found
 
     def intrusion(self, joints: Vector) -> tuple[float, int, int]:
-        """By how much [m] a part of the arm is inside of a thing or of another part, if above 0;
-        the number of the joint that moves it; and the thing, as `clearance` says.
+        """Depth [m] to which the arm is inside of a thing or of itself; below 0 if it is not.
+
+        Also returns the index of the joint that moves this part, and the thing, as `clearance`
+        does.
         """
         clear, part, thing = clearance(joints, NOBODY, self._bare, self._capsules, self._pairs, self._boxes)
         return -clear, int(self._capsules["link"][part]) - 1, thing
 
     def share(self, velocity: Vector) -> float:
-        """How much of joint velocities (J,) [rad/s] is slow enough for all that is near."""
+        """Largest share, at most 1, of joint velocities (J,) that keeps all planned limits."""
         return float(share_of(self.constraints, self.count, velocity))
 
     def excess(self, velocity: Vector, acceleration: Vector) -> float:
-        """By how much joints that move so (J,) [rad/s, rad/s²] pass what is allowed [m/s], or will
-        as their acceleration comes to 0; at most 0 if they do not.
+        """Largest excess [m/s] over the `allowed` limits at this motion of the joints.
+
+            max over k of ( max(row_k · dq, row_k · (dq + ddq |ddq| / 2 jerk)) - allowed_k )
+
+        The second term is the speed once all accelerations have come to 0. An excess of 0 or less
+        means that all limits hold. Both arguments are (J,), [rad/s, rad/s²].
         """
         return float(excess_of(self.constraints, self.count, velocity, acceleration, self._jerk)[0])
 
     def less(self, velocity: Vector, moved: tuple[Vector, Vector]) -> Vector:
-        """The velocities (J,) [rad/s] nearest to these by which what joints that have `moved` so
-        (J,) [rad/s, rad/s²] pass the most is passed no more.
+        """Joint velocities (J,), changed as little as possible to end the largest excess.
+
+            velocity - excess row / |row|²
+
+        `moved`: velocity and acceleration of the joints (J,) that cause the excess.
         """
         excess, k = excess_of(self.constraints, self.count, *moved, self._jerk)
         row = self.constraints["row"][k]

@@ -1,4 +1,4 @@
-"""Separation's compiled step: from hands and posture to inequalities of joint velocities."""
+"""Compiled step of separation: from hands and posture to inequalities in joint velocity."""
 
 from __future__ import annotations
 
@@ -29,9 +29,14 @@ from service.core.separation.tuning import (
 
 @compiled
 def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
-    """Speed [m/s] toward something `distance` [m] away that comes at `hand_speed` [m/s] all the
-    time, from which a stop that begins a reaction time [s] late and brakes so [m/s²] ends
-    `clearance` away.
+    """Largest speed v [m/s] toward an object, from which a stop still ends at the clearance.
+
+    The object is at the distance d and approaches with constant speed u = `hand_speed`. The arm
+    moves on for the reaction time T, then brakes with B. It keeps the clearance c if
+
+        d - c = (v + u) T + v² / 2B + u v / B,
+
+        v = max(0, sqrt(u² + (B T)² + 2 B (d - c)) - B T - u)
     """
     square = hand_speed**2 + (brake * reaction) ** 2 + 2.0 * brake * (distance - clearance)
     return max(0.0, math.sqrt(max(square, 0.0)) - brake * reaction - hand_speed)
@@ -48,7 +53,37 @@ def step(
     contacts: Records,
     constraints: Records,
 ) -> tuple[int, float, float, float]:
-    """`Separation.step`: how many constraints; nearest, speed limit and setpoint's share."""
+    """Write the constraints; return their number, nearest_m, speed_limit and setpoint_share.
+
+    For the nearest points p1, p2 of two capsules (or of a capsule and a box), with the unit normal
+    n from p1 to p2 and the distance d of the surfaces, a constraint is
+
+        row · dq <= limit,    row = n^T (dp1/dq - dp2/dq)    [m/s]
+
+    where p2 of a hand or a box does not depend on q. With s = `allowed_speed`, the limits are
+
+        hands           allowed = max(contact, s(d, u)) + braked + SLIP_SPEED_MPS
+                        planned = `_planned`(d, u)
+        boxes, itself   `_limit`
+
+    u is the speed of the hand toward the part: the measured one, or unknown_speed for a hand that
+    was just seen. contact is contact_speed for the tool's part near a hand that may be touched,
+    else 0.
+
+    A moving hand is also evaluated at the times h = moving LOOKAHEAD_S, with moving = `_swiftness`
+    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = HAND_ACCELERATION_FADE_S,
+    at
+
+        p + h v + τ (h - f) a,    with the velocity v + f a,    f = τ (1 - exp(-h / τ))
+
+    braked = brake max(h - BRAKE_RAMP_S, 0) is the speed [m/s] that the arm can brake until then.
+
+    A hand that has been out of sight for t seconds more than stale_ms is assumed to accelerate
+    toward the arm by g = UNSEEN_ACCELERATION_MPS2 during t: u grows by w = min(g t, unknown_speed),
+    d shrinks by w (t - w / 2g).
+
+    Only constraints that the joints can violate are kept.
+    """
     state, here, given = states[0], heres[0], parameters[0]
     joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
     later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
@@ -69,7 +104,7 @@ def step(
             _receives(contacts, state.hands, side),
         )
         age_s = (state.tick - state.hand_ticks[side]) * given.period_s
-        # of one that is not seen, while the arm may go on: by so much faster and nearer it may be
+        # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
         unseen_s = age_s - given.unseen_s[0] if given.unseen_s[0] < age_s < given.unseen_s[1] else 0.0
         speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, given.unknown_speed)
         nearer = speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
@@ -119,7 +154,7 @@ def step(
         part = capsules[capsule]
         for box in range(len(boxes)):
             inner = nearest_to_box(now[capsule], boxes[box])
-            for where in range(3):  # the ends too: a capsule that lies along a face may tip
+            for where in range(3):  # the ends have constraints too: a capsule along a face may tip
                 share = inner if where == 0 else where - 1.0
                 distance = to_box(now[capsule], share, boxes[box], near) - part.radius
                 planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
@@ -144,15 +179,18 @@ def step(
 
 @compiled
 def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
-    """Speed [m/s] that a rule allows."""
+    """Speed [m/s] that the rule (PEOPLE, THINGS or ITSELF) allows at this distance [m]."""
     given = parameters[0]
     return allowed_speed(distance, coming, given.brake[rule], given.reaction_s[rule], given.clearance[rule])
 
 
 @compiled
 def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
-    """Speed [m/s] that is planned with: less than the rule allows, but at least `least`, and what
-    is `braked` until then.
+    """Speed [m/s] that motion is planned with: lower than what the rule allows.
+
+        max(PLANNED_BRAKE_SHARE least, allowed_speed) + PLANNED_BRAKE_SHARE braked
+
+    with the planned brake and reaction time, and with the planned margin added to the clearance.
     """
     given = parameters[0]
     brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
@@ -162,11 +200,14 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
 
 @compiled
 def _limit(constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float) -> float:
-    """Set the limits of a constraint to a thing or to another part; the planned speed [m/s].
+    """Set the limits of constraint k to a thing or another part; return the planned speed [m/s].
 
-    With the distance `left` to the clearance, parts slow down to CLEARANCE_GAIN_PER_S * left.
-    Inside of the clearance they return, if the joints can move them, and may slip the less the
-    deeper they are.
+        left    = distance - clearance
+        allowed = allowed_speed(distance) + SLIP_SPEED_MPS min(max(1 + left / SLIP_DEPTH_M, 0.1), 1)
+        planned = min(planned, max(CLEARANCE_GAIN_PER_S left, -RETREAT_SPEED_MPS))
+
+    Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
+    move them at RETREAT_AUTHORITY_MPS.
     """
     given, constraint = parameters[0], constraints[k]
     left = distance - given.clearance[rule]
@@ -181,7 +222,7 @@ def _limit(constraints: Records, k: int, parameters: Records, rule: int, distanc
 
 @compiled
 def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) -> int:
-    """1 if joints within their greatest velocities can pass a limit along a constraint, else 0."""
+    """1 if the joints can exceed a limit along row k, sum of |row_j| max_velocity_j > limit."""
     most = 0.0
     for j in range(len(max_velocity)):
         most += abs(constraints[k].row[j]) * max_velocity[j]
@@ -190,14 +231,17 @@ def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) 
 
 @compiled
 def _swiftness(velocity: Vector, tremor_speed: float) -> float:
-    """0 for a hand that rests or trembles, 1 for one that goes somewhere."""
+    """Share of motion: 0 for a hand that rests or trembles, 1 from twice the tremor speed on.
+
+    |velocity| / tremor_speed - 1, limited to 0 ... 1
+    """
     speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
     return min(max(speed / tremor_speed - 1.0, 0.0), 1.0)
 
 
 @compiled
 def _share(near: Vector, limit: float, velocity: Vector) -> float:
-    """How much of a velocity (3,) stays under a limit along the normal."""
+    """Largest share, at most 1, of a velocity (3,) that keeps a limit along the normal."""
     along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
     limit = max(limit, 0.0)
     return limit / along if along > limit else 1.0
@@ -205,7 +249,10 @@ def _share(near: Vector, limit: float, velocity: Vector) -> float:
 
 @compiled
 def _receives(contacts: Records, hands: Vector, side: int) -> bool:
-    """Whether the hands are at a via-point where the tool goes with this one."""
+    """True if the hands are at a via-point where the tool goes with the hand of this side.
+
+    Each coordinate of both hands is within the via-point's radius and CONTACT_MARGIN_M.
+    """
     for contact in contacts:
         if contact.side == side:
             far = 0.0
@@ -221,8 +268,12 @@ def _receives(contacts: Records, hands: Vector, side: int) -> bool:
 def _bring_together(
     constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
 ) -> None:
-    """Adds to a constraint's row the speed along the normal, times the sign, of the point
-    near[at:at + 3] of a link that the first joints move.
+    """Add to row k the speed along the normal of the point p = near[at:at + 3] of a link.
+
+        row_j += sign n · (v_j + w_j × (p - tool)),    j = 0 ... link - 1
+
+    v_j and w_j are the linear and angular columns of the tool's Jacobian, n = near[6:9]. A positive
+    sign first sets the row to 0.
     """
     row, tool, jacobian = constraints[k].row, heres[0].position, heres[0].jacobian
     if sign > 0.0:
@@ -239,7 +290,10 @@ def _bring_together(
 
 @compiled
 def share_of(constraints: Records, count: int, velocity: Vector) -> float:
-    """`Separation.share`."""
+    """Largest share, at most 1, of joint velocities (J,) that keeps all planned limits.
+
+    min over k of max(planned_k, SLIP_SPEED_MPS / 2) / (row_k · velocity)
+    """
     share = 1.0
     for k in range(count):
         speed = 0.0
@@ -253,7 +307,7 @@ def share_of(constraints: Records, count: int, velocity: Vector) -> float:
 
 @compiled
 def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
-    """`Separation.excess`, and of which constraint."""
+    """`Separation.excess`, and the number of the constraint with the largest excess."""
     most, which = -math.inf, 0
     for k in range(count):
         constraint = constraints[k]

@@ -1,24 +1,24 @@
-"""Stage 5, setpoint: from the target to one that the arm can follow and that can always stop."""
+"""Stage 5, setpoint: a smooth motion toward the target that the arm can follow and always stop."""
 
 from __future__ import annotations
 
 from service.contract.records import Field
 
-HULL_SPANS = 7  # of time, of which one is always being filled
+HULL_SPANS = 7  # the last targets are kept as bounds of this many spans of time; the newest one grows
 STATE = (
-    Field("hull_ticks", "int64"),  # in the newest span
-    Field("gripper_tick", "int64"),  # at which the gripper was last moved
-    Field("setpoint", "float64", (3, 3)),  # position, velocity, acceleration; by axis
-    Field("hull", "float64", (HULL_SPANS, 2, 3)),  # least and greatest target of the last spans of time
-    Field("orientation", "float64", (4,)),  # of the setpoint
-    Field("turning", "float64", (3,)),  # its angular velocity [rad/s]
+    Field("hull_ticks", "int64"),  # number of targets in the newest span
+    Field("gripper_tick", "int64"),  # tick of the last change of the gripper
+    Field("setpoint", "float64", (3, 3)),  # position [m], velocity [m/s], acceleration [m/s²]; by axis
+    Field("hull", "float64", (HULL_SPANS, 2, 3)),  # smallest and largest target [m] of each span, newest first
+    Field("orientation", "float64", (4,)),  # orientation setpoint, a quaternion x y z w
+    Field("turning", "float64", (3,)),  # angular velocity of the orientation setpoint [rad/s]
     Field("gripper", "uint8"),
 )
 FRAME = (
-    Field("setpoint", "float64", (3,)),  # after smoothing [m]
-    Field("setpoint_velocity", "float64", (3,)),
-    Field("setpoint_acceleration", "float64", (3,)),
-    Field("setpoint_orientation", "float64", (4,)),
-    Field("setpoint_turning", "float64", (3,)),
+    Field("setpoint", "float64", (3,)),  # position setpoint [m]
+    Field("setpoint_velocity", "float64", (3,)),  # [m/s]
+    Field("setpoint_acceleration", "float64", (3,)),  # [m/s²]
+    Field("setpoint_orientation", "float64", (4,)),  # quaternion x y z w
+    Field("setpoint_turning", "float64", (3,)),  # angular velocity [rad/s]
     Field("gripper", "uint8"),  # 0: unknown; 1: open; 2: closed
 )

@@ -1,6 +1,20 @@
-"""Where a setpoint may go and how fast: the box around the last targets, the step that can still
-stop in it, and what comes back to it; docs/bounds.md has the proof. And the stops themselves, of
-one axis or of several that come to rest together, and the jerk after which one keeps its room.
+"""Bounds of the setpoint: the box around the last targets, the accepted step, and the fall-back.
+
+docs/bounds.md proves what these bounds guarantee. Its symbols are used here, on each axis:
+
+    x, v, a   position [m], velocity [m/s] and acceleration [m/s²] of the setpoint
+    V         max_speed, limit of the norm of the velocity
+    Â, Ĵ      max_acceleration and max_jerk, limits of the norms of acceleration and jerk
+    A, J      stop_acceleration and stop_jerk, limits of a stop on each axis
+    ρ         V / 16, speed at which a setpoint beyond a bound returns (RETURN_SHARE)
+    π(v, a)   largest displacement [m] along the fastest stop from v, a within A and J
+    top       x + π(v, a), the farthest position of the fastest stop
+    P         x + π(v + ρ, a), the same for the fastest change to -ρ, in a frame that moves at -ρ
+    c         max(|v|, |v + a|a| / 2J|), the largest speed if the acceleration is ended at once
+    N         sqrt(sum over the axes of max(c, ρ)²)
+
+For a lower bound, -x, -v and -a replace x, v and a. The module also holds the stopping distance
+along the motion and the discrete barrier that limits the tracker's jerk.
 """
 
 from __future__ import annotations
@@ -29,7 +43,13 @@ BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
 
 @compiled
 def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int:
-    """Takes a target (3,) into the least and greatest of its span; ticks in the newest span."""
+    """Add a target (3,) [m] to the smallest and largest targets, `hull` (HULL_SPANS, 2, 3).
+
+    A span holds `span_ticks` targets. When the newest span is full, all spans move on by one, the
+    oldest is dropped, and a new one begins. With `ticks` = 0 only the newest span is set.
+
+    Returns the number of targets in the newest span.
+    """
     if ticks >= span_ticks or ticks == 0:
         if ticks > 0:
             for span in range(HULL_SPANS - 1, 0, -1):
@@ -48,7 +68,10 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
 def bounds_around(
     hull: Vector, ticks: int, position: Vector, parameters: Records, box: Vector, low: Vector, high: Vector
 ) -> int:
-    """As `bounds`, with one more target (3,), see `remember`; ticks in the newest span."""
+    """Add a target (3,) with `remember`, then write the `bounds` into low and high (3,) [m].
+
+    Returns the number of targets in the newest span.
+    """
     ticks = remember(hull, ticks, position, parameters[0].span_ticks)
     bounds(hull, box, parameters[0].lowest, low, high)
     return ticks
@@ -56,7 +79,14 @@ def bounds_around(
 
 @compiled
 def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
-    """Where the setpoint may go: around the last targets, and inside the workspace."""
+    """Write the setpoint's bounds low and high (3,) [m], from the last targets and the workspace.
+
+        low  = max(box[0], lowest, smallest target - HULL_MARGIN_M)
+        high = min(box[1],         largest target  + HULL_MARGIN_M)
+
+    `hull` (HULL_SPANS, 2, 3): smallest and largest target of each span. `box` (2, 3): lower and
+    upper corner of the workspace. `lowest` (3,): planes of the reach, -inf for none.
+    """
     for axis in range(3):
         least, greatest = hull[0, 0, axis], hull[0, 1, axis]
         for span in range(1, HULL_SPANS):
@@ -67,7 +97,18 @@ def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector)
 
 @compiled
 def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
-    """Which of BOUNDS a step from `before` (3, 3) breaks."""
+    """Index in BOUNDS of the first bound that a step from `before` breaks; 0 for none.
+
+    The setpoint and `before` are (3, 3): position, velocity, acceleration; by axis. Norms are over
+    the axes, and allow for rounding:
+
+        1  a number is not finite
+        2  |v| > max(V, speed_to_come(before))
+        3  |a| > max(Â, |a before|)
+        4  |a - a before| > Ĵ period
+        5  the position is beyond `bounds`, and beyond the position before, by more than
+           V² / 2A + 1 s V, which is more than any stop from outside takes
+    """
     given = parameters[0]
     max_speed = given.max_speed
     if not np.isfinite(setpoint).all():
@@ -85,7 +126,7 @@ def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, p
         return 4
     low, high = np.empty(3), np.empty(3)
     bounds(hull, box, given.lowest, low, high)
-    farthest = 0.5 * max_speed * max_speed / given.stop_acceleration + max_speed  # of a stop from outside, generously
+    farthest = 0.5 * max_speed * max_speed / given.stop_acceleration + max_speed  # no stop from outside takes more
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
             return 5
@@ -98,8 +139,20 @@ def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, p
 def take_safe(
     setpoint: Vector, ahead: Vector, parameters: Records, costs: Vector, slow: float, low: Vector, high: Vector
 ) -> bool:
-    """Moves a setpoint (3, 3) to `ahead` if it keeps every bound after that; else one period on its
-    fastest stop, and false. An axis that would not come back does so.
+    """Move a setpoint (3, 3) to `ahead` (3, 3) if a stop from there keeps every bound.
+
+    The step is accepted if N(ahead) <= V and, on each side of each axis with the bound H,
+
+        top(ahead) <= H,    or    top(setpoint) > H  and  P(ahead) <= P(setpoint) - σ ρ dt,
+
+        σ = slow / max(1, max |costs[0]| V)
+
+    where costs (3, 3, J) are those of `joint_costs`. If only the second condition fails on an axis,
+    `_fall_back` replaces the step of that axis, provided that the norms of all axes then keep Â and
+    Ĵ. Otherwise all axes take `_fall_back` for one period; with ρ = 0 if N(setpoint) > V, so that a
+    setpoint that began too fast only brakes.
+
+    Returns False if all axes fell back.
     """
     given = parameters[0]
     max_speed, max_acceleration, max_jerk = given.max_speed, given.stop_acceleration, given.stop_jerk
@@ -121,7 +174,7 @@ def take_safe(
             if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + BOUND_ROUNDING_M:
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
                 mixed = True
-    if mixed:  # the norms of what the others do beside it
+    if mixed:  # an axis was replaced, so the norms over all axes are checked again
         acceleration = change = 0.0
         for i in range(3):
             acceleration += ahead[2, i] ** 2
@@ -132,7 +185,7 @@ def take_safe(
         setpoint[:] = ahead
         return True
     if speed_to_come(setpoint[1], setpoint[2], max_jerk, back) > max_speed:
-        back = 0.0  # it began too fast: no axis moves on before that is over
+        back = 0.0  # following began too fast: all axes brake first
     for i in range(3):
         _fall_back(setpoint, setpoint, parameters, i, low[i], high[i], back)
     return False
@@ -142,13 +195,15 @@ def take_safe(
 def _fall_back(
     setpoint: Vector, out: Vector, parameters: Records, axis: int, low: float, high: float, back: float
 ) -> None:
-    """Into out (3, 3) one axis a period on along its fastest stop; or, where that ends beyond a
-    bound, along the fastest change to `back` [m/s] inwards.
+    """Write into out (3, 3) one axis one period further along its fastest stop.
+
+    If that stop would end beyond a bound, the axis follows the fastest change to the speed `back`
+    [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which one counts.
     """
     max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
     over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND_M
     under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND_M - low
-    if over and under:  # it crosses the box
+    if over and under:  # the stop ends beyond both bounds
         over = setpoint[1, axis] > 0.0
         under = not over
     frame, stop = back * (under - over), np.empty(6)
@@ -159,8 +214,12 @@ def _fall_back(
 
 @compiled
 def farthest(setpoint: Vector, axis: int, side: float, max_acceleration: float, max_jerk: float, back: float) -> float:
-    """How far [m] an axis of a setpoint (3, 3) comes in direction `side` (1 or -1) on its fastest
-    change to `back` [m/s] against it, seen from what moves at that; 0: on its fastest stop.
+    """Farthest position [m] of an axis, toward `side` (1 or -1), along its fastest change of speed.
+
+        side x + π(side v + back, side a)
+
+    With back = 0 this is top, the end of the fastest stop. With back > 0 it is P, for the fastest
+    change to the velocity -side `back` [m/s], in the frame that moves at this velocity.
     """
     stop = np.empty(6)
     fastest_stop(side * setpoint[1, axis] + back, side * setpoint[2, axis], max_acceleration, max_jerk, 0.0, stop)
@@ -169,8 +228,9 @@ def farthest(setpoint: Vector, axis: int, side: float, max_acceleration: float, 
 
 @compiled
 def speed_to_come(velocity: Vector, acceleration: Vector, max_jerk: float, least: float) -> float:
-    """Norm [m/s] of the axes' greatest speeds, each `least` or more, if each acceleration is
-    brought to 0 at once.
+    """Largest speed N [m/s] of a setpoint whose accelerations (3,) are brought to 0 at once.
+
+    N = sqrt(sum over the axes of max(|v|, |v + a |a| / (2 max_jerk)|, least)²)
     """
     total = 0.0
     for i in range(3):
@@ -181,14 +241,26 @@ def speed_to_come(velocity: Vector, acceleration: Vector, max_jerk: float, least
 
 @compiled
 def stop_distance(speed: float, acceleration: float, brake: float, change: float) -> float:
-    """Way [m] to rest along the motion, braking by `brake` [m/s²] after ramps of jerk `change`
-    [m/s³].
+    """Distance [m] to rest along the motion, with deceleration B = `brake` and jerk C = `change`.
+
+    From speed v and acceleration a >= 0, the acceleration is brought to 0 in t = a / C, at the
+    speed v1; then the brake is ramped up and down:
+
+        distance = d1 + d2
+        v1 = v + a² / 2C
+        d1 = t (v + a t / 3)
+        d2 = v1² / 2B + v1 B / 2C                if v1 >= B² / C, so that B is reached
+        d2 = v1 sqrt(v1 / C)                     otherwise
+
+    If a < 0, the braking has begun already: it continues as if it had started with acceleration 0,
+    a time t = min(-a, B) / C ago. Then v1 = v + C t² / 2, and d1 = -(v1 t - C t³ / 6) is minus the
+    distance covered since.
     """
     if acceleration >= 0.0:
         t = acceleration / change
         speed_then = speed + 0.5 * acceleration * t
         way = t * (speed + acceleration * t / 3.0)
-    else:  # as if the braking had begun from the crest before
+    else:  # the braking is treated as begun at acceleration 0
         t = min(-acceleration, brake) / change
         speed_then = speed + 0.5 * change * t * t
         way = -(speed_then * t - change * t * t * t / 6.0)
@@ -199,14 +271,19 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
 
 @compiled
 def _stop_after(v: float, a: float, jerk: float, brakes: Pair, dt: float) -> float:
-    """The way [m] of a period at a jerk [m/s³] and of the stop by such brakes after it."""
+    """Distance [m] of one period dt at a constant jerk and of the stop after it.
+
+    v dt + stop_distance(max(v + dt (a + dt jerk / 2), 0), a + dt jerk, *brakes)
+    """
     return stop_distance(max(v + dt * (a + 0.5 * dt * jerk), 0.0), a + jerk * dt, *brakes) + v * dt
 
 
 @compiled
 def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float) -> float:
-    """The greatest jerk up to the wanted one at which something, linear in jerk, stays at its
-    limit.
+    """Largest jerk in [lowest, wanted] at which a quantity that is linear in jerk keeps its limit.
+
+    The quantity is `at_wanted` at the jerk `wanted` and `at_lowest` at `lowest`, and grows with
+    jerk. Returns `wanted` if the limit holds there, and `lowest` if it holds at neither.
     """
     if at_wanted <= limit:
         return wanted
@@ -217,8 +294,16 @@ def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, li
 
 @compiled
 def stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: Pair, kept: float, dt: float) -> float:
-    """The greatest jerk, from the wanted to the lowest of `jerks`, after which a stop by `brakes`
-    [m/s², m/s³] is `kept` this share of its room, on a way [m] that grows by what `comes`.
+    """Largest jerk [m/s³] in [lowest, wanted] at which a discrete barrier keeps a distance h.
+
+    With d the `stop_distance` by `brakes` (m/s², m/s³) before and d' after one period at this jerk:
+
+        h  = way - d                       distance [m] left at the end of a stop
+        h' = way + comes - v dt - d'       the same, one period later
+        h' >= kept h
+
+    `comes` [m] is how much the way grows by itself in a period. A secant method finds the jerk, to
+    STOP_SECANT_TOLERANCE_M of h'.
     """
     (brake, change), (wanted, chosen) = brakes, jerks
     limit = way + comes - kept * (way - stop_distance(v, a, brake, change))

@@ -1,4 +1,4 @@
-"""The orientation setpoint: it turns toward its target within limits of speed and acceleration."""
+"""Orientation setpoint: a turn to the target within limits of angular speed and acceleration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.core.setpoint.tuning import ORIENTATION_BRAKE_SHARE, ORIENTATION_GA
 
 
 class OrientationSetpoint:
-    """Turns the state's orientation (4,), at an angular velocity (3,) [rad/s], toward targets."""
+    """Orientation setpoint of the state: a quaternion (4,) and an angular velocity (3,) [rad/s]."""
 
     def __init__(self, settings: Settings) -> None:
         tool = settings.tool
@@ -26,16 +26,15 @@ class OrientationSetpoint:
         )
 
     def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
-        """Puts it where the tool is, before there are targets: rotation (3, 3), turning (3,)
-        [rad/s].
-        """
+        """Start from the tool's rotation (3, 3) and angular velocity `turning` (3,) [rad/s]."""
         quaternion_of(rotation, state["orientation"])
         state["turning"] = turning
 
     def step(self, state: Record, orientation: Vector, turning: Vector) -> None:
-        """Turns it one period on toward an orientation (4,) that turns itself (3,) [rad/s].
+        """Turn the setpoint for one period toward an orientation (4,) that turns at (3,) [rad/s].
 
-        Where the settings say that a direction is followed, +z goes the shortest way.
+        If the settings say that only a direction is followed, the setpoint turns +z on the shortest
+        path.
         """
         turn_orientation(state["orientation"], state["turning"], orientation, turning, self.parameters)
 
@@ -44,7 +43,19 @@ class OrientationSetpoint:
 def turn_orientation(
     quaternion: Vector, turning: Vector, target: Vector, target_turning: Vector, parameters: Records
 ) -> None:
-    """One period, in place."""
+    """Turn a quaternion (4,), in place, for one period toward a target (4,).
+
+    `turning` and `target_turning` (3,) [rad/s] are their angular velocities; `turning` is updated
+    too. With e (3,) [rad] the rotation vector to the target, g the gain and B the planned braking:
+
+        desired = target_turning + rate e
+        rate    = g                                      if |e| <= B / g²
+        rate    = sqrt(2 B (|e| - B / 2g²)) / |e|        otherwise
+
+    The desired velocity is scaled down to max_speed. The angular velocity moves toward it by at
+    most max_acceleration * period, and turns the quaternion for one period. If only the direction
+    of +z is followed, e is its shortest turn and target_turning loses its component about +z.
+    """
     given, dt = parameters[0], parameters[0].period_s
     error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
     axis_of(quaternion, axis)
@@ -56,7 +67,7 @@ def turn_orientation(
         for i in range(3):
             along += target_turning[i] * axis[i]
     angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
-    # in proportion to the error when near, braking evenly from afar
+    # rate is constant for small errors; for large ones the turn ends at constant deceleration
     brake, rate = ORIENTATION_BRAKE_SHARE * given.max_acceleration, ORIENTATION_GAIN_PER_S
     near = brake / ORIENTATION_GAIN_PER_S**2
     if angle > near:

@@ -1,18 +1,21 @@
-"""From the predicted target to a setpoint that the arm can follow, and that can always stop in
-time.
+"""Setpoint stage: from the predicted target to a setpoint that the arm can follow and always stop.
 
-The setpoint is led by a linear-quadratic tracker whose input is jerk: it minimises the integral of
-error² + weight jerk². Along its motion that jerk is bounded twice (discrete control barrier
-functions; Agrawal and Sreenath, RSS 2017). The setpoint can stop, within its limits, where the
-hands would stop at the soonest; the later, the later their tracker shows that they do. And it can
-come to the target's own speed before it passes that. A step is taken only if the stop after it
-keeps every limit; else the stop, which the step before had made sure of, begins now. So the limits
-hold by induction, whatever the target does:
+A linear-quadratic tracker with jerk as its input leads the setpoint. It minimises
 
-* speed, acceleration and jerk at most `max_speed`, `max_acceleration` and `max_jerk`, as norms;
-* never outside the box of the workspace, nor farther than HULL_MARGIN from the box around the last
-  HULL_TIME_S of targets. Where that box has moved away, or began elsewhere, the setpoint comes back
-  to it at RETURN_SHARE of the greatest speed at least: docs/bounds.md has the proof.
+    integral of |target - setpoint|² + jerk_weight |jerk|².
+
+Discrete control barrier functions (Agrawal and Sreenath, RSS 2017) limit this jerk along the motion
+(`step._track`). The setpoint can stop, within its limits, where the hands can stop at the earliest;
+a little before that if their tracker shows a stop late. It can reach the target's own speed before
+it passes the target. Its speed stays within the speed that the joints and the tool's lag allow.
+
+A step is taken only if the stop after it keeps every limit. Otherwise the setpoint begins the stop
+that the step before has checked. So these limits hold by induction, whatever the target does:
+
+* the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
+* the setpoint stays inside the workspace, and within HULL_MARGIN_M of the box around the targets of
+  the last HULL_TIME_S. If that box has moved away, or if following began outside of it, the
+  setpoint returns at RETURN_SHARE of max_speed or faster. docs/bounds.md has the proof.
 """
 
 from __future__ import annotations
@@ -36,9 +39,7 @@ from service.core.skill.pose import NO_GRIPPER, decided
 
 
 class SetpointGenerator:
-    """Moves the state's setpoint (3, 3), position, velocity and acceleration by axis, toward
-    targets.
-    """
+    """Position setpoint of the state (3, 3): position, velocity and acceleration; by axis."""
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
@@ -56,25 +57,28 @@ class SetpointGenerator:
         )
 
     def begin(self, state: Record, setpoint: Vector) -> None:
-        """Puts the setpoint where the tool is, before there are targets."""
+        """Start from the motion of the tool (3, 3), which becomes the only known target."""
         state["setpoint"] = setpoint
         state["hull"] = setpoint[0]
         state["hull_ticks"] = 0
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
-        """Moves the setpoint one period on; 0, or PLANNED or STOPPED where a limit was met, or
-        WRONG where a bound was passed, which cannot be: it then stays where it is.
+        """Move the setpoint one period toward a target.
 
-        box: (2, 3) lower and upper corner [m] of the workspace. costs: (3, 3, J) what a tool
-        velocity, acceleration and jerk cost of each joint's limit, 1 for all of it. slow: share of
-        the speed that is allowed, as the arm is behind.
+        box: lower and upper corner (2, 3) [m] of the workspace. costs: (3, 3, J) of `joint_costs`,
+        the share of each joint's limit that a tool velocity, acceleration and jerk need. slow:
+        share of max_speed that is allowed while the tool is behind.
+
+        Returns 0 if no limit was met, PLANNED or STOPPED if one was, and WRONG if a bound is
+        broken. WRONG means an error in this program; the setpoint then stays where it is.
         """
         motion = target.position, target.velocity, target.acceleration
         return int(lead(as_array(state), *motion, self._parameters, box, costs, slow))
 
     def stretched(self, box: Vector, setpoint: Vector) -> Vector:
-        """A workspace (2, 3) [m] in which a setpoint (3, 3) can stop, so that one that is outside
-        of its workspace and waits for its tool need not return.
+        """Workspace (2, 3) [m], extended so that a setpoint (3, 3) can stop inside of it.
+
+        A setpoint outside of its workspace that waits for its tool then need not return.
         """
         limits = self._parameters[0]["stop_acceleration"], self._parameters[0]["stop_jerk"]
         ends = np.array(
@@ -83,12 +87,12 @@ class SetpointGenerator:
         return np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
 
     def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
-        """What of its bounds a setpoint passed since `before` (3, 3), seen from outside."""
+        """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
         return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
 
 
 class SetpointStage:
-    """Leads the state's setpoints within the workspace's box (2, 3) [m] of the skill in force."""
+    """Position and orientation setpoints and gripper, in the box (2, 3) [m] of the active skill."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm, self._period_s, self._max_speed = arm, settings.period_s, float(settings.tool.max_speed)
@@ -96,15 +100,16 @@ class SetpointStage:
         self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
 
     def begin(self, state: Record, frame: Record, here: Kinematics) -> None:
-        """The setpoints where the commanded joints have the tool."""
+        """Start the setpoints where the commanded joints place the tool, at the tool's velocity."""
         velocities = state["joints"][1]
         self._position.begin(state, np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)]))
         self._orientation.begin(state, here.rotation, here.jacobian[3:] @ velocities)
         write(as_array(state), as_array(frame))
 
     def step(self, state: Record, frame: Record, wanted: Wanted, here: Kinematics, box: Vector, share: float) -> int:
-        """Leads the setpoints one period on; what `SetpointGenerator.step` says. `share` is that of
-        the setpoint's speed at which separation lets the tool go along.
+        """Move the setpoints one period on; return the code of `SetpointGenerator.step`.
+
+        `share`: share of the setpoint's speed at which separation lets the tool follow.
         """
         states, frames = as_array(state), as_array(frame)
         slow = ready(states, here.record, self._arm.parameters, self._max_speed, share, self._costs)
@@ -121,7 +126,7 @@ class SetpointStage:
         return met
 
     def _grip(self, state: Record, wanted: Wanted, here: Kinematics) -> None:
-        """Opens or closes the gripper as the skill asks, once the tool is where it is to be."""
+        """Open or close the gripper as the skill predicts, once the tool is near its target."""
         before, closure = int(state["gripper"]), float(state["closure"])
         since_s = self._period_s * int(state["tick"] - state["gripper_tick"])
         off = math.dist(wanted.target.position.tolist(), here.record["position"][0].tolist())

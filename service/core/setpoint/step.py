@@ -1,4 +1,4 @@
-"""The setpoint's compiled step: see `stage` for the method, `bounds` for what it keeps."""
+"""Compiled step of the setpoint: `stage` describes the method, `bounds` the bounds it keeps."""
 
 from __future__ import annotations
 
@@ -36,8 +36,12 @@ from service.core.setpoint.tuning import (
 
 @compiled
 def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) -> float:
-    """Share of the greatest speed [m/s] for a setpoint (3, 3) that is ahead of the tool (3,) [m]; 1
-    where it comes back; and for one that may keep only a share of its own speed.
+    """Share of max_speed [m/s] that a setpoint (3, 3) may use while its tool (3,) [m] is behind.
+
+        1 / (1 + max(0, |setpoint - tool| - GAP_FREE_M) / GAP_SLOW_M)
+
+    It is 1 if the setpoint moves toward its tool. If separation allows only a share < 1 of the
+    setpoint's speed, the result is at most share |v| / max_speed.
     """
     along = gap = 0.0
     for i in range(3):
@@ -61,7 +65,16 @@ def lead(
     costs: Vector,
     slow: float,
 ) -> int:
-    """`SetpointGenerator.step`."""
+    """Move the position setpoint of the state one period on; see `SetpointGenerator.step`.
+
+    The tracker's jerk j is constant over the period dt:
+
+        x' = x + v dt + a dt² / 2 + j dt³ / 6
+        v' = v + a dt + j dt² / 2
+        a' = a + j dt
+
+    `take_safe` accepts this step or replaces it by the fall-back.
+    """
     state, given, setpoint = states[0], parameters[0], states[0].setpoint
     target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
     target[0], target[1], target[2] = position, velocity, acceleration
@@ -93,8 +106,40 @@ def _track(
     box: Vector,
     jerk: Vector,
 ) -> int:
-    """The tracker's jerk (3,), less of it along the motion where the stop, the target's speed or
-    the greatest one asks for that. A stop of the hands is seen `late_s` later than by most.
+    """Write the tracker's jerk (3,) [m/s³], reduced along the motion where a barrier requires it.
+
+    The tracker, with gains k (5,) of `tracker_gains` and φ = min(1, V / |v target|):
+
+        jerk = k0 (x target - x) + k1 φ v target + k2 a target + k3 v + k4 a
+
+    Without k2 if φ < 1: accelerations of a target beyond the speed limit are not followed.
+
+    `_approach_sides` and `_limit_jerk` limit this. Then the jerk along the velocity is reduced
+    until h' >= kept h for each of three barriers, where h' is the value of h one period later.
+    Along the unit vector of the velocity:
+
+        v, a      speed and acceleration of the setpoint
+        w         distance to the target
+        v_t, a_t  speed, φ v target, and acceleration of the target
+        B, C      deceleration and jerk that are planned with, within the limits of tool and joints
+        top       speed that is planned with, `slow` times the limit of tool and joints
+
+        stop      h = w + room - stop_distance(v, a, B, C)
+                  room = STOP_OVERSHOOT_M - min(late_s v, LATE_STOP_MAX_M)
+                         + stop_room (STOP_REACTION_S v_p + v_p² / (2 HAND_BRAKE_MPS2))
+                  v_p  = max(0, v_t + DECELERATION_LOOKAHEAD_S min(a_t, 0))    predicted speed
+        meeting   h = w + MEETING_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
+                  M = max(MEETING_BRAKE_SHARE B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
+        speed     h = top - (v + a |a| / 2C)
+
+        kept = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
+
+    In the stop, w grows by min(v_p, v) dt in a period. `late_s` is the additional delay with which
+    the hand tracker shows a stop. The meeting applies only while the setpoint is faster than its
+    target. The jerk is at least -C and, for stop and meeting, at least the one with which the
+    setpoint just comes to rest; below that one it would reverse.
+
+    Returns PLANNED if a barrier reduced the jerk, else 0.
     """
     given = parameters[0]
     gains, dt = given.gains, given.period_s
@@ -103,7 +148,7 @@ def _track(
     feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
     for i in range(3):
         jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
-        if feasible == 1.0:  # what a target does beyond the speed limit is not followed
+        if feasible == 1.0:  # accelerations of a target beyond the speed limit are not followed
             jerk[i] += gains[2] * target[2, i]
         jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
     _approach_sides(setpoint, parameters, box, jerk)
@@ -126,10 +171,10 @@ def _track(
     coming = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
     room = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
     room += given.stop_room * (STOP_REACTION_S * coming + coming * coming / (2.0 * HAND_BRAKE_MPS2))
-    # with less jerk than the lowest it would brake on after it rests, and swing back
+    # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
-    # what is left of a room shrinks at BARRIER_RATE_PER_S at most
+    # each barrier's distance shrinks at BARRIER_RATE_PER_S at most
     kept = 1.0 - min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt)
     chosen = stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
     faster, a_faster = speed - v_target, a - a_target
@@ -151,14 +196,15 @@ def _track(
 
 @compiled
 def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Vector) -> None:
-    """Limit the jerk (3,) so that the setpoint approaches each side of the workspace without
-    passing it: with h the distance to the side, (d/dt + p)³ h >= 0, that is
+    """Limit the jerk (3,) so that the setpoint approaches the workspace's sides without passing.
+
+    With h the distance to the side, (d/dt + p)³ h >= 0, that is
 
         jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = gains[0]^(1/3).
 
-    A setpoint whose target lies on a side then comes to rest there. Without this, the tracker
-    passes its target by a little, each time into the fastest stop, and swings for ever. Beyond a
-    side h is 0: the setpoint goes no farther, and its targets bring it back.
+    A setpoint whose target lies on a side then comes to rest there. Without this limit, the tracker
+    would pass its target a little, begin the fastest stop each time, and oscillate. Beyond a side,
+    h is 0: the setpoint moves no farther out, and its targets bring it back.
     """
     given = parameters[0]
     p = given.gains[0] ** (1.0 / 3.0)
@@ -172,14 +218,20 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
 
 @compiled
 def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
-    """The speed [m/s] at which the acceleration, after dt of a jerk, comes to 0 by `change`."""
+    """Speed [m/s] when the acceleration has come to 0, after a period dt at a constant jerk.
+
+    v + dt (a + dt jerk / 2) + a' |a'| / (2 change),    a' = a + dt jerk
+    """
     then = a + dt * jerk
     return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
 
 
 @compiled
 def _largest(costs: Vector, motion: Vector) -> float:
-    """How much of its limit the busiest joint needs for a tool motion (3,), with costs (3, J)."""
+    """Largest share of a joint's limit that a tool motion (3,) needs: max over j |motion · cost_j|.
+
+    `costs` (3, J): share of each joint's limit for a unit of motion along each axis.
+    """
     largest = 0.0
     for joint in range(costs.shape[1]):
         needed = costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
@@ -189,8 +241,10 @@ def _largest(costs: Vector, motion: Vector) -> float:
 
 @compiled
 def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
-    """The jerk (3,) cut so that it, and the acceleration after it, keep the limits of tool and
-    joints.
+    """Scale the jerk (3,) down to the limits of tool and joints, in place.
+
+    First the acceleration after the period, a + dt jerk, is scaled to its limits, which gives the
+    jerk; then the jerk itself is scaled to its own.
     """
     given, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
     for i in range(3):
@@ -207,19 +261,20 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
 
 @compiled
 def _norm(vector: Vector) -> float:
+    """Euclidean norm of a vector (3,)."""
     return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
 @compiled
 def ready(states: Records, heres: Records, arms: Records, max_speed: float, share: float, costs: Vector) -> float:
-    """The joints' costs of tool motion into `costs`; share of the speed that is allowed."""
+    """Write the `joint_costs` of tool motion; return the share of speed that `slow_down` allows."""
     joint_costs(arms, heres, costs)
     return slow_down(states[0].setpoint, heres[0].position, share, max_speed)
 
 
 @compiled
 def finish(states: Records, frames: Records, parameters: Records) -> None:
-    """Turns the orientation's setpoint on toward the frame's target, and shows the setpoints."""
+    """Turn the orientation setpoint for one period, and write the setpoints into the frame."""
     state, frame = states[0], frames[0]
     turn_orientation(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
     write(states, frames)
@@ -227,7 +282,7 @@ def finish(states: Records, frames: Records, parameters: Records) -> None:
 
 @compiled
 def write(states: Records, frames: Records) -> None:
-    """Into the frame where the setpoints are."""
+    """Write the state's setpoints and gripper into the frame."""
     state, frame = states[0], frames[0]
     frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
     frame.setpoint_acceleration[:] = state.setpoint[2]

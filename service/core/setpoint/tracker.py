@@ -1,4 +1,4 @@
-"""What leads the setpoint: its tracker's gains, and the target of one that waits for the tool."""
+"""Gains of the setpoint's tracker, and the target of a setpoint that waits for its tool."""
 
 from __future__ import annotations
 
@@ -25,8 +25,16 @@ from service.core.skill.model import Target
 
 
 def gains_for(settings: Settings) -> Vector:
-    """`tracker_gains` for the jerk that the settings weigh, but no quicker than tool, joints and
-    the loop can follow.
+    """Gains (5,) of `tracker_gains` for the settings, slow enough for tool, joints and loop.
+
+    With jerk_weight w the tracker's rate is w^(-1/6) [1/s]. The weight is the configured one, or
+    the weight of the largest rate that all can follow, if that is larger:
+
+        rate = min(TRACKER_RATE_SHARE * min over joints of (jerk / acceleration),
+                   max(TRACKER_RATE_SHARE * tool jerk / tool acceleration,
+                       cbrt(STIFFEST_PER_M * tool jerk)),
+                   TRACKER_LOOP_SHARE * rate_hz)
+        jerk_weight = max(configured weight, max(rate, SLOWEST_PER_S)^-6)
     """
     tool = settings.tool
     own = max(TRACKER_RATE_SHARE * tool.jerk / tool.acceleration, math.cbrt(STIFFEST_PER_M * tool.jerk))
@@ -35,12 +43,16 @@ def gains_for(settings: Settings) -> Vector:
 
 
 def tracker_gains(jerk_weight: float) -> Vector:
-    """Gains (5,) of the error, of target velocity and acceleration, and of the setpoint's.
+    """Gains k (5,) of the linear-quadratic tracker, rounded to GAIN_DECIMALS.
 
-    For the jerk that minimises the integral of error² + jerk_weight [s⁶] jerk² while the target's
-    acceleration reverts to 0 as ACCELERATION_REVERSION_PER_S and VELOCITY_REVERSION_PER_S2 say.
+    On each axis, with x the setpoint, r the target, and z = (r - x, r', r'', x', x''):
+
+        jerk = k · z    minimises    integral of (r - x)² + jerk_weight jerk² dt
+
+    jerk_weight is in s⁶. The target is assumed to follow r''' = -VELOCITY_REVERSION_PER_S2 r' -
+    ACCELERATION_REVERSION_PER_S r''. The gains solve the continuous algebraic Riccati equation.
     """
-    a = np.zeros((5, 5))  # error, target velocity and acceleration, setpoint velocity and acceleration
+    a = np.zeros((5, 5))  # dz/dt = a z + b jerk
     a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = (
         1.0,
         -1.0,
@@ -58,8 +70,12 @@ def tracker_gains(jerk_weight: float) -> Vector:
 
 
 def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
-    """The target for a setpoint (3, 3) that is far ahead of the tool (3,) [m]: so much nearer to
-    where it is as it is to wait, unless that brings it back.
+    """Target of a setpoint (3, 3) that is far ahead of its tool (3,) [m], at rest and moved closer.
+
+        share = (GAP_STOPPED_M - gap) / (GAP_STOPPED_M - GAP_WAITING_M), limited to 0 ... 1
+        waiting target = setpoint + share (target - setpoint)
+
+    A target in whose direction the setpoint would approach its tool is returned unchanged.
     """
     ahead, way = setpoint[0] - tool, target.position - setpoint[0]
     gap = float(np.linalg.norm(ahead))
