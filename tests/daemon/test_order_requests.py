@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -32,6 +32,13 @@ class SlowWorkshop(SkillWorker):
         self.begun.set()
         assert self.let.wait(20)
         return adapted(skill, places, tolerance=tolerance)
+
+
+@pytest.fixture
+def slow() -> Iterator[SlowWorkshop]:
+    running = SlowWorkshop()
+    yield running
+    running.close()
 
 
 @pytest.mark.parametrize("suffix", ["hold", "resume", "reset"])
@@ -69,8 +76,7 @@ def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: py
         cell.client.ask("hold")
 
 
-def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell]) -> None:
-    slow = SlowWorkshop()
+def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop) -> None:
     cell = opened(slow)
     with ThreadPoolExecutor(1) as pool:
         teaching = pool.submit(cell.client.add, PLACES)
@@ -84,8 +90,9 @@ def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorke
     assert held["tick"] < taught.tick
 
 
-def test_requests_that_wait_are_answered_before_the_end(opened: Callable[[SkillWorker], Cell]) -> None:
-    slow = SlowWorkshop()
+def test_requests_that_wait_are_answered_before_the_end(
+    opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop
+) -> None:
     cell = opened(slow)
     with ThreadPoolExecutor(2) as pool:
         teaching = pool.submit(cell.client.add, PLACES)
