@@ -4,6 +4,7 @@ a wait for what no file holds.
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 
 from service.contract.explain import ExplainedError
@@ -20,11 +21,12 @@ def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> b
 
     Raises OSError, UnusableError.
     """
-    size = path.stat().st_size
-    if not (path.is_file() or path.is_dir() or (accepts_pipes and path.is_fifo())):
+    about = path.stat()
+    is_file = stat.S_ISREG(about.st_mode)
+    if not (is_file or stat.S_ISDIR(about.st_mode) or (accepts_pipes and stat.S_ISFIFO(about.st_mode))):
         raise UnusableError("it is not a file")
-    if path.is_file() and size > largest_bytes:
-        raise UnusableError(f"it has {size} bytes, at most {largest_bytes} accepted")
+    if is_file and about.st_size > largest_bytes:
+        raise UnusableError(f"it has {about.st_size} bytes, at most {largest_bytes} accepted")
     with path.open("rb") as file:
         data = file.read(largest_bytes + 1)
     if len(data) > largest_bytes:
