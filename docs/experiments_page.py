@@ -72,7 +72,7 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     stale = {name for name, result in results.items() if staleness(name, result, here)}
 
     def at_six(method: str) -> dict[str, Any]:
-        """What a method costs with six inputs."""
+        """The row of a method with six inputs."""
         rows = results["promp"]["dimensions"]
         return next(row for row in rows if (row["method"], row["inputs"]) == (method, 6))
 

@@ -77,14 +77,14 @@ def client_settings(
 
 
 def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
-    """What was given, once it is valid. Raises SettingsError."""
+    """Return the given values if they are valid. Raises SettingsError."""
     try:
         validated(given, ClientSettings)
     except InvalidError as error:
-        told = str(error)
+        problems = str(error)
         if origin.startswith(("$", "-")):  # a variable or an option, which names the value itself
-            told = re.sub(rf"(?m)^{next(iter(given))}(, entry \d+)?: ", "", told)
-        raise SettingsError(f"{origin}: {told}") from None
+            problems = re.sub(rf"(?m)^{next(iter(given))}(, entry \d+)?: ", "", problems)
+        raise SettingsError(f"{origin}: {problems}") from None
     return given
 
 

@@ -37,7 +37,7 @@ class Stream(NamedTuple):
 
 
 class Seeds(NamedTuple):
-    """What an experiment draws: to learn from, to choose constants on, and to evaluate on.
+    """Random streams of an experiment: to learn from, to choose constants on, to evaluate on.
 
     `method` is the seed of the methods' own random choices.
     """
