@@ -1,4 +1,4 @@
-"""`python docs/settings_page.py` writes settings.md: every setting of `service/config.py` with its
+"""`python docs/settings_page.py` writes settings.md: every setting of a cell with its
 default, its accepted values and the comment beside it.
 """
 
@@ -16,12 +16,12 @@ from typing import Any
 import msgspec
 from msgspec import inspect as types
 
-from service import config
+from service.settings import config
 
 PAGE = Path(__file__).with_name("settings.md")
 HEAD = """# Settings
 
-<!-- Written by `python docs/settings_page.py` from service/config.py: change it there. -->
+<!-- Written by `python docs/settings_page.py` from service/settings/config.py: change it there. -->
 
 This page lists every setting of a cell, with its default and the values that are accepted. Write
 the settings that you want to change into a TOML file, and start the daemon with it: `thirdhand

@@ -10,7 +10,7 @@ import math
 import time
 
 from service.client import Follower, client_settings
-from service.config import Settings
+from service.settings.config import Settings
 
 PERIOD_S = 0.005
 

@@ -15,7 +15,7 @@ import numpy as np
 from service.arms.drive import Measured, follow
 from service.arms.playback import SpeedLimits
 from service.client import client_settings
-from service.config import Settings, load
+from service.settings.config import Settings, load
 
 
 class FakeArm:

@@ -6,12 +6,12 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback, until it is watched for
 
 # isort: split
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import sys
 
-from service import interrupt
+from service.process import interrupt
 
 __all__ = ["main"]
 

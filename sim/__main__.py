@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
 from service.contract.explain import in_words
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -14,14 +14,14 @@ from pathlib import Path
 
 import msgspec
 
-from service import interrupt
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
 from service.contract.printable import printable_lines
-from service.described_arm import SettingsError, UnreadableError
-from service.launch import ENGINES, LaunchError, engine_of
-from service.shipped import ARMS, cell_of
+from service.daemon.launch import ENGINES, LaunchError, engine_of
+from service.files.shipped import ARMS, cell_of
+from service.process import interrupt
+from service.settings.arm_description import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, Pause
 

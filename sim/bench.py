@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from service.config import Settings
 from service.contract.messages import BASE, SceneObject
+from service.settings.config import Settings
 from sim.engines import world_of
 from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript

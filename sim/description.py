@@ -6,9 +6,9 @@ import math
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from service.config import Settings, robot_description
 from service.core.separation.body import body_of
-from service.urdf import Urdf
+from service.settings.config import Settings, robot_description
+from service.settings.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
 UNKNOWN_KG = "1"  # of a link that a joint moves and of which the URDF does not say a mass: engines move none without

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.launch import engine_of
+from service.daemon.launch import engine_of
 from sim.world import World
 
 

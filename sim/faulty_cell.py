@@ -19,10 +19,10 @@ from typing import Literal, NamedTuple, Self
 import zenoh
 
 from service.client import Client, UnreachableError, open_session
-from service.config import Settings
 from service.contract import cdr, channels
 from service.daemon.clock import Deadlines
-from service.launch import Launched, launched
+from service.daemon.launch import Launched, launched
+from service.settings.config import Settings
 from sim.bench import Bench
 from sim.network import Bridge, Live
 from sim.parts import Link, Part, as_usual_afterwards, before_others

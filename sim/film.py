@@ -6,7 +6,7 @@ is. The bench draws it without a screen, twice as large as it is shown: that smo
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from service import palette
-from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
+from service.settings import palette
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.closed_loop import ClosedLoop
 from sim.scene import Scene

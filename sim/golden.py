@@ -7,8 +7,8 @@ again, for a change of behaviour that is meant.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
 from service.contract.explain import in_words
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -20,17 +20,17 @@ from pathlib import Path
 
 import numpy as np
 
-from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, outgoing, run
 from service.core.frame import Event, Frame, Tick, differences, order
+from service.files.mcap_file import RecordingError
+from service.files.recording import Recorder, Recording
+from service.files.replay import ticks
+from service.files.steps import checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
-from service.recording.mcap_file import RecordingError
-from service.recording.recording import Recorder, Recording
-from service.recording.replay import ticks
-from service.recording.steps import checksum
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from sim.scene import Scene

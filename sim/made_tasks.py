@@ -18,9 +18,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from service.config import Reach
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
+from service.settings.config import Reach
 from sim.people import PROJECT_SEED, SEEDS, Person, person
 from sim.scene import TOOL_ORIENTATION
 from sim.script import Array

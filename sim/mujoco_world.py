@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.config import Settings
+from service.settings.config import Settings
 from sim.description import simulated
 from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World
 

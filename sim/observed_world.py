@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from service.config import Settings, robot_description
 from service.contract import cdr, messages
 from service.contract.joint_states import JointStates, measured
 from service.core.arm.stage import Arm
 from service.core.geometry import between_segments, place, quaternion_of
 from service.core.separation.body import body_of
+from service.settings.config import Settings, robot_description
 from sim.world import LEVEL, Body, Floats, Pose, World, carried_by
 
 

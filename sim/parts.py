@@ -13,8 +13,8 @@ Each says where it listens, if it does, or else that it began; port 0 takes a fr
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
 from service.contract.explain import in_words
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -30,10 +30,10 @@ import threading
 import time
 from collections.abc import Iterator
 
-from service import child
 from service.client import endpoints, open_session
 from service.contract import cdr, channels, messages
 from service.daemon.clock import Deadlines
+from service.process import child
 from sim.scene import Scene
 from sim.script import HandScript
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.config import Settings
+from service.settings.config import Settings
 from sim.description import simulated
 from sim.quiet import pybullet
 from sim.world import POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World, camera

@@ -7,7 +7,7 @@ sits at +x and faces -x, so left is -y.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -19,11 +19,11 @@ from typing import Annotated
 
 import msgspec
 
-from service.config import Reach
 from service.contract import requests
 from service.contract.explain import InvalidError, in_words, validated
-from service.described_arm import SettingsError
-from service.shipped import ARMS, cell_of
+from service.files.shipped import ARMS, cell_of
+from service.settings.arm_description import SettingsError
+from service.settings.config import Reach
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]

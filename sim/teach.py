@@ -4,8 +4,8 @@ the same seed), or published live for `thirdhand record`.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
 from service.contract.explain import in_words
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -24,9 +24,9 @@ from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
-from service.demonstrations.demonstration_reader import write_demonstration
-from service.described_arm import SettingsError
+from service.files.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
+from service.settings.arm_description import SettingsError
 from sim import made_tasks, sessions
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError

@@ -8,7 +8,7 @@ that counts bytes.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
@@ -27,7 +27,7 @@ import zenoh
 
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError, in_words
-from service.launch import launched
+from service.daemon.launch import launched
 from sim.parts import Part, PartError
 from sim.sockets import CountingRelay
 

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.messages import Quaternion
 from service.core.geometry import rotation
-from service.urdf import multiply
+from service.settings.config import Settings
+from service.settings.urdf import multiply
 from sim.scene import HAND_ORIENTATION, Scene
 
 Floats = tuple[float, ...]

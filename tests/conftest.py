@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import os
@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from service.core.skill.skill import Skill
+from service.files.replay import replay
 from service.learning.skill_file import decoded
-from service.recording.replay import replay
 from service.viewer import vulkan
 from support import compiling, tiers
 from support.paths import RECORDINGS, ROOT

@@ -14,7 +14,7 @@ import os
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # before anything imports Numba
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import sys
@@ -24,7 +24,6 @@ from types import FrameType
 from typing import Any
 
 from service.client import endpoints, open_session, publisher
-from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, Attachment, JointState, PoseStamped
 from service.contract.records import SIDES, SOURCES, Mode
@@ -33,7 +32,8 @@ from service.core.frame import Event, Frame, Tick, Vector
 from service.daemon import daemon
 from service.daemon.cell_streams import Arrivals, CellStreams
 from service.daemon.input_monitor import KEYS
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
+from service.settings.config import Settings, robot_description
 
 ROOT = Path(__file__).parents[1]
 LOOP = str(Path(daemon.__file__))  # this file does what the loop there does

@@ -53,20 +53,20 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
         {
             "service/core/frame.py": "from service.daemon.clock import Deadlines",
             "service/contract/channels.py": "from service.core.frame import Tick",
-            "service/recording/scribe.py": "from service.daemon.clock import Deadlines",
+            "service/scribe/scribe.py": "from service.daemon.clock import Deadlines",
             "service/daemon/clock.py": "from service.cli.usage import UsageError",
             "service/core/skill/skill.py": "from service.learning.learn import learn",
-            "kmp/gmm.py": "from service.config import Settings",
-            "service/config.py": "from sim.scene import Scene",
+            "kmp/gmm.py": "from service.settings.config import Settings",
+            "service/settings/config.py": "from sim.scene import Scene",
         },
         {
             "sim may use service and kmp, service may use kmp, never back",
-            "inside the service, the commands use the processes, these the core, the core the contract",
+            "inside the service, each room imports only the rooms below it",
         },
     ),
     "a module outside of every room": (
         {"service/somewhere_else.py": '"""A module."""'},
-        {"inside the service, the commands use the processes, these the core, the core the contract"},
+        {"inside the service, each room imports only the rooms below it"},
     ),
 }
 
@@ -140,7 +140,7 @@ def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_lib
     names = ((node, getattr(node, "module", None) or node.names[0].name) for node in imports)
     first = next(node for node, name in names if name.split(".")[0] not in sys.stdlib_module_names)
     assert isinstance(first, ast.ImportFrom)
-    assert (first.module, [name.name for name in first.names]) == ("service", ["one_blas_thread"])
+    assert (first.module, [name.name for name in first.names]) == ("service.process", ["one_blas_thread"])
 
 
 def test_the_mathematics_imports_nothing_but_mathematics() -> None:

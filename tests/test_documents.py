@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import Settings, robot_description
 from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import Cause, Flag, Mode, Reason
 from service.contract.roles import ROLES
 from service.core.arm.stage import Arm
 from service.core.frame import FRAME, TIMING_FIELDS
-from service.recording.scribe import Scribe
+from service.scribe.scribe import Scribe
+from service.settings.config import Settings, robot_description
 from service.viewer.blueprint import plot_views
 from support.paths import ROOT
 

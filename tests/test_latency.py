@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from service.recording.replay import replay
+from service.files.replay import replay
 from service.timing import benchmark
 from support.cell import thirdhand
 
@@ -22,7 +22,7 @@ SECONDS, RATE_HZ = 5.0, 500
 # What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 1 and 0.
 MOST_WORK, MOST_LATENCY, MOST_LATE, MOST_MISSED = 14.0, 1.4, 10.0, 0.03
 PLANTED = """
-from service import one_blas_thread
+from service.process import one_blas_thread
 import sys, threading, time
 from service.cli.main import main
 from service.daemon.cell_streams import CellStreams

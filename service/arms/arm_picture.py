@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 from scipy.spatial import ConvexHull
 
-from service import palette
 from service.arms.first_cell import PLACES, Proposal
 from service.core.frame import Vector
 from service.core.geometry import place
+from service.settings import palette
 
 VIEWS = (("from the side", 0, 2, "x [m]", "z [m]"), ("from above", 1, 0, "y [m]", "x [m]"))
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 40)

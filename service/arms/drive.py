@@ -12,10 +12,10 @@ import zenoh
 
 from service.arms.playback import Playback, SpeedLimits
 from service.client import Follower, UnreachableError
-from service.config import RATES_HZ, JointSettings
 from service.contract.channels import key
 from service.contract.explain import ExplainedError
 from service.core.frame import Vector
+from service.settings.config import RATES_HZ, JointSettings
 
 SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
 

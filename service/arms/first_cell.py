@@ -18,15 +18,15 @@ import pinocchio as pin
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from service.config import Settings, converted, robot_description
 from service.core.arm.stage import Arm
 from service.core.frame import Vector
 from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
-from service.described_arm import SettingsError, description
-from service.mesh_cover import found_meshes
-from service.reachable import Shell, Workspace, workspace_of
-from service.urdf import Joint, Urdf
+from service.settings.arm_description import SettingsError, description
+from service.settings.config import Settings, converted, robot_description
+from service.settings.mesh_cover import found_meshes
+from service.settings.reachable import Shell, Workspace, workspace_of
+from service.settings.urdf import Joint, Urdf
 
 PLACES = {  # [m] the tool's in the demo, frame base: where the shipped skill begins and its via-points
     "start": (0.45, -0.05, 0.35),

@@ -13,8 +13,8 @@ import numpy as np
 
 from service.arms.drive import DriveError, Measured
 from service.arms.playback import SpeedLimits
-from service.config import JointSettings, Settings
 from service.core.frame import Vector
+from service.settings.config import JointSettings, Settings
 
 PERIOD_S = 0.001
 ACCELERATION, JERK = 9.0, 4000.0  # [rad/s², rad/s³] of 10 and 5000: a lost packet is made up for by the robot

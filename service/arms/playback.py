@@ -16,10 +16,10 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.client import BRAKE_AFTER_S, Command, no_room_to_brake
-from service.config import RATES_HZ, JointSettings
 from service.core.frame import Records, Vector, parameters
 from service.core.intake.arm_samples import in_turn
 from service.core.limiter.stage import Limited, Limiter
+from service.settings.config import RATES_HZ, JointSettings
 
 REJOIN_AFTER_S = 0.1  # a new sequence begins after this silence, or with a tick number this far from the last
 REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # a new sequence must begin this near to where the arm stands

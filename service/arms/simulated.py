@@ -8,8 +8,8 @@ import numpy as np
 
 from service.arms.drive import Measured
 from service.arms.playback import SpeedLimits
-from service.config import Settings
 from service.core.frame import Vector
+from service.settings.config import Settings
 
 PERIOD_S = 0.001
 MOST_BEHIND_S = 0.05  # that is made up for; after a longer pause it goes on from then

@@ -10,10 +10,10 @@ from xml.etree import ElementTree
 from service.arms.arm_picture import draw
 from service.arms.first_cell import JERK_RATE, PLACES, RISE_S, TORQUE_SHARE, Proposal, proposed, written
 from service.cli.usage import check_writable
-from service.config import load
 from service.contract.explain import ExplainedError
-from service.described_arm import SettingsError, description
-from service.mesh_cover import unfound
+from service.settings.arm_description import SettingsError, description
+from service.settings.config import load
+from service.settings.mesh_cover import unfound
 
 DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
 

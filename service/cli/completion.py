@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.progress import say
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
+from service.process.progress import say
 
 
 def completion(args: argparse.Namespace) -> int:

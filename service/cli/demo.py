@@ -12,14 +12,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from service.child import python
-from service.cli.progress import say
 from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
+from service.daemon.launch import engine_of, launched, played
 from service.daemon.machine import LATE_MS, MISSED_SHARE
-from service.launch import engine_of, launched, played
-from service.shipped import cell_of
+from service.files.shipped import cell_of
+from service.process.child import python
+from service.process.progress import say
 
 START_TIMEOUT_S = 60.0
 AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
@@ -58,7 +58,13 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
+            bench = [
+                "--engine",
+                engine,
+                "--arm",
+                str(service.config),
+                *(["--scene", str(scene)] if scene else []),
+            ]
             report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()

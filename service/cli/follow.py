@@ -6,13 +6,13 @@ import argparse
 import signal
 import threading
 
-from service.cli.progress import say
 from service.cli.usage import reaching
 from service.client import Client
 from service.client.session import tried
-from service.config import Settings
-from service.described_arm import UnreadableError
-from service.shipped import cell_of
+from service.files.shipped import cell_of
+from service.process.progress import say
+from service.settings.arm_description import UnreadableError
+from service.settings.config import Settings
 
 DRIVES = ("franka", "simulated")
 

@@ -7,11 +7,11 @@ import math
 import time
 from typing import Any
 
-from service.cli.progress import say
 from service.cli.usage import reached
 from service.client import Client
 from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
+from service.process.progress import say
 
 STILL_S, STILL_M = 1.0, 0.015  # still: no more motion than STILL_M over STILL_S
 OLDEST_MS = 200.0  # of a hand

@@ -13,9 +13,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from service import interrupt
 from service.cli import record_options
-from service.cli.progress import say
 from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
@@ -23,7 +21,9 @@ from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
-from service.described_arm import SettingsError, UnreadableError
+from service.process import interrupt
+from service.process.progress import say
+from service.settings.arm_description import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),

@@ -8,14 +8,11 @@ import select
 import sys
 from pathlib import Path
 
-from service.cli.progress import say
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in, reaching
 from service.client import UnreachableError, open_session
-from service.config import Settings
 from service.contract.channels import ENDPOINT
 from service.contract.printable import printable, printable_lines
-from service.demonstrations.capture import capture
-from service.demonstrations.demonstration_files import (
+from service.files.demonstration_files import (
     DemonstrationNameError,
     demonstration_paths,
     draw,
@@ -26,8 +23,11 @@ from service.demonstrations.demonstration_files import (
     trim,
     uncut,
 )
-from service.recording.mcap_file import RecordingError
-from service.shipped import cell_of
+from service.files.mcap_file import RecordingError
+from service.files.shipped import cell_of
+from service.process.progress import say
+from service.settings.config import Settings
+from service.trackers.capture import capture
 
 LONGEST_PERSON = 64  # letters of who demonstrates
 

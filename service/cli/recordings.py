@@ -11,7 +11,6 @@ from collections.abc import Mapping
 import msgspec
 
 from kmp import AffineMean
-from service.cli.progress import progress, say, steps
 from service.cli.usage import check_writable, places_in, reached
 from service.client import Client, Tracker
 from service.contract import cdr
@@ -19,16 +18,17 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.printable import printable_lines
 from service.contract.requests import Status
-from service.demonstrations.demonstration_reader import iter_hands, read_demonstration
-from service.demonstrations.pose_streams import SIDES, PoseTopic
+from service.files.demonstration_reader import iter_hands, read_demonstration
+from service.files.mcap_file import ends_early
+from service.files.pose_streams import SIDES, PoseTopic
+from service.files.recording import Recording
+from service.files.replay import replay as replayed
+from service.files.shipped import cell_of
 from service.learning.judgement import table
 from service.learning.learn import Evidence, check_count
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
-from service.recording.mcap_file import ends_early
-from service.recording.recording import Recording
-from service.recording.replay import replay as replayed
-from service.shipped import cell_of
+from service.process.progress import progress, say, steps
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
 

@@ -15,11 +15,11 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from service.cli.progress import progress
 from service.cli.usage import UsageError, check_writable
 from service.contract.printable import printable
 from service.contract.records import Mode
-from service.recording.recording import Recording
+from service.files.recording import Recording
+from service.process.progress import progress
 from service.report.columns import KEPT
 from service.report.report import Report, reported
 from service.report.tables import Table, comparison, names_of, summary, tables

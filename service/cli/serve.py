@@ -13,14 +13,14 @@ from typing import Any
 
 import msgspec
 
-from service import child
 from service.cli.usage import UsageError
-from service.config import Settings, converted
 from service.contract.explain import in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
-from service.described_arm import SettingsError
-from service.shipped import SHIPPED_SKILL, cell_of, skills_folder
+from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
+from service.process import child
+from service.settings.arm_description import SettingsError
+from service.settings.config import Settings, converted
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -41,11 +41,11 @@ def serve(args: argparse.Namespace) -> int:
             reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
             raise OSError(f"nothing can be recorded in {folder}: {reason}") from None
     if folder is not None or args.live is not None:
-        child.preload("service.recording.process")  # beside this process, which imports as much
+        child.preload("service.scribe.process")  # beside this process, which imports as much
     with starting(settings) as start:
         gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
         from service.daemon import daemon  # heavy, while who asks is answered
-        from service.recording.scribe import Scribe
+        from service.scribe.scribe import Scribe
 
         gc.enable()
 

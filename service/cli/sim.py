@@ -7,8 +7,8 @@ import os
 import sys
 from typing import NoReturn
 
-from service.child import python
-from service.launch import engine_of
+from service.daemon.launch import engine_of
+from service.process.child import python
 
 
 def sim(args: argparse.Namespace) -> NoReturn:

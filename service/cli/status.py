@@ -12,7 +12,6 @@ import msgspec
 import zenoh
 from zenoh.handlers import RingChannel
 
-from service import interrupt
 from service.cli.clients import ask
 from service.cli.usage import reached
 from service.client import Client, UnreachableError, decoded, why_silent
@@ -20,6 +19,7 @@ from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief
 from service.contract.records import SIDES
 from service.contract.requests import Source, Status
+from service.process import interrupt
 
 LOOK_S, LINE_S, SILENT_S = 0.02, 0.5, 2.0
 LATE_MS, AHEAD_MS = 1000.0, -5.0  # beyond these a sample's stamp tells of clocks

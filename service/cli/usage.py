@@ -15,11 +15,11 @@ from typing import Any, NoReturn
 import zenoh
 
 from service.client import ClientSettings, client_settings
-from service.config import RATES_HZ
 from service.contract.channels import LARGEST_REQUEST, lacking
 from service.contract.explain import in_file, in_words
-from service.contract.file_content import UnusableError, content
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
+from service.settings.config import RATES_HZ
+from service.settings.file_content import UnusableError, content
 
 CONNECT_TIMEOUT_S = 3.0
 

@@ -22,19 +22,19 @@ import rerun as rr
 from mcap.writer import MCAP0_MAGIC
 from PIL import Image, ImageDraw, ImageFont
 
-from service import palette
 from service.cli.clients import ask
 from service.cli.live_page import Address, Latest, LivePage, web_viewer
-from service.cli.progress import progress, say
 from service.cli.usage import UsageError, check_writable, reached
 from service.client import Client
 from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
-from service.launch import free_port
-from service.network_settings import is_local
-from service.recording.recording import OBJECTS, Recording
-from service.recording.steps import Gap
+from service.daemon.launch import free_port
+from service.files.recording import OBJECTS, Recording
+from service.files.steps import Gap
+from service.process.progress import progress, say
+from service.settings import palette
+from service.settings.network import is_local
 from service.viewer import vulkan
 from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program

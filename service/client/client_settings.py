@@ -13,11 +13,11 @@ import msgspec
 import zenoh
 
 from service.client.session import open_session
-from service.config import Cell
 from service.contract.channels import ENDPOINT, lacking
 from service.contract.explain import InvalidError, in_words, validated
-from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content
-from service.described_arm import SettingsError, UnreadableError
+from service.settings.arm_description import SettingsError, UnreadableError
+from service.settings.config import Cell
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
 

@@ -17,7 +17,7 @@ import zenoh
 
 from service.contract.channels import lacking
 from service.contract.explain import ExplainedError, in_words
-from service.contract.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late

@@ -13,7 +13,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from service.config import Settings
 from service.contract import cdr
 from service.contract.channels import STREAMS
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
@@ -55,6 +54,7 @@ from service.core.skill.model import Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
 from service.core.skill.skill import NEVER, Skill
 from service.core.skill.stage import SkillStage
+from service.settings.config import Settings
 
 # Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)

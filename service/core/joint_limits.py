@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.config import JointSettings
 from service.core.frame import Vector
+from service.settings.config import JointSettings
 
 LIMIT_MARGIN_RAD = 1e-6  # distance kept from the position limits; rounding along a stop is below 1e-7 rad
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.config import Settings
 from service.contract.messages import BASE, Transform
 from service.contract.records import SIDES
 from service.core.frame import Frame
-from service.urdf import Urdf
+from service.settings.config import Settings
+from service.settings.urdf import Urdf
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w without rotation
 

@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
-from service.config import Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.arm.stage import Arm
@@ -23,6 +22,7 @@ from service.core.skill.memory import delayed, moving_features
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 from service.core.skill.unseen import deviation_m
+from service.settings.config import Settings
 
 FOLLOWED_TICKS = 30  # ticks of the rehearsal, once the arm's posture is trusted
 SAMPLE_EVERY = 5  # ticks between two samples of the hands

@@ -14,13 +14,13 @@ import math
 
 import numpy as np
 
-from service.config import Settings
 from service.core.arm.stage import Arm
 from service.core.decision import WAY
 from service.core.frame import Vector
 from service.core.geometry import axis_of, quaternion_of, swing, turn_between
 from service.core.kinematics import Kinematics
 from service.core.separation.stage import Separation
+from service.settings.config import Settings
 
 STARTS, ITERATIONS = 60, 120  # random starts of the search for postures, and steps from each start
 STEP_RAD = 0.2  # largest change of a joint in one step

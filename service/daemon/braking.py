@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import time
 
-from service.config import Settings
 from service.contract import cdr
 from service.contract.messages import Attachment
 from service.core.frame import Frame
 from service.core.limiter.stage import Limiter
 from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import Deadlines
+from service.settings.config import Settings
 
 RESTS_S = 0.1  # so long it is said: a message may be lost, and some controllers go on by the last one
 

@@ -11,13 +11,13 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from service.client import publisher
-from service.config import Settings
 from service.contract import channels, ros2
 from service.contract.cdr import encode_joints
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.core.frame import Event, Frame, Record
 from service.daemon.ros2_domain import Ros2Domain
+from service.settings.config import Settings
 
 KEPT_DELAYS = 256  # messages whose delay is remembered
 CLOCK_STEP_NS = 100_000_000  # a delay may be this much below the least one before it

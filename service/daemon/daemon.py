@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from service.client import endpoints
-from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import in_brief, in_full
@@ -50,8 +49,9 @@ from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.way_finder import WayFinder
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
-from service.recording.protocol import pack
-from service.recording.scribe import Scribe
+from service.scribe.protocol import pack
+from service.scribe.scribe import Scribe
+from service.settings.config import Settings, robot_description
 
 log = logging.getLogger("thirdhand")
 STOP_TIMEOUT_S = 3.0

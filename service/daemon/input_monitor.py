@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Iterator
 from statistics import median
 
-from service.config import JointSettings, Settings
 from service.contract.incidents import (
     LONGEST_NAME,
     MALFORMED,
@@ -33,6 +32,7 @@ from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
 from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
 from service.daemon.cell_streams import Arrivals
+from service.settings.config import JointSettings, Settings
 
 WINDOW_S = 1.0  # over which rates and clocks are taken
 TELL_EVERY_S = 10.0  # counts of what goes on being rejected

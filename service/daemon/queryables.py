@@ -16,7 +16,6 @@ import numpy as np
 import zenoh
 
 from service.client import ENCODINGS
-from service.config import Settings
 from service.contract import channels
 from service.contract.incidents import word
 from service.contract.records import Mode
@@ -42,6 +41,7 @@ from service.daemon.status import outcome
 from service.learning.reach import accepted, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
+from service.settings.config import Settings
 
 ADOPTION_TIMEOUT_S = 2.0
 POLL_S = 0.001  # while waiting for the tick that took a request

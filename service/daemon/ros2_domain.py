@@ -15,7 +15,6 @@ import zenoh
 from zenoh import ext
 
 from service.client import ENCODINGS
-from service.config import Settings, urdf_path
 from service.contract import cdr, ros2
 from service.contract.incidents import in_brief, in_full
 from service.contract.messages import in_order
@@ -23,7 +22,8 @@ from service.core.frame import Frame, Record
 from service.core.transforms import Frames
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
-from service.described_arm import description
+from service.settings.arm_description import description
+from service.settings.config import Settings, urdf_path
 
 MOST_WAITING = 256  # messages: half a second of commands
 CLOSED_WITHIN_S = 2.0

@@ -7,10 +7,10 @@ import os
 import time
 from pathlib import Path
 
-from service.config import Settings
 from service.core.skill.skill import Skill
 from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
+from service.settings.config import Settings
 
 LONGEST_S = 600.0  # a restart that takes longer is of another job: its hands tell where it begins
 SURE = 0.5  # a stage that is less probable is not worth keeping

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from service.contract.explain import ExplainedError, in_file, in_words
-from service.contract.file_content import content
+from service.settings.file_content import content
 
 log = logging.getLogger("thirdhand")
 NOT_OURS = "it is damaged, or was not written by this service"

@@ -14,9 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from service.config import Settings, robot_description
 from service.contract.explain import in_words
-from service.contract.file_content import UnusableError
 from service.contract.requests import Add, ViaPoint, decode_request, encode_json
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
@@ -24,7 +22,9 @@ from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError
-from service.urdf import Urdf
+from service.settings.config import Settings, robot_description
+from service.settings.file_content import UnusableError
+from service.settings.urdf import Urdf
 
 log = logging.getLogger("thirdhand")
 T = TypeVar("T")

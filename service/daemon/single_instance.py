@@ -18,9 +18,9 @@ import zenoh
 
 from service.client import Client, RefusedError, UnreachableError
 from service.client.presence import living
-from service.config import Settings
 from service.contract import channels
 from service.contract.explain import ExplainedError
+from service.settings.config import Settings
 
 MOST_SESSIONS = 64
 MOST_DESCRIPTORS = 65536

@@ -19,16 +19,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from service import child
-from service.config import Settings, robot_description
 from service.contract.explain import in_words
-from service.contract.file_content import UnusableError, content
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.way_out import WayOut
 from service.learning.reach import beyond_m
 from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
+from service.process import child
+from service.settings.config import Settings, robot_description
+from service.settings.file_content import UnusableError, content
 
 MODULE = "service.daemon.skill_worker"
 TIMEOUT_S = 25.0  # shorter than a client waits

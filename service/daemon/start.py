@@ -18,12 +18,12 @@ from typing import Any
 import zenoh
 
 from service.client import open_session
-from service.config import Settings
 from service.contract import channels, ros2
 from service.contract.printable import CLEAR
 from service.contract.requests import STARTING
 from service.contract.roles import access_control
 from service.daemon.single_instance import BOUNDS, Lock, allow_descriptors, occupy, state_folder
+from service.settings.config import Settings
 
 log = logging.getLogger("thirdhand")
 TELL_EVERY_S, LOG_EVERY_S = 1.0, 20.0

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.incidents import MALFORMED, Evidence, Inside, Outside, Stuck, explained, word
 from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES, Flag, Mode, Reason
@@ -23,6 +22,7 @@ from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames
+from service.settings.config import Settings
 
 OLDEST_S = 0.2  # of the measured joints
 AT_LIMIT_RAD = 0.02  # so near to its limit a joint is at the end of its way

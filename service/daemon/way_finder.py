@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from service.config import Settings
 from service.core.frame import Event, Frame, Record, order
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import SkillError
+from service.settings.config import Settings
 
 AGAIN_S = 2.0  # after which it is looked for once more, as what was in the way may have gone
 

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP, AffineMean, GaussianKernel, Gaussians
-from service.config import ToolSettings
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
+from service.settings.config import ToolSettings
 
 ELLS = 2.0 ** np.arange(-1.0, 4.0)  # [1/m²] beyond these, via-points bend everything or nothing
 NARROW = 2.0 ** np.arange(-1.0, 6.0)  # [1/m²] of more inputs than positions: hands are farther from each other there

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 import numpy as np
 
-from service.config import Reach
 from service.contract.messages import BASE
 from service.core.frame import Vector
 from service.core.skill.model import LEVELS, Regions
@@ -20,6 +19,7 @@ from service.learning.ambiguity import COMPARED, ambiguity, lengths
 from service.learning.choice import NOISE_M, rms
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
+from service.settings.config import Reach
 
 if TYPE_CHECKING:
     from service.learning.regions import Apart

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
-from service.config import Reach
 from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
@@ -41,6 +40,7 @@ from service.learning.regions import Apart, calibrated, folds, of_held_out, of_m
 from service.learning.skill_file import HIGHEST_GATE_M, SkillError, StoredSkill, with_file
 from service.learning.stages import Learned, learned
 from service.learning.via_points import of_one
+from service.settings.config import Reach
 
 MARGIN_M = 0.25  # by which targets may leave the demonstrated box
 ELL, PENALTY = 5.0, 2.0  # of the paper's way, in metres

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service import palette
 from service.core.frame import Vector
 from service.core.skill.model import LEVELS
 from service.learning.gate import nonsense
 from service.learning.judgement import HeldOut
 from service.learning.learn import Evidence
+from service.settings import palette
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

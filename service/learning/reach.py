@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.config import Settings, urdf_path
 from service.core.frame import Vector
 from service.core.skill.skill import clamp
-from service.described_arm import description
 from service.learning.skill_file import StoredSkill
-from service.reachable import workspace_of
-from service.urdf import Urdf
+from service.settings.arm_description import description
+from service.settings.config import Settings, urdf_path
+from service.settings.reachable import workspace_of
+from service.settings.urdf import Urdf
 
 REFUSED_SHARE = 0.5  # a skill is refused when a larger share of its places cannot be carried out
 RETAUGHT_M = 0.15  # [m] a task's via-point that is out of reach by less can be taught anew beside where it was learned

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import ViaPointMissed
-from service.config import ToolSettings
 from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.settings.config import ToolSettings
 
 MAX_GAIN = ToolSettings().max_gain
 NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations

@@ -21,9 +21,9 @@ from service.contract.printable import printable, printable_values
 from service.contract.requests import Source
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
+from service.files.recording import Recording
+from service.files.steps import Gap, Step
 from service.learning.skill_file import SkillError, decoded
-from service.recording.recording import Recording
-from service.recording.steps import Gap, Step
 
 KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "tool", "joints"),

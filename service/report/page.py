@@ -11,12 +11,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from service import palette
 from service.contract.printable import printable
 from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
 from service.report.report import Report
 from service.report.tables import Table, comparison, names_of, summary, tables
+from service.settings import palette
 
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))

@@ -15,7 +15,7 @@ import numpy as np
 from service.contract.incidents import word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.core.frame import Vector
-from service.recording.recording import Recording
+from service.files.recording import Recording
 from service.report.causes import before, why
 from service.report.columns import Columns, read, runs
 from service.report.stages import stages

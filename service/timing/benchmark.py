@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from service.cli.progress import say
 from service.client import Client, open_session
 from service.core.frame import STAGES, TIMING
-from service.launch import launched
-from service.recording.recording import Recording
-from service.shipped import SHIPPED_SKILL, cell_of, recordings
+from service.daemon.launch import launched
+from service.files.recording import Recording
+from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
+from service.process.progress import say
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import BenchError, echo, family, probe

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import contextlib
@@ -29,13 +29,13 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
 from service.client import Client, RefusedError, UnreachableError, open_session
-from service.config import Settings
 from service.contract.explain import ExplainedError
 from service.contract.requests import ViaPoint
-from service.launch import Launched, free_port, launched
+from service.daemon.launch import Launched, free_port, launched
+from service.files.replay import replay
+from service.files.shipped import SHIPPED_SKILL, recordings, shipped_skill
 from service.learning.skill_file import with_file
-from service.recording.replay import replay
-from service.shipped import SHIPPED_SKILL, recordings, shipped_skill
+from service.settings.config import Settings
 from service.timing.probe import TRACKER_HZ, hands_of
 from service.timing.probe_processes import probe
 from service.viewer.stream import rerun_program
@@ -45,7 +45,7 @@ LARGE_SKILL = "large"
 LARGE = 100_000  # points of it
 SETTLE_S = 2.0
 COLLECTING = f"""
-from service import one_blas_thread
+from service.process import one_blas_thread
 import gc, sys, threading, time
 from service.cli.main import main
 

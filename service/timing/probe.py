@@ -5,7 +5,7 @@ commands which answer its hands, and an echo.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import functools
@@ -22,7 +22,6 @@ import numpy as np
 import zenoh
 
 from service.client import endpoints, open_session
-from service.config import Settings, robot_description
 from service.contract import cdr, channels
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES
@@ -31,8 +30,9 @@ from service.core.frame import Event, Tick, Vector
 from service.core.skill.skill import Skill
 from service.core.warm_up import warm_up
 from service.daemon.clock import SPIN_NS, Deadlines, ask_for_real_time
+from service.files.shipped import cell_of
 from service.learning.skill_file import decoded
-from service.shipped import cell_of
+from service.settings.config import Settings, robot_description
 
 SHARES = (50.0, 99.0, 99.9, 100.0)
 EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms

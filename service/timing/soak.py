@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from service.client import Client, open_session
-from service.config import Settings
-from service.launch import launched
+from service.daemon.launch import launched
+from service.settings.config import Settings
 from service.timing.loads import asking, until_following
 from service.timing.probe_processes import family
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from service import palette
 from service.contract.incidents import explained, word
 from service.contract.records import Mode, Reason
+from service.settings import palette
 
 WIDTH, HEIGHT = 640, 80  # pixels
 LETTERS, MARGIN = 44, 24

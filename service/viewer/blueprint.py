@@ -15,8 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import components
 
-from service import palette
-from service.config import Settings
+from service.settings import palette
+from service.settings.config import Settings
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")

@@ -11,8 +11,6 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service import palette
-from service.config import Settings
 from service.contract.incidents import word
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
@@ -20,6 +18,8 @@ from service.core.geometry import between_segments, off_target, place
 from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
+from service.settings import palette
+from service.settings.config import Settings
 from service.viewer.banner import banner, line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import ArmModels

@@ -17,14 +17,14 @@ import msgspec
 import numpy as np
 import rerun as rr
 
-from service import palette
 from service.contract.explain import in_words
 from service.contract.printable import as_markdown, printable, printable_values
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
-from service.demonstrations.demonstration_reader import read_demonstration
+from service.files.demonstration_reader import read_demonstration
+from service.files.mcap_file import RecordingError
 from service.learning.demonstration import Demonstration, fingerprint
-from service.recording.mcap_file import RecordingError
+from service.settings import palette
 from service.viewer.scene_objects import Column, row
 
 MOST_POINTS = 300  # of a line

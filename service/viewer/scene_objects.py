@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service import palette
 from service.contract.messages import BASE, SceneObject
 from service.contract.printable import printable
+from service.settings import palette
 
 LABEL_OFFSET_M = (
     0.06  # of an object's name: above it, clear of via-points' names; toward the arm where the tool holds it

@@ -19,14 +19,14 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service import palette
-from service.config import Reach, Settings, robot_description, urdf_path
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
-from service.mesh_cover import found_meshes, unfound
-from service.robot_xml import element_of
-from service.urdf import Urdf
+from service.settings import palette
+from service.settings.config import Reach, Settings, robot_description, urdf_path
+from service.settings.mesh_cover import found_meshes, unfound
+from service.settings.robot_xml import element_of
+from service.settings.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
 

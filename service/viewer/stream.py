@@ -23,7 +23,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from service.config import Settings
 from service.contract import cdr
 from service.contract.explain import ExplainedError, in_words
 from service.contract.joint_states import measured
@@ -31,9 +30,10 @@ from service.contract.messages import SceneObject, WireError
 from service.contract.printable import printable
 from service.core.frame import Record
 from service.core.intake.arm_samples import in_turn
+from service.files.recording import OBJECTS
+from service.files.shipped import skills_folder
 from service.learning.demonstration import Demonstration
-from service.recording.recording import OBJECTS
-from service.shipped import skills_folder
+from service.settings.config import Settings
 from service.viewer import learned, scene_objects
 from service.viewer.blueprint import blueprint
 from service.viewer.dynamic import LOG_NS, DrawnFrame, DynamicScene

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse

@@ -17,9 +17,9 @@ import rerun as rr
 from scipy.stats import wilcoxon
 
 from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, improve
-from service.config import Settings, robot_description
 from service.core.arm.stage import Arm
 from service.core.kinematics import Kinematics
+from service.settings.config import Settings, robot_description
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
 from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
 from sim.experiments.writing import TARGETS, write

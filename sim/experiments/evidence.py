@@ -23,9 +23,9 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from service.core.frame import encode
-from service.recording.mcap_file import machine
-from service.recording.recording import Recording
-from service.shipped import SHIPPED_SKILL, recordings
+from service.files.mcap_file import machine
+from service.files.recording import Recording
+from service.files.shipped import SHIPPED_SKILL, recordings
 from sim.experiments.results import Array, ExperimentError, Options
 from sim.experiments.seeds import BY_EXPERIMENT
 

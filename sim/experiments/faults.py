@@ -24,12 +24,12 @@ from typing import Any, get_args
 import numpy as np
 
 from service.client import RefusedError
-from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.records import Mode, Reason
 from service.core.arm.stage import Arm
-from service.recording.recording import Recording
-from service.shipped import cell_of
+from service.files.recording import Recording
+from service.files.shipped import cell_of
+from service.settings.config import Settings, robot_description
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
 from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
 from sim.parts import PartError

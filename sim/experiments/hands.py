@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.contract.records import Mode
-from service.recording.recording import Recording
-from service.shipped import shipped_skill
+from service.files.recording import Recording
+from service.files.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.beside_the_paper import differences

@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import Reach, Settings
 from service.contract.explain import in_words
 from service.contract.records import SIDES
 from service.contract.requests import Hands, ViaPoint
@@ -29,8 +28,9 @@ from service.core.skill.model import CHI_SQUARE
 from service.core.skill.skill import Skill
 from service.core.skill.stage import SkillStage
 from service.core.skill.tuning import UNSURE_M
+from service.files.shipped import shipped_skill
 from service.learning.demonstration import Demonstration
-from service.shipped import shipped_skill
+from service.settings.config import Reach, Settings
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.results import Array, ExperimentError
 

@@ -11,7 +11,7 @@ import msgspec
 
 from service.client import Client, open_session
 from service.contract.requests import TOLERANCE_M
-from service.launch import launched, played
+from service.daemon.launch import launched, played
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M
 from sim.experiments.scenes import OFFSET_M, Drawn
 from sim.network import RunReport

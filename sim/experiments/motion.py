@@ -17,12 +17,12 @@ import msgspec
 import numpy as np
 import rerun as rr
 
-from service.config import Settings
 from service.core.skill.skill import Skill
+from service.files.shipped import cell_of, recordings
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
-from service.shipped import cell_of, recordings
+from service.settings.config import Settings
 from sim.experiments import spectra
 from sim.experiments.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
 from sim.experiments.linear_floor import best_linear

@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import Settings, robot_description
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Known, Prediction, Skill, clamp
 from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2, MOTION_STEP_S
+from service.settings.config import Settings, robot_description
 from sim.experiments.results import Array
 
 Law: TypeAlias = Callable[[Array], Array]

@@ -15,10 +15,10 @@ import rerun as rr
 
 from kmp.orientation import exp, log, multiplied
 from service.contract.requests import TOLERANCE_M, ViaPoint
+from service.files.shipped import shipped_skill
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw

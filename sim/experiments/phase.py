@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop
 from sim.experiments.seeds import SHIPPED, Stream

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from kmp.compiled import compiled
-from service.config import Settings, robot_description
 from service.contract.records import Flag
 from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
 from service.core.separation.tuning import SLIP_SPEED_MPS
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
 from sim.experiments import rivals
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse

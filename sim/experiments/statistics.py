@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rerun as rr
 
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
 from sim.bench import TaskEvents
 from sim.experiments import rivals
 from sim.experiments.live import live_run

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from service.config import Settings
 from service.contract.records import SIDES, Mode
 from service.core.frame import Event, Tick
 from service.core.skill.model import CHI_SQUARE
 from service.core.skill.skill import Skill
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
+from service.settings.config import Settings
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.open_loop import Said, along_hands, controller, frames, rival
 from sim.experiments.results import Array

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from service.arms.first_cell import PLACES, Proposal, plate_of, proposed, rates, turn_of_tool, written
-from service.config import load, robot_description
 from service.core.arm.stage import Arm
 from service.core.separation.stage import Separation
-from service.described_arm import description
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
-from service.urdf import Urdf
+from service.settings.arm_description import description
+from service.settings.config import load, robot_description
+from service.settings.urdf import Urdf
 from sim.experiments.rehearsal import rehearse
 from sim.scene import Scene
 from sim.script import HandScript

@@ -23,9 +23,9 @@ from zenoh.handlers import RingChannel
 from service.arms.drive import follow
 from service.arms.simulated import SimulatedArm
 from service.client import Client, UnreachableError, endpoints, open_session
-from service.config import Settings
 from service.contract import cdr
-from service.launch import free_port
+from service.daemon.launch import free_port
+from service.settings.config import Settings
 from sim.scene import Scene
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told

@@ -15,9 +15,9 @@ from service.arms import franka
 from service.arms.drive import DriveError
 from service.arms.playback import Playback
 from service.client import Command
-from service.config import JointSettings, Settings, robot_description
 from service.core.arm.stage import Arm
 from service.core.limiter.stage import Limiter
+from service.settings.config import JointSettings, Settings, robot_description
 from support.franka_cell import STANDS, assert_allowed, cell, fr3, robot, simulated
 
 TICK, PERIOD = 0.002, franka.PERIOD_S  # [s]

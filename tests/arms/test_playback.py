@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from service.arms.playback import REJOIN_AFTER_S, REJOIN_RAD, Playback
 from service.client import BRAKE_AFTER_S, Command
-from service.config import JointSettings
 from service.core.limiter.stage import Limiter
+from service.settings.config import JointSettings
 
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from service.config import Settings, load
+from service.settings.config import Settings, load
 from support.cell import told
 from support.paths import ROOT
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from service.cli.main import GROUPS, parser
-from service.launch import free_port
+from service.daemon.launch import free_port
 from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
 

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from service.cli.demo import EVENTS, text
-from service.config import WAM
+from service.settings.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
 

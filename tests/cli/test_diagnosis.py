@@ -12,9 +12,9 @@ import pytest
 
 from service.cli.diagnosis import Y_UP, Finding, findings
 from service.cli.status import line, rows
-from service.config import converted
 from service.contract.requests import Percentiles, Source, Status
 from service.core.geometry import rotation
+from service.settings.config import converted
 
 NONE = Percentiles()
 GOOD = Source(rate_hz=100.0, age_ms=4.0, fresh=True, clock_ms=1.5, frame="base")

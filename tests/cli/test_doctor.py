@@ -22,10 +22,10 @@ import zenoh
 from service.arms.drive import follow
 from service.cli.main import main
 from service.client import endpoints, open_session
-from service.config import Settings
 from service.contract import cdr, messages
+from service.daemon.launch import launched
 from service.daemon.single_instance import occupy
-from service.launch import launched
+from service.settings.config import Settings
 from support.cell import LEFT, Daemon, Tracker
 from support.paths import ROOT
 

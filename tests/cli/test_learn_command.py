@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.demonstrations.demonstration_reader import write_demonstration
+from service.files.demonstration_reader import write_demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import decoded
 from sim.scene import Scene

@@ -15,7 +15,7 @@ import pytest
 
 from service.cli.main import main
 from service.contract.channels import ENDPOINT
-from service.launch import free_port
+from service.daemon.launch import free_port
 from service.learning.skill_file import decoded
 from sim import teach
 from support.paths import ROOT

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service import palette
 from service.cli.main import main
-from service.config import Settings
 from service.core.frame import blank
-from service.launch import ENGINES
-from service.recording.recording import Recorder, Recording
+from service.daemon.launch import ENGINES
+from service.files.recording import Recorder, Recording
 from service.report.page import thinned
+from service.settings import palette
+from service.settings.config import Settings
 from support.paths import RECORDINGS, ROOT
 from support.wam import STATE
 

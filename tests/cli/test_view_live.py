@@ -26,10 +26,10 @@ import psutil
 import pytest
 from PIL import Image
 
-from service import palette
 from service.cli.live_page import A_PICTURE, PATIENCE_S, SAMPLES, STREAM, UNKNOWN
 from service.cli.view import FRESH_S, screenshot
-from service.launch import free_port
+from service.daemon.launch import free_port
+from service.settings import palette
 from support import chromium
 from support.cell import Daemon, Tracker, serving
 from support.paths import ROOT

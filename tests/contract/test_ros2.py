@@ -15,9 +15,9 @@ from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
-from service.config import SettingsError, parse
 from service.contract import cdr, channels, ros2
-from service.network_settings import Ros2
+from service.settings.config import SettingsError, parse
+from service.settings.network import Ros2
 
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
 COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"

@@ -16,11 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.config import ArmSettings, Settings, ToolSettings
 from service.contract.messages import BASE
 from service.core.arm.stage import Arm
 from service.core.limiter.stage import Limiter
 from service.core.skill.skill import clamp
+from service.settings.config import ArmSettings, Settings, ToolSettings
 from support.wam import JOINT_NAMES, URDF
 
 Vector = npt.NDArray[np.float64]

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.config import Settings
 from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
 from service.core.skill.skill import Skill
+from service.settings.config import Settings
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
 

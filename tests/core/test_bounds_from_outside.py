@@ -14,9 +14,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.config import robot_description
 from service.contract.records import Mode, Reason
 from service.core.frame import Vector
+from service.settings.config import robot_description
 from support import bounds
 from support.arm_geometry import ArmGeometry, between_segments, points_to_box, segments_to_box
 from support.bounds import Bound, Session, broken

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import Settings, load, robot_description
 from service.contract.messages import JointState
 from service.contract.records import Cause, Mode, Reason
 from service.core.arm.stage import Arm
@@ -20,6 +19,7 @@ from service.core.frame import Event, Frame, Tick, Vector, order
 from service.core.geometry import quaternion_of
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
+from service.settings.config import Settings, load, robot_description
 from sim.closed_loop import hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Settings
 from service.contract import channels
 from service.contract.records import Flag, Mode, Reason
 from service.core.controller import Controller, outgoing
@@ -20,6 +19,7 @@ from service.core.skill.model import Regions
 from service.core.skill.skill import Skill
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
+from service.settings.config import Settings
 from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of

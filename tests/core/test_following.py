@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Settings, ToolSettings
 from service.contract.messages import PoseStamped
 from service.core.frame import blank
 from service.core.intake.stage import Intake
@@ -14,6 +13,7 @@ from service.core.setpoint.stage import SetpointGenerator
 from service.core.setpoint.tracker import tracker_gains
 from service.core.setpoint.tuning import LATE_STOP_MAX_M
 from service.core.skill.model import Target
+from service.settings.config import Settings, ToolSettings
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE
 

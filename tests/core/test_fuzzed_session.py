@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import Settings
 from service.contract import channels
 from service.contract.messages import WireError
 from service.contract.records import Mode
@@ -17,7 +16,8 @@ from service.contract.requests import RequestError
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick, order
 from service.core.skill.skill import Skill
-from service.recording.recording import Recorder
+from service.files.recording import Recorder
+from service.settings.config import Settings
 from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
 from support.wam import URDF
 

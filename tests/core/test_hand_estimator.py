@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from service.config import HandSettings
 from service.core.frame import Vector
 from service.core.intake import MODES, STATES, mode_filter
 from service.core.intake.motion_model import REST, model
 from service.core.intake.tuning import LEAST_NOISE_M, MAX_NOISE_M
+from service.settings.config import HandSettings
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 
 

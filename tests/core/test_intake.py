@@ -9,10 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from service.config import HandSettings
 from service.contract.messages import PoseStamped
 from service.contract.records import Cause
 from service.core.geometry import rotation
+from service.settings.config import HandSettings
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
 

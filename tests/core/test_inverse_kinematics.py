@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from service.config import robot_description
 from service.core.arm.least_squares import least_squares
 from service.core.arm.stage import Arm
 from service.core.arm.step import describe
@@ -16,7 +15,8 @@ from service.core.frame import parameters
 from service.core.kinematics import tool_speed_after, tool_speeds
 from service.core.setpoint.step import slow_down
 from service.core.setpoint.tuning import GAP_FREE_M, GAP_SLOW_M
-from service.shipped import cell_of
+from service.files.shipped import cell_of
+from service.settings.config import robot_description
 
 
 @pytest.mark.parametrize("seed", range(40))

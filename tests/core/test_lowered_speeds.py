@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Settings, robot_description
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Frame, Tick, Vector, order
 from service.core.skill.skill import Skill
+from service.files.shipped import cell_of as shipped
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
-from service.shipped import cell_of as shipped
+from service.settings.config import Settings, robot_description
 from sim.scene import Scene
 from support.arms import cell_of
 from support.in_process import hand

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import Settings, SettingsError, load, parse, robot_description
 from service.contract.records import Mode
 from service.core.arm.stage import Arm
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.skill.skill import Skill
+from service.files.recording import Recorder
+from service.files.replay import replay
 from service.learning.learn import learn
-from service.recording.recording import Recorder
-from service.recording.replay import replay
+from service.settings.config import Settings, SettingsError, load, parse, robot_description
 from sim.scene import Scene
 from sim.script import HandScript
 from sim.teach import demonstrations

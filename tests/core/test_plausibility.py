@@ -15,13 +15,13 @@ from hypothesis import example, given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.config import HandSettings
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, copied, parameters
 from service.core.intake import plausibility, step
 from service.core.skill.skill import Skill
+from service.settings.config import HandSettings
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
 from support.tracked import LEFT as LEFT_SIDE
 from support.tracked import STRAIGHT, Hands

@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
-from service.config import Settings
 from service.contract import cdr
 from service.core.arm.stage import Arm
 from service.core.controller import Controller, outgoing
@@ -25,6 +24,7 @@ from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOr
 from service.core.skill.skill import Skill
 from service.core.skill.tuning import GRIPPER_MOVES_S
 from service.learning.via_points import adapted
+from service.settings.config import Settings
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, frames, ticks_of

@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.config import Box, Obstacles, Settings, Table, robot_description
 from service.contract.records import Flag, Mode
 from service.core.arm.stage import Arm
 from service.core.controller import Controller, start_state
@@ -28,8 +27,9 @@ from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
 from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS, TABLE_DEPTH_M
 from service.core.skill.skill import Skill
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
+from service.settings.config import Box, Obstacles, Settings, Table, robot_description
 from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript

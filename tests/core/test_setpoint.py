@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.config import Settings, ToolSettings
 from service.core.arm.stage import Arm
 from service.core.frame import Vector, blank, copied, frame_layout
 from service.core.setpoint.bounds import speed_to_come, stop_distance
@@ -21,6 +20,7 @@ from service.core.setpoint.tracker import waiting
 from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
 from service.core.skill.model import Target, Wanted
 from service.core.stops import fastest_stop
+from service.settings.config import Settings, ToolSettings
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE, URDF

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from service.config import Settings, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller, start_state
 from service.core.frame import Frame, Tick, Vector
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
+from service.settings.config import Settings, robot_description
 from sim.scene import Scene
 from support.arms import cell_of
 from support.in_process import hand

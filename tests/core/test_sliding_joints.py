@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.config import Settings, robot_description
 from service.contract.records import Cause, Mode, Reason
 from service.core.arm.stage import Arm
 from service.core.controller import Controller
@@ -19,8 +18,9 @@ from service.core.geometry import place
 from service.core.separation.body import body_of
 from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
-from service.recording.recording import Recorder
-from service.recording.replay import replay
+from service.files.recording import Recorder
+from service.files.replay import replay
+from service.settings.config import Settings, robot_description
 from sim.closed_loop import hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript

@@ -7,15 +7,15 @@ import itertools
 import numpy as np
 import pytest
 
-from service.config import Settings
 from service.core.controller import Controller, start_state
 from service.core.frame import Tick, order, structured
 from service.core.skill.memory import along, delayed
 from service.core.skill.skill import Skill
 from service.core.skill.stage import SkillStage
 from service.core.skill.stages import MOST_STAGES, STAGE, along_way, recognise
+from service.files.shipped import shipped_skill
 from service.learning.skill_file import decoded
-from service.shipped import shipped_skill
+from service.settings.config import Settings
 from support.paths import RECORDINGS
 from support.wam import URDF
 

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from service.config import Settings, robot_description
 from service.contract.records import Flag, Mode, Reason
 from service.core.arm.stage import Arm
 from service.core.controller import Controller, start_state
@@ -24,9 +23,10 @@ from service.core.frame import Event, Frame, Tick, Vector, order
 from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
+from service.files.recording import Recorder
+from service.files.replay import replay
 from service.learning.via_points import adapted
-from service.recording.recording import Recorder
-from service.recording.replay import replay
+from service.settings.config import Settings, robot_description
 from sim.scene import Scene
 from support.arms import cell_of
 from support.in_process import ASSUMED, LEFT, RIGHT, arm, hand

@@ -17,12 +17,12 @@ import pkgutil
 import sys
 from pathlib import Path
 
-from service import one_blas_thread
+from service.process import one_blas_thread
 from numba.core.dispatcher import Dispatcher
 
 import kmp
 import service.core
-from service.config import Settings, robot_description
+from service.settings.config import Settings, robot_description
 from service.core.warm_up import warm_up
 
 LOOPED = [
@@ -51,7 +51,7 @@ def compiled_by(skill):
 """
 REPLAYED = """
 from service.cli.main import main
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
 
 before = compiled_by(shipped_skill())
 assert main(["replay", sys.argv[1]]) in (0, None)

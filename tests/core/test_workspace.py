@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.config import Reach, robot_description
 from service.contract.records import Mode
 from service.core.controller import Controller
 from service.core.frame import Vector
 from service.core.skill.skill import Skill, clamp, is_reachable
+from service.settings.config import Reach, robot_description
 from support.arms import cell_of
 from support.in_process import LEFT, RIGHT, frames, resting
 

@@ -21,16 +21,16 @@ from zenoh.handlers import FifoChannel
 
 from service.cli.main import main
 from service.client import RefusedError
-from service.config import Settings, robot_description
 from service.contract import cdr, messages, requests
 from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill
 from service.daemon.status import MeasuredArm
+from service.files.recording import Recording
+from service.files.replay import replay
 from service.learning.learn import learn
-from service.recording.recording import Recording
-from service.recording.replay import replay
+from service.settings.config import Settings, robot_description
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
 from support.circling import circling
 from support.in_process import arm

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from service.config import Settings
 from service.contract import cdr
 from service.contract.records import Mode
+from service.settings.config import Settings
 from support.cell import serving
 from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
 

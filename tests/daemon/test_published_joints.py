@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.config import Settings
 from service.contract import cdr
 from service.contract.messages import JointState
+from service.settings.config import Settings
 from support.cell import Daemon, serving, told
 
 JOINTS = Settings().joints.names

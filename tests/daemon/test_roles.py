@@ -23,8 +23,8 @@ from service.client import Client, UnreachableError, endpoints, living, open_ses
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
+from service.daemon.launch import launched
 from service.daemon.single_instance import BOUNDS
-from service.launch import launched
 from support.cell import LEFT, Tracker, thirdhand, told
 
 CELL = "bench"

@@ -14,8 +14,8 @@ from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
 from service.client import endpoints, open_session
-from service.config import Settings
 from service.contract import ros2, ros2msg
+from service.settings.config import Settings
 from support.cell import Tracker, serving
 from support.wam import JOINT_NAMES
 

@@ -20,7 +20,6 @@ from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 from zenoh_ros2_sdk.session import ZenohSession
 
 from service.client import endpoints, open_session
-from service.config import Settings, parse, robot_description
 from service.contract import cdr, ros2
 from service.contract.messages import JointState, Transform
 from service.contract.roles import access_control
@@ -28,7 +27,8 @@ from service.core.frame import blank, frame_layout
 from service.core.transforms import Frames
 from service.daemon.ros2_domain import Ros2Domain
 from service.daemon.single_instance import BOUNDS
-from service.shipped import cell_of
+from service.files.shipped import cell_of
+from service.settings.config import Settings, parse, robot_description
 from support.cell import Tracker, serving, told
 from support.wam import JOINT_NAMES
 

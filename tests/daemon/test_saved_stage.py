@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from service.client import RefusedError
-from service.config import Files, Settings
 from service.core.skill.skill import Skill
 from service.daemon.saved_stage import LONGEST_S, SavedStage
 from service.daemon.saved_state import LARGEST_BYTES, NOT_OURS
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.single_instance import state_folder
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
+from service.settings.config import Files, Settings
 from support.cell import serving
 
 

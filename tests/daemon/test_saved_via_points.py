@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from service.cli.usage import added_in
-from service.config import WAM, Files, Settings, converted
 from service.core.skill.skill import Skill
 from service.daemon.saved_via_points import SavedViaPoints
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
+from service.settings.config import WAM, Files, Settings, converted
 from sim.scene import Scene
 
 POINTS = Scene().via_points()

@@ -15,13 +15,13 @@ import zenoh
 
 from service.cli.main import main
 from service.client import RefusedError, endpoints
-from service.config import Files, Reach, Settings
 from service.contract.records import Mode, Reason
 from service.core.skill.skill import Skill
 from service.daemon.daemon import load_skill
 from service.daemon.skill_worker import SkillWorker
 from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.settings.config import Files, Reach, Settings
 from support.request_cell import PLACES, Cell
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import psutil
 import pytest
 
-from service import child
 from service.contract.requests import ViaPoint
 from service.core.skill.skill import Skill
 from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted, in_force
+from service.process import child
 from sim.scene import Scene
 from support.paths import RECORDINGS
 

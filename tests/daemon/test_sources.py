@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from service.config import HandSettings, Settings
 from service.contract.incidents import explained
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
@@ -21,6 +20,7 @@ from service.core.frame import Event, Frame, Tick, blank, frame_layout
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEYS, InputMonitor, evidence
 from service.daemon.status import CellStatus
+from service.settings.config import HandSettings, Settings
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES, URDF
 

@@ -16,14 +16,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from service import launch
 from service.cli.main import main
 from service.client import Client, StartingError, UnreachableError, cells, endpoints, open_session
-from service.config import Files, Settings
 from service.contract.channels import CHANNELS
+from service.daemon import launch
+from service.daemon.launch import LaunchError, launched
 from service.daemon.start import LOG_EVERY_S, Start, starting
-from service.launch import LaunchError, launched
-from service.network_settings import Network
+from service.settings.config import Files, Settings
+from service.settings.network import Network
 from support.cell import serving
 from support.paths import ROOT
 
@@ -193,7 +193,9 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("command", ["service.cli.serve", "service.cli.demo", "service.daemon.start", "service.launch"])
+@pytest.mark.parametrize(
+    "command", ["service.cli.serve", "service.cli.demo", "service.daemon.start", "service.daemon.launch"]
+)
 def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
     code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

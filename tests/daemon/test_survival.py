@@ -18,10 +18,10 @@ from typing import Any
 import pytest
 
 from service.client import Client, RefusedError, UnreachableError, open_session
+from service.daemon.launch import free_port
 from service.daemon.single_instance import Lock
 from service.daemon.supervised_thread import supervised
-from service.launch import free_port
-from service.recording.replay import replay
+from service.files.replay import replay
 from support.cell import Daemon, Tracker, serving, thirdhand
 from support.paths import ROOT
 
@@ -217,7 +217,7 @@ def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(t
     """Also beside a scribe that does not begin: the loop does not wait for it."""
     go, records = tmp_path / "go", tmp_path / "records"
     before = (
-        "import pathlib, time\nfrom service import child\nfrom service.daemon import daemon\nrun = daemon.run\n"
+        "import pathlib, time\nfrom service.process import child\nfrom service.daemon import daemon\nrun = daemon.run\n"
         f"def late(*arguments):\n    while not pathlib.Path({str(go)!r}).exists():\n        time.sleep(0.01)\n"
         "    run(*arguments)\ndaemon.run = late\n"
         "start = child.start\n"
@@ -271,11 +271,11 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
 def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     """A child that never looks at its socket, and a parent's thread that ends before it does."""
     (tmp_path / "busy.py").write_text(
-        "import time\nfrom service import child\n"
+        "import time\nfrom service.process import child\n"
         "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"
     )
     parent = (
-        "import socket, sys, threading, time\nfrom service import child\nstarted = []\n"
+        "import socket, sys, threading, time\nfrom service.process import child\nstarted = []\n"
         "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
         "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
         "print(started[0].pid, flush=True)\ntime.sleep(60)\n"

@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Reach
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures, table
 from service.learning.learn import Evidence, learn
 from service.learning.picture import draw, drawn
 from service.learning.skill_file import SkillError
+from service.settings.config import Reach
 from sim.made_tasks import takes
 from support.paths import ROOT
 from support.taught_scene import demonstrated

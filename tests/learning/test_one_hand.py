@@ -13,15 +13,15 @@ from service.contract.requests import Hands, ViaPoint
 from service.core.controller import Controller
 from service.core.frame import Records, Tick
 from service.core.skill.staged import StagedKMP
-from service.demonstrations.demonstration_files import summary
-from service.demonstrations.demonstration_reader import read_demonstration, write_demonstration
-from service.demonstrations.pose_streams import PoseTopic
+from service.files.demonstration_files import summary
+from service.files.demonstration_reader import read_demonstration, write_demonstration
+from service.files.mcap_file import RecordingError
+from service.files.pose_streams import PoseTopic
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures, table
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
-from service.recording.mcap_file import RecordingError
 from sim.made_tasks import takes
 from support.circling import circling
 from support.in_process import ASSUMED, frames, hand

@@ -13,6 +13,7 @@ from service.contract.requests import RequestError, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.skill import Skill
+from service.files.shipped import shipped_skill
 from service.learning.ambiguity import SAME_M
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import Figures
@@ -20,7 +21,6 @@ from service.learning.learn import learn
 from service.learning.pose import learned_pose
 from service.learning.skill_file import SkillError, decoded
 from service.learning.via_points import adapted, in_force
-from service.shipped import shipped_skill
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
 from support.taught_scene import PLACES, SCENE

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Reach, Settings, robot_description
 from service.core.arm.stage import Arm
 from service.core.skill.skill import is_reachable
+from service.files.shipped import ARMS, cell_of, shipped_skill
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import StoredSkill
-from service.shipped import ARMS, cell_of, shipped_skill
+from service.settings.config import Reach, Settings, robot_description
 from support.turning import sliding_cell
 
 WIDE = Reach(centre=(0.0, 0.0, 0.3), inner=0.01, outer=3.0, min_x=-1.0, min_z=-1.0)

@@ -8,18 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.config import Settings
 from service.core.controller import start_state
 from service.core.frame import blank, frame_layout
 from service.core.skill.model import CHI_SQUARE, LEVELS, NORMAL, REGION_95, Regions
 from service.core.skill.stage import SkillStage
 from service.core.skill.step import calibrate, recent
 from service.core.skill.tuning import UNSURE_M
+from service.files.shipped import shipped_skill
 from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.regions import FOLDS, Apart, calibrated, folds, of_the_others
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
-from service.shipped import shipped_skill
+from service.settings.config import Settings
 from sim.made_tasks import takes
 
 

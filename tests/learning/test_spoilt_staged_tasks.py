@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from service.core.skill.staged import StagedKMP
-from service.demonstrations.demonstration_reader import read_demonstration
+from service.files.demonstration_reader import read_demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted

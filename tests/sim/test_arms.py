@@ -16,16 +16,16 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
-from service.config import Box, Obstacles, Reach, Settings, parse, robot_description
 from service.contract import cdr, messages
 from service.contract.records import Mode
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
-from service.described_arm import UnreadableError
-from service.launch import ENGINES, described
+from service.daemon.launch import ENGINES, described
+from service.files.shipped import ARMS, cell_of, shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import ARMS, cell_of, shipped_skill
-from service.urdf import Urdf
+from service.settings.arm_description import UnreadableError
+from service.settings.config import Box, Obstacles, Reach, Settings, parse, robot_description
+from service.settings.urdf import Urdf
 from sim.bench import Bench
 from sim.engines import world_of
 from sim.experiments.rehearsal import rehearse

@@ -21,11 +21,11 @@ import pytest
 import zenoh
 
 from service.client import endpoints, open_session
-from service.config import WAM, Settings
 from service.contract import cdr, channels, messages
 from service.core.skill.pose import CLOSED, OPEN
 from service.learning.learn import learn
 from service.learning.via_points import adapted
+from service.settings.config import WAM, Settings
 from sim.bench import Bench, Observation
 from sim.experiments.rehearsal import rehearse
 from sim.network import BenchError, Commands, Dropout, Live, RunReport, run

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from service.launch import ENGINES, LaunchError, engine_of
+from service.daemon.launch import ENGINES, LaunchError, engine_of
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
 from sim.bench import Bench
 from sim.engines import world_of
 from sim.experiments.rehearsal import Rehearsed, rehearse
@@ -127,7 +127,7 @@ def test_what_is_carried_keeps_its_place_in_the_hand() -> None:
 
 
 def test_an_engine_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
+    monkeypatch.setattr("service.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
     assert engine_of() == "msgspec"
     with pytest.raises(LaunchError, match="needs NoneSuch, which is not installed"):
         engine_of("none_such")

@@ -19,10 +19,10 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib")
 
-from service.config import Settings
-from service.recording.recording import Recording
-from service.recording.replay import ticks
-from service.shipped import recordings, shipped_skill
+from service.files.recording import Recording
+from service.files.replay import ticks
+from service.files.shipped import recordings, shipped_skill
+from service.settings.config import Settings
 from sim.experiments import evidence
 from sim.experiments.__main__ import jobs, main
 from sim.experiments.evidence import EXPERIMENTS, core_digest, kmp_digest, options_of, origin, staleness, tree

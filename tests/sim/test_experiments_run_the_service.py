@@ -13,7 +13,6 @@ import pytest
 
 pytest.importorskip("movement_primitives", reason="ProMPs need movement_primitives")
 
-from service.config import Settings, robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, PoseStamped
 from service.contract.records import SIDES, Mode
@@ -24,10 +23,11 @@ from service.core.skill.model import NORMAL
 from service.core.skill.skill import Skill
 from service.core.skill.staged import StagedKMP
 from service.core.skill.stages import MOST_STAGES
+from service.files.shipped import recordings, shipped_skill
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
-from service.shipped import recordings, shipped_skill
+from service.settings.config import Settings, robot_description
 from sim.experiments import followers, rehearsal, rivals
 from sim.experiments.moving_hands import stops
 from sim.experiments.open_loop import targets

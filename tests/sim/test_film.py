@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 from PIL import Image
 
-from service.config import Settings, robot_description
 from service.core.controller import Controller
-from service.shipped import shipped_skill
+from service.files.shipped import shipped_skill
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.closed_loop import ClosedLoop
 from sim.film import FRAME_HZ, SIZE, SPEED, Film

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.config import Settings
 from service.contract.records import Mode
-from service.launch import ENGINES
+from service.daemon.launch import ENGINES
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
+from service.settings.config import Settings
 from sim.bench import Bench
 from sim.engines import world_of
 from sim.experiments.rehearsal import rehearse

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config import Reach
 from service.learning.division import FOLLOW, off_via_point
+from service.settings.config import Reach
 from sim.made_tasks import AHEAD_S, CARRIED_M, KINDS, LATE_S, RATE_HZ, run, takes
 from sim.sessions import along
 

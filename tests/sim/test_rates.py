@@ -8,8 +8,8 @@ import importlib.util
 
 import pytest
 
-from service.launch import ENGINES
-from service.shipped import ARMS, cell_of
+from service.daemon.launch import ENGINES
+from service.files.shipped import ARMS, cell_of
 from sim.experiments.rehearsal import rehearse
 from sim.network import BenchError
 from sim.script import HandScript

@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.config import Settings
 from service.core.frame import Vector
 from service.core.separation.body import body_of
 from service.core.separation.tuning import TABLE_DEPTH_M
-from service.urdf import Urdf
+from service.settings.config import Settings
+from service.settings.urdf import Urdf
 
 STEP_S = 1e-5  # of difference quotients
 SEARCH_STEPS = 30  # of a golden-section search, each 0.62 times as wide as the one before

@@ -9,7 +9,7 @@ from importlib.metadata import files
 from pathlib import Path
 from typing import NamedTuple
 
-from service.config import Settings, parse
+from service.settings.config import Settings, parse
 from support.in_process import ASSUMED
 
 

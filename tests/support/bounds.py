@@ -13,9 +13,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.records import Flag, Mode, Reason
 from service.core.frame import Vector
+from service.settings.config import Settings
 from support.arm_geometry import STEP_S, ArmGeometry, at_least, between_segments, segments_to_box
 
 ROUNDING = 1e-9  # of numbers in SI units, and relative

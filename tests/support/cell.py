@@ -19,7 +19,7 @@ import zenoh
 from service.cli.main import main
 from service.client import Client, open_session
 from service.contract import cdr, messages
-from service.launch import Launched, launched
+from service.daemon.launch import Launched, launched
 from support.paths import ROOT
 
 LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'

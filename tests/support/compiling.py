@@ -5,7 +5,7 @@ and time out where several do.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import fcntl
@@ -16,10 +16,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from service.config import Settings, robot_description
 from service.contract.requests import ViaPoint
 from service.core import warm_up
 from service.daemon.skill_worker import SkillWorker
+from service.settings.config import Settings, robot_description
 from support.arms import cell_of
 from support.paths import RECORDINGS, ROOT
 

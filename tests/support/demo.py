@@ -10,15 +10,15 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from service.config import Settings, robot_description
 from service.contract.cdr import encode_attachment
 from service.contract.messages import Attachment
 from service.contract.records import SIDES, Mode
 from service.core.controller import Controller, outgoing
 from service.core.frame import Event, Tick
 from service.core.skill.skill import Skill
+from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
+from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import HANDS_HZ, START_NS, begin_when_settled, hand_event, joints_event
 from sim.engines import world_of

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from service.config import Box, Settings, parse
-from service.shipped import cell_of as shipped
+from service.files.shipped import cell_of as shipped
+from service.settings.config import Box, Settings, parse
 from support.arms import MODELS, Model, toml_of
 
 XARM7 = Model("xarm7.urdf", "link7", (0.0, -0.3, 0.0, 1.2, 0.0, 1.5, 0.0))

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from service.config import Settings, robot_description
 from service.contract.messages import PoseStamped
 from service.contract.records import SIDES, Flag, Reason
 from service.contract.requests import ViaPoint
@@ -21,10 +20,11 @@ from service.core.controller import Controller
 from service.core.frame import Event, Frame, Record, Tick, Vector, order
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
+from service.files.shipped import shipped_skill
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
 from service.learning.via_points import adapted
-from service.shipped import shipped_skill
+from service.settings.config import Settings, robot_description
 from sim.made_tasks import takes
 from sim.scene import Scene
 from sim.script import HandScript

@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config import Settings, ToolSettings
 from service.core.controller import Controller
 from service.core.frame import Record, Vector
 from service.core.setpoint import HULL_SPANS
@@ -16,6 +15,7 @@ from service.core.setpoint.stage import SetpointGenerator
 from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
 from service.core.skill.model import Target
 from service.core.skill.skill import Skill
+from service.settings.config import Settings, ToolSettings
 
 
 def margin(tool: ToolSettings) -> float:

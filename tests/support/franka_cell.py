@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from service.config import JointSettings, Settings, parse
+from service.settings.config import JointSettings, Settings, parse
 from support.paths import ROOT
 
 PERIOD = 0.001  # [s]

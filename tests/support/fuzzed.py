@@ -11,14 +11,14 @@ from random import Random
 
 import numpy as np
 
-from service.config import robot_description
 from service.contract import cdr
 from service.contract.messages import BASE, JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.frame import Frame, Vector
+from service.files.recording import Recording
+from service.files.replay import replay, ticks
 from service.learning.skill_file import decoded
-from service.recording.recording import Recording
-from service.recording.replay import replay, ticks
+from service.settings.config import robot_description
 from support.arm_geometry import ArmGeometry
 from support.bounds import Session, broken
 from support.explained import explained_controller

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 import msgspec
 import numpy as np
 
-from service.config import Settings
 from service.core.controller import Controller, run
 from service.core.frame import Event, Frame, Tick
+from service.settings.config import Settings
 from sim.closed_loop import hand_event, joints_event
 from sim.script import HandScript
 from support.wam import JOINT_NAMES

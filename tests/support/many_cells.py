@@ -4,7 +4,7 @@ many_cells.py FOLDER ENDPOINT CELL ...` serves until its standard input ends.
 
 from __future__ import annotations
 
-from service import one_blas_thread  # noqa: F401
+from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import contextlib
@@ -16,14 +16,14 @@ from typing import Any
 
 import msgspec
 
-from service.config import ArmSettings, Files, Settings
 from service.daemon import daemon
 from service.daemon.daemon import Daemon
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.start import starting
-from service.network_settings import Network
-from service.recording.scribe import Scribe
-from service.shipped import recordings, shipped_skill
+from service.files.shipped import recordings, shipped_skill
+from service.scribe.scribe import Scribe
+from service.settings.config import ArmSettings, Files, Settings
+from service.settings.network import Network
 
 RATE_HZ, ROS2_DOMAIN = 50, 7
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.config import Settings
 from service.contract import cdr, messages
 from service.core.controller import outgoing
 from service.core.frame import TIMING, Event, Record, Tick, blank
-from service.recording.recording import Recorder
-from service.recording.scribe import Scribe
+from service.files.recording import Recorder
+from service.scribe.scribe import Scribe
+from service.settings.config import Settings
 from support.wam import FRAME, JOINT_NAMES, STATE
 
 START_NS = 1_700_000_000_000_000_000

@@ -10,7 +10,6 @@ from typing import Any
 import zenoh
 
 from service.client import Client
-from service.config import Files, Reach, Settings
 from service.contract import channels, requests
 from service.contract.records import Mode, Reason
 from service.core.frame import Event
@@ -18,6 +17,7 @@ from service.core.skill.skill import Skill
 from service.daemon.queryables import Queryables
 from service.daemon.single_instance import state_folder
 from service.daemon.skill_worker import SkillWorker
+from service.settings.config import Files, Reach, Settings
 from sim.scene import Scene
 
 PLACES = Scene().via_points()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.config import Settings, ToolSettings
 from service.core.frame import Vector, blank
 from service.core.skill.model import Target
+from service.settings.config import Settings, ToolSettings
 from support.explained import Explained
 from support.wam import STATE
 

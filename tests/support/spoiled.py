@@ -12,9 +12,9 @@ from service.contract import cdr
 from service.contract.channels import POSE, STRING
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint, encode_json
-from service.demonstrations.pose_streams import PLACES
+from service.files.mcap_file import McapFile
+from service.files.pose_streams import PLACES
 from service.learning.demonstration import Demonstration
-from service.recording.mcap_file import McapFile
 
 KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 START_NS = 10**18

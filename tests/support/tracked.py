@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from service.config import HandSettings, Settings
 from service.contract.messages import JointState, PoseStamped
 from service.contract.records import Cause
 from service.core.codes import ARM_HEARD
@@ -14,6 +13,7 @@ from service.core.frame import Record, Vector, as_array, blank, copied
 from service.core.intake.hand_estimator import is_fresh
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
+from service.settings.config import HandSettings, Settings
 from support.wam import FRAME, JOINT_NAMES, STATE
 
 PERIOD_S = 0.002

@@ -6,7 +6,7 @@ import math
 import re
 from pathlib import Path
 
-from service.config import Settings, load
+from service.settings.config import Settings, load
 from support.paths import ROOT
 
 ARMS = ROOT / "service" / "arms"

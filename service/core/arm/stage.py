@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from service.config import Settings
 from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step
 from service.core.arm.tuning import (
     CLOSING_BRAKE_SHARE,
@@ -35,7 +34,8 @@ from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, appro
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
 from service.core.separation.stage import Separation
-from service.urdf import Urdf
+from service.settings.config import Settings
+from service.settings.urdf import Urdf
 
 
 class Solution(NamedTuple):

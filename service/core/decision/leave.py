@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 
-from service.config import Settings
 from service.contract import cdr
 from service.core.codes import HELD
 from service.core.decision.tuning import (
@@ -18,6 +17,7 @@ from service.core.decision.tuning import (
     WAY_START_RAD,
 )
 from service.core.frame import Event, Record, Vector
+from service.settings.config import Settings
 
 
 class WayOut:

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.records import Reason
 from service.core.codes import BLOCKED, FAULT, HOLD, NOT_READY, RETURNING
 from service.core.decision.leave import WayOut
 from service.core.decision.step import step
 from service.core.decision.tuning import RETURN_RADPS
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
+from service.settings.config import Settings
 
 
 class Decision:

@@ -11,9 +11,9 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.config import JointSettings, Settings
 from service.core.frame import Records, Vector
 from service.core.intake.tuning import ARM_STILL_S, MAX_JOINT_RADPS
+from service.settings.config import JointSettings, Settings
 
 TURN = 2.0 * math.pi
 

@@ -18,7 +18,6 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.config import HandSettings
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
 from service.core.intake import KEPT, MODES
@@ -40,6 +39,7 @@ from service.core.intake.tuning import (
     STILLNESS_LOWPASS_S,
     TICK_ROUNDING,
 )
+from service.settings.config import HandSettings
 
 STILL = np.ones(2)  # stillness of two hands that rest
 USUAL = HandSettings()  # default settings, for recordings without a cell's settings

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.channels import BY_KEY
 from service.contract.joint_states import measured
 from service.contract.messages import BASE, JointState, PoseStamped, WireError
@@ -23,6 +22,7 @@ from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
 from service.core.intake.tuning import JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS, MAX_LATE_S, MAX_OUTSIDE_RAD
+from service.settings.config import Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 

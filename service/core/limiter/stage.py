@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 import ruckig
 
-from service.config import JointSettings, Settings
 from service.core.arm.stage import Arm
 from service.core.frame import Record, Vector, as_array, parameters
 from service.core.joint_limits import LIMIT_MARGIN_RAD, approach_gain
@@ -36,6 +35,7 @@ from service.core.limiter.step import (
 from service.core.limiter.tuning import CANCELLED_MOTION_SHARE, STOP_SPEED_SHARE
 from service.core.separation.stage import Separation
 from service.core.stops import stop_together
+from service.settings.config import JointSettings, Settings
 
 
 class Limited(NamedTuple):

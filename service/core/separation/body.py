@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.config import Settings
 from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.core.separation.tuning import CAPSULE_EXCESS_M, CAPSULE_FITS, LEAST_TOOL_M, OWN_CLEARANCE_M, UNMOVED_M
-from service.urdf import Joint, Shape, Urdf
+from service.settings.config import Settings
+from service.settings.urdf import Joint, Shape, Urdf
 
 
 def own_clearance(settings: Settings) -> float:

@@ -18,7 +18,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from service.config import Settings
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
 from service.core.separation.body import body_of, own_clearance
@@ -34,6 +33,7 @@ from service.core.separation.tuning import (
     TABLE_DEPTH_M,
     THINGS_PLANNED_MARGIN_M,
 )
+from service.settings.config import Settings
 
 CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.config import Settings
 from service.core.frame import Record, Records, Vector, parameters
 from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.setpoint.tuning import ORIENTATION_BRAKE_SHARE, ORIENTATION_GAIN_PER_S, ORIENTATION_SPEED_SHARE
+from service.settings.config import Settings
 
 
 class OrientationSetpoint:

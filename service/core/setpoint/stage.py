@@ -24,7 +24,6 @@ import math
 
 import numpy as np
 
-from service.config import Settings
 from service.core.arm.stage import Arm
 from service.core.frame import Record, Vector, as_array, parameters
 from service.core.kinematics import Kinematics
@@ -36,6 +35,7 @@ from service.core.setpoint.tracker import gains_for, waiting
 from service.core.setpoint.tuning import GAP_STOPPED_M, GAP_WAITING_M, HULL_TIME_S
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER, decided
+from service.settings.config import Settings
 
 
 class SetpointGenerator:

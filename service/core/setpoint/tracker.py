@@ -7,7 +7,6 @@ import math
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from service.config import Settings
 from service.core.frame import Vector
 from service.core.joint_limits import acceleration_rate
 from service.core.setpoint.tuning import (
@@ -22,6 +21,7 @@ from service.core.setpoint.tuning import (
     VELOCITY_REVERSION_PER_S2,
 )
 from service.core.skill.model import Target
+from service.settings.config import Settings
 
 
 def gains_for(settings: Settings) -> Vector:

@@ -15,7 +15,6 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.immutable import Immutable, frozen
-from service.config import Reach
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Vector
 from service.core.intake.hand_estimator import STILL
@@ -26,6 +25,7 @@ from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
 from service.core.skill.tuning import MAX_TARGET_M
+from service.settings.config import Reach
 
 NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from service.config import Settings
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Record, Vector, as_array
 from service.core.skill import ORDER
@@ -24,6 +23,7 @@ from service.core.skill.tuning import (
     UNSURE_OFF_SHARE,
 )
 from service.core.skill.unseen import off_m
+from service.settings.config import Settings
 
 NO_STAGE = -1  # stage in a frame while it is not known
 

@@ -1,0 +1,192 @@
+"""A daemon as a process of its own, on a free port and with its files in one folder: for the demo,
+experiments and tests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import select
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from service.contract.explain import ExplainedError
+from service.contract.requests import STARTING
+from service.process.child import python
+from service.settings.config import Settings
+
+STUCK_S, LOOK_S = 60.0, 0.1  # a start that tells of nothing new for so long; how often that is looked for
+STOP_TIMEOUT_S = 60.0
+BENCH_TIMEOUT_S = 120.0
+ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # of the bench; the first that is installed is taken
+
+
+class LaunchError(ExplainedError, RuntimeError):
+    """A daemon did not start or did not end; the message has its output."""
+
+
+def engine_of(wanted: str | None = None) -> str:
+    """The bench's engine: the one that is wanted, or else the first of those installed.
+
+    Raises LaunchError where it is not.
+    """
+    for name in (wanted,) if wanted else ENGINES:
+        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules on purpose
+            if importlib.util.find_spec(name) is not None:
+                return name
+    needed = f"{ENGINES[wanted]}, which is not" if wanted else f"{' or '.join(ENGINES.values())}, none of which is"
+    raise LaunchError(
+        f"the bench needs {needed} installed: pip install 'thirdhand[sim]' (PyBullet has wheels up to Python 3.11 only)"
+    )
+
+
+@dataclass(frozen=True)
+class Launched:
+    """A running daemon: its process, its configuration, where it listens, and its log."""
+
+    process: subprocess.Popen[str]
+    config: Path
+    endpoint: str
+    log: Path
+
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> int:
+        """The exit code, after being asked to stop. Raises LaunchError where that takes longer."""
+        self.process.terminate()
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise LaunchError(f"the service did not end within {timeout_s:g} s of being asked to") from None
+
+    def missing(self) -> str:
+        """What its recordings lack, by the last line of its log; empty: nothing."""
+        from service.scribe.scribe import NOT_RECORDED  # heavy, and launching is to begin at once
+
+        last_lines = self.log.read_text().splitlines()[-1:]
+        return "".join(line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED))
+
+
+@contextlib.contextmanager
+def launched(
+    folder: Path,
+    *arguments: str,
+    record: Path | None = None,
+    skills: Path | None = None,
+    settings: Settings | None = None,
+    rerun: bool = True,
+    program: tuple[str, ...] = ("-m", "service"),
+    network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
+    say: Callable[[str], None] = lambda line: None,
+) -> Iterator[Launched]:
+    """A daemon (`thirdhand serve` with the arguments) that ends with the context.
+
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, drawn
+    too if `rerun`, and its skills in `skills`, where given. Arm, tool and all that describes the
+    cell are those of `settings`; `network` is the section [network] of its configuration. Raises
+    LaunchError.
+    """
+    config, log = folder / "cell.toml", folder / "service.log"
+    files = {"state": folder / "state", "record": record, "skills": skills}
+    config.write_text(
+        "# A cell with a free port and its own files.\n"
+        f"{described(settings or Settings())}{network}[files]\nrerun = {json.dumps(rerun)}\n"
+        + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
+    )
+    command, environment = python(*program, "serve", "--config", str(config), *arguments)
+    with log.open("w") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
+    with process:
+        try:
+            yield Launched(process, config, _endpoint(process, log, say), log)
+        finally:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+            process.kill()
+
+
+def described(settings: Settings) -> str:
+    """As TOML what settings say of a cell, but for its name, network and files."""
+    given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
+    told = {name: given[name] for name in given if given[name] != usual[name]}
+    rate = f"rate_hz = {told['rate_hz']}\n" if "rate_hz" in told else ""
+    return rate + "".join(
+        f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in section.items())
+        for name, section in told.items()
+        if isinstance(section, dict) and name not in ("network", "files")
+    )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:
+    """The endpoint at which a daemon listens, by its output; what its log tells of its start is
+    passed on, and it is waited for as long as that goes on. Raises LaunchError.
+    """
+    assert process.stdout is not None
+    moved_s, last = time.monotonic(), "nothing"
+    with log.open() as lines:
+        while time.monotonic() - moved_s < STUCK_S:
+            if select.select([process.stdout], [], [], LOOK_S)[0]:
+                line = process.stdout.readline()
+                if line.startswith("listening on "):
+                    return line.split()[2].rstrip(",")
+                if not line:
+                    raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")
+            for line in lines:
+                if STARTING in line:
+                    moved_s, last = time.monotonic(), line.partition(STARTING)[2].strip()
+                    say(f"  {STARTING}{last}")
+    raise LaunchError(
+        f"the service has got no further for {STUCK_S:g} s. Start it again on a machine with a free core: what it has "
+        f"compiled is kept. It said last: {last}"
+    )
+
+
+def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda line: None) -> str:
+    """The report of one run of the bench (`python -m sim` with the arguments) as JSON; `say` is
+    called with its progress. Raises LaunchError.
+    """
+    at = ("--connect", endpoint, "--cell", "thirdhand")
+    command, environment = python("-m", "sim", *at, "--once", "--output", "-", *arguments)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
+    clock.start()
+    lines: list[str] = []
+    try:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        for line in process.stderr:
+            lines.append(line.rstrip())
+            say(f"  {lines[-1]}")
+        report = process.stdout.read()
+        if process.wait() != 0:
+            raise LaunchError(
+                f"the bench ended with code {process.returncode}: {lines[-1] if lines else 'it gave no reason'}"
+            )
+    finally:
+        clock.cancel()
+        process.kill()
+        process.communicate()
+    return next((line for line in report.splitlines() if line.startswith("{")), "")
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

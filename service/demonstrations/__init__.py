@@ -1,1 +1,0 @@
-"""Demonstrations on disk: captured, listed, trimmed, and read from recordings of others."""

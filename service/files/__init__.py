@@ -1,0 +1,1 @@
+"""Recordings and demonstrations: MCAP files, their replay, and the files that are shipped."""

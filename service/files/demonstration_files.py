@@ -1,0 +1,271 @@
+"""Demonstrations on disk, one file each (a take): shown as text or as a picture, trimmed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.contract.channels import JOINTS, POSE
+from service.core.frame import Vector
+from service.files.demonstration_reader import read_demonstration
+from service.files.dwells import remarks_on_places
+from service.files.mcap_file import RecordingError, whole_file
+from service.files.mcap_reader import Messages
+from service.files.pose_streams import SIDES, Recorded, chosen
+from service.files.track import Track
+from service.learning.demonstration import LEAST_M, Demonstration
+from service.settings import palette
+from service.settings.config import Settings
+
+NAME = r"\w[\w .-]{0,63}"
+GAP_S = 0.1  # without a sample, after which the daemon holds for a stale hand
+AWAY = 5.0  # times the usual gap: where it is longer than this and GAP_S, nothing was seen
+END_S, MOVING_MPS = 0.3, 0.1  # [s, m/s] a take begins or ends in motion if its first or last 0.3 s are faster
+BLOCKS = "▁▂▃▄▅▆▇█"
+WIDTH = 60  # letters of the plot
+COLOURS = {
+    side: palette.written(colour)
+    for side, colour in zip(SIDES, (palette.LEFT, palette.RIGHT, palette.TOOL), strict=True)
+}
+
+
+class DemonstrationNameError(RecordingError):
+    """A take does not exist, exists already, or cannot have this name."""
+
+
+class Stream(NamedTuple):
+    """One stream of a take: number of poses, rate while it is seen [Hz], the longest gap [s] and
+    when it began [s], and the poses' frame.
+    """
+
+    name: str
+    poses: int
+    rate_hz: float
+    gap_s: float
+    gap_at_s: float
+    frame: str
+
+
+class Summary(NamedTuple):
+    """The contents of a take: the demonstration as learning reads it, its streams, and remarks."""
+
+    path: Path
+    demonstration: Demonstration
+    streams: tuple[Stream, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def lasts_s(self) -> float:
+        """The duration that hands and tool have in common [s]."""
+        return float(np.ptp(self.demonstration.stamps_ns)) / 1e9
+
+
+def path_of(folder: Path, name: str) -> Path:
+    """The path of a take of this name. Raises DemonstrationNameError."""
+    name = name.removesuffix(".mcap")
+    if not re.fullmatch(NAME, name):
+        raise DemonstrationNameError(f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name")
+    return folder / f"{name}.mcap"
+
+
+def existing_path(folder: Path, name: str) -> Path:
+    """The path of a take that exists. Raises DemonstrationNameError."""
+    path = path_of(folder, name)
+    if not path.is_file():
+        names = ", ".join(found.stem for found in demonstration_paths(folder)) or "none"
+        raise DemonstrationNameError(f"no take {path.stem!r} in {folder}. There are: {names}")
+    return path
+
+
+def demonstration_paths(folder: Path) -> list[Path]:
+    """The files of the takes in a folder, `take-2` before `take-10`."""
+    return sorted(folder.glob("*.mcap"), key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
+
+
+def _split(name: str) -> list[str]:
+    return re.split(r"(\d+)", name)
+
+
+def summary(path: Path, *, settings: Settings | None = None) -> Summary:
+    """The contents of a take, by `settings` or those in the file. Raises RecordingError."""
+    remarks: list[str] = []
+    demonstration = read_demonstration(path, settings=settings, say=remarks.append)
+    remarks = [line.removeprefix(f"{path}: ") for line in remarks]
+    recorded = Recorded(path)
+    tracks = chosen(recorded, {}, settings or recorded.settings or Settings()).tracks
+    shown = [side for side in SIDES if side == "tool" or demonstration.conducts in ("both", side)]
+    streams = tuple(_stream(side, track) for side, track in zip(SIDES, tracks, strict=True) if side in shown)
+    remarks += [*_still(demonstration), *_in_motion(demonstration, shown), *remarks_on_places(demonstration)]
+    return Summary(path, demonstration, streams, tuple(remarks))
+
+
+def _still(demonstration: Demonstration) -> list[str]:
+    """Remarks on hands or a tool that do not move, so that nothing can be learned."""
+    found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
+    moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
+    return [
+        f"{name}: no more than {1000 * m:.1f} mm of motion; of takes that are all so nothing is learned "
+        f"({1000 * LEAST_M:g} needed)"
+        for name, m in moved
+        if m < LEAST_M
+    ]
+
+
+def _in_motion(demonstration: Demonstration, shown: Sequence[str]) -> list[str]:
+    """Remarks on hands or a tool that move when a take begins or ends: what is before or behind it
+    is not known.
+    """
+    out, seconds = [], demonstration.seconds
+    for when, span in (("begins", seconds <= END_S), ("ends", seconds >= seconds[-1] - END_S)):
+        speeds = {side: _mean_speed(seconds[span], getattr(demonstration, side)[span, :3]) for side in shown}
+        if moving := [f"{side} {speed:.2f} m/s" for side, speed in speeds.items() if speed > MOVING_MPS]:
+            out.append(
+                f"it {when} in motion: {', '.join(moving)}; let all rest for a moment before and behind the task"
+            )
+    return out
+
+
+def _mean_speed(seconds: Vector, at: Vector) -> float:
+    """The speed [m/s] of the line that fits positions (N, 3) [m] best."""
+    if len(seconds) < 2:
+        return 0.0
+    return float(np.linalg.norm(np.polyfit(seconds - seconds[0], at, 1)[0]))
+
+
+def _stream(side: str, track: Track) -> Stream:
+    logged = np.sort(track.logged_ns) / 1e9
+    gaps = np.diff(logged, prepend=logged[:1])
+    worst = int(np.argmax(gaps))
+    seen = gaps[1:][gaps[1:] <= max(GAP_S, AWAY * float(np.median(gaps[1:])))] if len(gaps) > 1 else gaps[1:]
+    rate = len(seen) / float(seen.sum()) if seen.any() else 0.0
+    began = float(logged[max(0, worst - 1)] - logged[0])
+    return Stream(side, len(logged), rate, float(gaps[worst]), began, track.frame)
+
+
+def table(found: Summary) -> str:
+    """The contents of a take as lines of text, with a plot of speeds."""
+    lines = [f"{found.path}: {found.lasts_s:.1f} s"]
+    lines += [
+        f"  {one.name:<6}{one.poses:>7} poses  {one.rate_hz:6.1f} Hz  longest gap {1e3 * one.gap_s:.0f} ms at "
+        f"{one.gap_at_s:.1f} s  frame {one.frame or 'not named'}"
+        for one in found.streams
+    ]
+    if found.demonstration.person:
+        lines.append(f"  by {found.demonstration.person}")
+    if found.demonstration.places:
+        lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
+    lines += [f"  {remark}" for remark in found.remarks]
+    speeds = {one.name: _speed(found.demonstration, one.name) for one in found.streams}
+    lines += [
+        f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s" for side, speed in speeds.items()
+    ]
+    end = f"{found.lasts_s:.1f} s"
+    lines.append(f"  speed {'0 s':<{WIDTH - len(end)}}{end}")
+    return "\n".join(lines)
+
+
+def _speed(demonstration: Demonstration, side: str) -> Vector:
+    """The speed [m/s] at WIDTH + 1 times, each averaged over 0.1 s."""
+    at: Vector = getattr(demonstration, side)[:, :3]
+    seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
+    edges = np.linspace(0.0, seconds[-1], WIDTH + 1)
+    window = min(0.1, float(seconds[-1]))
+    grid = np.arange(0.0, max(seconds[-1] - window, window), window / 2)
+    begin, end = (
+        np.stack([np.interp(grid + late, seconds, column) for column in at.T], axis=1) for late in (0.0, window)
+    )
+    speeds = np.linalg.norm(end - begin, axis=1) / window
+    return np.asarray(np.interp((edges[:-1] + edges[1:]) / 2, grid + window / 2, speeds))
+
+
+def _blocks(speed: Vector) -> str:
+    greatest = max(float(np.max(speed)), 0.05)  # so that noise at rest stays flat
+    return "".join(BLOCKS[min(int(len(BLOCKS) * one / greatest), len(BLOCKS) - 1)] for one in speed)
+
+
+def draw(found: Summary, path: Path) -> None:
+    """Writes a picture of a take, a PNG: positions over time, gaps shaded, and from above."""
+    from matplotlib.figure import Figure  # heavy, and most do without
+
+    figure = Figure(figsize=(11, 6.5), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(3, 2, width_ratios=(3, 2))
+    demonstration = found.demonstration
+    seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
+    first = figure.add_subplot(grid[0, 0])
+    axes = [first, *(figure.add_subplot(grid[i, 0], sharex=first) for i in (1, 2))]
+    above = figure.add_subplot(grid[:, 1])
+    begins = list(demonstration.begins)
+    for side in (one.name for one in found.streams):
+        at = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)  # no line over what is left out
+        for i, axis in enumerate(axes):
+            axis.plot(np.insert(seconds, begins, np.nan), at[:, i], color=COLOURS[side], lw=1.2, label=side)
+        above.plot(at[:, 0], at[:, 1], color=COLOURS[side], lw=1.2, label=side)
+        above.plot(at[0, 0], at[0, 1], "o", color=COLOURS[side], ms=5)
+    for i, axis in enumerate(axes):
+        axis.set_ylabel(f"{'xyz'[i]} [m]")
+        axis.label_outer()
+        for one in found.streams:
+            if one.gap_s > GAP_S:
+                axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=COLOURS[one.name], alpha=0.15, lw=0)
+    axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base", parse_math=False)
+    axes[-1].set_xlabel("time [s]")
+    above.set(title="from above; dots: the start", xlabel="x [m]", ylabel="y [m]")
+    above.set_aspect("equal", adjustable="datalim")
+    above.legend(frameon=False)
+    figure.savefig(path)
+
+
+def uncut(path: Path) -> Path:
+    """The path of a take as it was before trimming; `learn *.mcap` does not match it."""
+    return path.with_name(f"{path.name}.uncut")
+
+
+def trim(path: Path, start_s: float, end_s: float) -> str:
+    """What was cut, in words, once a take is trimmed to `start_s` to `end_s` [s] after its first
+    sample, all or nothing.
+
+    Messages other than poses and joints are kept. The original stays beside it, at the path that
+    `uncut` returns, unless there is one already. Raises RecordingError where too little to learn
+    from would be left.
+    """
+    messages = Messages(path)
+    rows = list(messages)
+    if messages.faults:
+        raise RecordingError(f"{path}: {'; '.join(map(str, messages.faults))}; it is not trimmed")
+    streams = {POSE.type, JOINTS.type}
+    times_ns = [row[2].log_time for row in rows if row[0] and row[0].name in streams] or [0]
+    begin_ns, lasts_s = min(times_ns), (max(times_ns) - min(times_ns)) / 1e9
+    kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
+    if len(kept_s) == len(times_ns):
+        return f"nothing is cut: {path} lasts {lasts_s:.1f} s"
+    joints = next((len(JOINTS.decode(row[2].data).names) for row in rows if row[0] and row[0].name == JOINTS.type), 0)
+    original = uncut(path)
+    existed = original.exists()
+    try:
+        with whole_file(path, joints=joints) as file:
+            for name, content in messages.metadata.items():
+                file.writer.add_metadata(name, content)
+            for name, data in messages.attachments.items():
+                file.attach(name, data, begin_ns)
+            for schema, channel, message in rows:
+                if schema is None or channel.message_encoding != "cdr":
+                    raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it is not trimmed")
+                at_s = (message.log_time - begin_ns) / 1e9
+                if schema.name not in streams or start_s <= at_s <= end_s:
+                    file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+            file.close()
+            try:
+                summary(file.path)
+            except RecordingError:
+                left = f"from {start_s:g} to {end_s:g} s too little is left, and it stays as it was"
+                raise RecordingError(f"{path} lasts {lasts_s:.1f} s: {left}") from None
+            if not existed:
+                path.replace(original)
+    except KeyError as error:
+        raise RecordingError(f"{path}: messages of type {error} are of no take; it is not trimmed") from None
+    told = f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s"
+    return f"{told}; the uncut take is {'still' if existed else 'kept as'} {original}"

@@ -1,0 +1,343 @@
+"""Reads and writes demonstrations; they are brought to frame `base` and to common stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.contract import cdr
+from service.contract.channels import JOINTS, POSE, STRING, topic
+from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
+from service.contract.requests import Hands, encode_json
+from service.core.frame import Vector
+from service.core.geometry import rotation
+from service.core.intake.far_away import too_far
+from service.core.intake.stage import UNIT_M
+from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+from service.files.mcap_file import McapFile, RecordingError, ends_early, existing
+from service.files.mcap_reader import Messages, full_name, next_whole
+from service.files.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
+from service.files.track import Track
+from service.files.track_check import LEAST_PIECE_S, Checked, checked, sound
+from service.files.track_clocks import by_one_clock
+from service.learning.demonstration import Demonstration
+from service.settings.config import HandSettings, Settings
+
+_STREAMS = tuple(ENDINGS.values())
+ENOUGH = 0.5  # a take is refused if less than this share of it can be learned from
+HARDLY_SEEN = 0.1  # a hand that is seen for a smaller share of a take is not one of those that conduct
+MOST_NAMED = 10  # stretches of a take
+UNUSUAL = 5.0  # a tool that is reported rarely is out of sight after as many times its usual interval
+
+
+def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
+    """Writes a demonstration in frame `base`.
+
+    The same arrays give the same bytes. Raises ValueError.
+    """
+    stamps_ns, left, right, tool = demonstration[:4]
+    poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
+    gripper, count = demonstration.gripper, len(stamps_ns)
+    given: list[tuple[str, Vector, tuple[int, ...]]]
+    given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    if demonstration.conducts != "both":
+        given = [one for one in given if one[0] in (ENDINGS[demonstration.conducts], ENDINGS["tool"])]
+    given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
+    for name, stream, shape in given:
+        if stream.shape != shape or not np.isfinite(stream).all():
+            raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
+    with McapFile(Path(path), joints=0, attached=False) as file:
+        told = {"hands": demonstration.conducts, "person": demonstration.person}
+        if told := {name: word for name, word in told.items() if word not in ("both", "")}:
+            file.writer.add_metadata("thirdhand", told)
+        streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
+        for i, (stamp, *rows) in enumerate(
+            zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for _, stream in streams), strict=True)
+        ):
+            for (name, _), row in zip(streams, rows, strict=True):
+                data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
+                file.put(topic(cell, name), POSE.type, data, stamp, i)
+            if gripper is not None:
+                data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
+                file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
+        if demonstration.places:
+            text = encode_json(demonstration.places).decode()
+            file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+
+
+def read_demonstration(
+    path: str | Path,
+    *,
+    topics: Mapping[str, PoseTopic] | None = None,
+    settings: Settings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Demonstration:
+    """The demonstration in a recording: hands and tool in frame `base` at the tool's stamps, over
+    the time that all three cover.
+
+    Reads MCAP files, ours and others', and bags. Topics are those in `topics` (by left, right,
+    tool). Without these they are found by the ends of their names, in any cell, or where only one
+    fits. Hands are brought to `base` as in the daemon, by `settings` or else those in the file.
+    Hands stamped at other times than the tool are interpolated linearly. Where the stamps are of
+    different clocks, the times of recording are used instead.
+
+    Raises RecordingError, also for a damaged file: the missing part may lie within a motion. A file
+    that was cut ends early. `say` is called with that, and with what was found or assumed.
+    """
+    recorded = Recorded(path)
+    if settings is None and recorded.settings is None and recorded.is_ours:
+        raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
+    settings = settings or recorded.settings or Settings()
+    if any(not fault.cut for fault in recorded.faults):
+        readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        faults = "; ".join(map(str, recorded.faults))
+        raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
+    found = chosen(recorded, topics or {}, settings)
+    for fault in recorded.faults:
+        there = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
+        say(f"{path}: {fault}; {there} are there")
+    one_clock = by_one_clock(found.tracks)
+    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
+    tracks = [_near(recorded, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
+    remarks = [*found.guessed, *_none_in(tracks), *mapped]
+    if remarks:
+        say(f"{path}: {'; '.join(remarks)}")
+    if one_clock.remark:
+        say(f"{path}: {one_clock.remark}")
+    tracks = [_in_order(path, track) for track in tracks]
+    seen = Seen.of(path, tracks, found.conducts, settings)
+    for line in seen.remarks:
+        say(f"{path}: {line}")
+    left, right, tool = (_resampled(seen.stamps_ns, track.stamps_ns, track.poses) for track in seen.tracks)
+    closure = recorded.closures(seen.stamps_ns, logged=one_clock.logged, part=one_clock.part)
+    for line in recorded.unused:
+        say(f"{path}: {line}")
+    seen.stamps_ns.setflags(write=False)
+    return Demonstration(
+        seen.stamps_ns,
+        left,
+        right,
+        tool,
+        BASE,
+        recorded.places,
+        closure,
+        seen.conducts,
+        recorded.person,
+        seen.begins,
+    )
+
+
+class Seen(NamedTuple):
+    """The part that hands and tool have in common: their trusted samples; the stamps of the tool at
+    which all are seen; the indices at which a new part begins behind a stretch that is left out;
+    and the remarks on it.
+    """
+
+    tracks: list[Track]
+    conducts: Hands
+    stamps_ns: NDArray[np.int64]
+    begins: tuple[int, ...]
+    remarks: list[str]
+
+    @staticmethod
+    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> Seen:
+        """Of the tracks of left hand, right hand and tool.
+
+        Raises RecordingError where too little is left.
+        """
+        unseen_s = settings.hands.unseen_ms / 1000
+        tool_s = max(unseen_s, UNUSUAL * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
+        hands = checked(tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s)
+        (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
+        remarks: list[str] = []
+        if conducts == "both":
+            shares = [one.seen_share for one in hands]
+            if min(shares) < HARDLY_SEEN <= max(shares):
+                side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
+                hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
+                remarks.append(f"the {side} hand conducts alone: the other is seen for {min(shares):.0%} of the time")
+        rows = [*hands, tool]
+        start_ns, end_ns = max(one.start_ns for one in rows), min(one.end_ns for one in rows)
+        if start_ns >= end_ns:
+            raise RecordingError(
+                f"{path}: hands and tool have less than two stamps of the tool in common: "
+                "by which clocks were they stamped?"
+            )
+        named = [one for row in rows for one in row.stretches if one.begin_ns < end_ns and one.end_ns > start_ns]
+        remarks += [one.remark for one in rows if one.remark]
+        stamps, begins = _left_in(tool.track.stamps_ns, rows)
+        kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
+        origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
+        named.sort(key=lambda one: one.begin_ns)
+        bad = "; ".join(one.text(origin_ns) for one in named[:MOST_NAMED])
+        bad += f"; and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
+        if kept_s < ENOUGH * span_s:
+            raise RecordingError(
+                f"{path}: {kept_s:.1f} of {span_s:.1f} s can be learned from, {ENOUGH:.0%} needed"
+                f"{f': {bad}' if bad else ''}. Record it anew, or cut it by thirdhand record --trim"
+            )
+        if bad:
+            remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
+        both = [hands[0].track, hands[-1].track, tool.track]
+        return Seen(both, conducts, stamps, tuple(begins), remarks)
+
+
+def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
+    """The tool's stamps at which all are seen, but for pieces that are too short; and the indices
+    of the first ones behind stretches at which they are not.
+    """
+    start_ns = max((int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows)
+    end_ns = min((int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows)
+    stamps = stamps[(stamps >= start_ns) & (stamps <= end_ns)]
+    holes = [hole for row in rows for hole in row.stretches]
+    for hole in holes:
+        stamps = stamps[(stamps <= hole.begin_ns) | (stamps >= hole.end_ns)]
+    cuts = sorted({int(np.searchsorted(stamps, hole.end_ns)) for hole in holes} - {0, len(stamps)})
+    pieces = [
+        piece
+        for piece in np.split(stamps, cuts)
+        if not cuts or (len(piece) and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
+    ]
+    begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
+    return np.concatenate(pieces) if pieces else stamps[:0], begins
+
+
+def _near(recorded: Recorded, track: Track, before: Track, hands: HandSettings) -> Track:
+    """The track with NaN for poses that are too far away. Raises RecordingError where all are;
+    `before`: as published.
+    """
+    with np.errstate(all="ignore"):
+        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > MAX_HAND_DISTANCE_M
+    if len(is_far) and is_far.all():
+        why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
+        if recorded.is_captured:
+            rule = "the unit that the file names counts, whatever [hands] unit says"
+            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that it names"
+        raise RecordingError(f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
+    poses = track.poses.copy()
+    poses[is_far] = np.nan
+    return track._replace(poses=poses)
+
+
+def _none_in(tracks: Sequence[Track]) -> list[str]:
+    """In words, how many poses of the tracks are NaN; nothing where none is."""
+    none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
+    count = sum(len(track.poses) for track in tracks)
+    return (
+        [f"{none} of {count} poses are none, or farther than {MAX_HAND_DISTANCE_M:g} m, and left out"] if none else []
+    )
+
+
+def _in_order(path: str | Path, track: Track) -> Track:
+    """The track in the order of its stamps, each of them once. Raises RecordingError."""
+    stamps, first = np.unique(track.stamps_ns, return_index=True)
+    if len(stamps) < 2:
+        raise RecordingError(
+            f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+        )
+    return Track(track.name, track.source, stamps, track.logged_ns[first], track.poses[first], track.frame)
+
+
+def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
+    """Whether the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as in the daemon
+    return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in tracker_frames)
+
+
+def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's frame and unit."""
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
+
+
+def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
+    """Words and remedy for a stream's position, as published, that is too far away."""
+    if is_by_tracker(name, frame, hands):
+        return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
+    rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
+    also = ", or name the tracker's frame in it and in [hands] frame: what it names is in [hands] unit"
+    return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
+
+
+def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
+    """Words and remedy for a stream in a frame of which nothing is known; empty for others."""
+    if frame in ("", BASE, hands.frame):
+        return ""
+    known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
+    return (
+        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) whose [hands] frame "
+        "names it and says by base_from_tracker where it is"
+    )
+
+
+def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
+    """Tracks of left hand, right hand and tool in frame `base`, and in words which of them were
+    transformed.
+
+    As in the daemon the hands are, except those in `base` where the tracker has a frame of its own.
+    The tool is only where it names that frame. Raises RecordingError for other frames.
+    """
+    for track in tracks:
+        if problem := unknown_frame(track.name, track.frame, hands):
+            raise RecordingError(f"{path}: {problem}")
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
+        return list(tracks), []
+    turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
+    for i, track in enumerate(tracks):
+        if is_by_tracker(track.name, track.frame, hands):
+            poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
+            if some.any():
+                poses[some, :3] = from_tracker(track.poses[some, :3], hands)
+                poses[some, 3:] = (turn * Rotation.from_quat(track.poses[some, 3:])).as_quat()
+            out[i] = track._replace(poses=poses, frame=BASE)
+            mapped.append(track.name)
+    remark = f"{', '.join(mapped)} brought to frame {BASE} by [hands] unit and base_from_tracker"
+    return out, [remark] if mapped else []
+
+
+def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (T, 7) at `stamps` by linear interpolation of those at `at` (N,); quaternions are
+    interpolated the short way and normalised.
+    """
+    if np.isin(stamps, at).all():
+        out = poses[np.searchsorted(at, stamps)]
+    else:
+        signs = np.cumprod(np.where(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0, -1.0, 1.0), axis=0)
+        smooth = np.concatenate([poses[:, :3], poses[:, 3:] * np.concatenate([[1.0], signs])[:, None]], axis=1)
+        times, knots = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out = np.stack([np.interp(times, knots, column) for column in smooth.T], axis=1)
+        out[:, 3:] /= np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
+    out.setflags(write=False)
+    return out
+
+
+def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
+    """Log time [ns], side and CDR bytes of every hand sample, in order of time.
+
+    Reads demonstrations, recordings and other ROS 2 recordings; a file that was cut up to its cut,
+    in the order of writing. Raises RecordingError.
+    """
+    path = existing(path)
+    found: dict[str, str] = {}  # topics by stream, one each
+    seen: set[str] = set()
+    with path.open("rb") as stream:
+        messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()
+        while one := next_whole(messages, path):
+            schema, channel, message = one
+            seen.add(topic := channel.topic)
+            name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
+            if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
+                continue
+            if found.setdefault(name, topic) != topic:
+                raise RecordingError(f"{path} has two streams of {name}: {found[name]} and {topic}")
+            yield message.log_time, name.removeprefix("hands/"), message.data
+    if not found:
+        lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
+        raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")

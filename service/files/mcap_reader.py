@@ -1,0 +1,249 @@
+"""Reads MCAP files: verifies every checksum, reads up to a cut, continues behind damage."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from service.files.mcap_file import RecordingError
+
+Found = tuple[Schema | None, Channel, Message]
+_HEAD = struct.Struct("<BQ")  # opcode, bytes that follow
+_FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
+_COMPRESSION = re.compile(b"\x04\0\0\0zstd|\x03\0\0\0lz4")
+_BEFORE_COMPRESSION = _HEAD.size + 28  # bytes of a chunk
+_BLOCK = 1 << 20
+_NAMING = {
+    int(kind): record
+    for kind, record in ((Opcode.SCHEMA, Schema), (Opcode.CHANNEL, Channel), (Opcode.METADATA, Metadata))
+}
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, LookupError, OverflowError, MemoryError)
+
+
+class FileFault(NamedTuple):
+    """A part of a file that cannot be read: first byte, size, cause.
+
+    `cut`: the end of the file is missing. Else the file continues behind the damage.
+    """
+
+    cut: bool
+    at: int
+    size: int
+    why: str
+
+    def __str__(self) -> str:
+        if self.cut:
+            return f"cut at byte {self.at}: the end is missing ({self.why})"
+        return f"damage at byte {self.at}: {self.size} bytes cannot be trusted ({self.why})"
+
+
+class Messages:
+    """The schema, channel and message of every message of an MCAP file in file order.
+
+    `faults`, `attachments` and `metadata` are those met so far. A fault that is new when a message
+    comes lies before that message. Attachments with a wrong checksum are left out.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.faults: list[FileFault] = []
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+
+    def __iter__(self) -> Iterator[Found]:
+        with self.path.open("rb") as stream:
+            reading = _Reading(stream, self.faults)
+            schemas: dict[int, Schema] = {}
+            channels: dict[int, Channel] = {}
+            unnamed = False
+            for record in itertools.chain(reading.named_in_summary(), reading.records()):
+                if isinstance(record, Message):
+                    channel = channels.get(record.channel_id)
+                    if channel is not None:
+                        yield schemas.get(channel.schema_id), channel, record
+                    elif not unnamed:
+                        unnamed = True
+                        why = f"messages on channel {record.channel_id}, whose name is not there"
+                        self.faults.append(FileFault(False, stream.tell(), 0, why))
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Attachment):
+                    self.attachments[record.name] = record.data
+                elif isinstance(record, Metadata):
+                    self.metadata[record.name] = record.metadata
+
+
+class _Reading:
+    """One pass over a file."""
+
+    def __init__(self, stream: IO[bytes], faults: list[FileFault]) -> None:
+        self._stream, self._faults = stream, faults
+        self._size = stream.seek(0, 2)
+        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None once it cannot be known
+        self._chunked = False
+        closing = self._size - len(MCAP0_MAGIC)
+        self._closed = closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
+        self._footer_at = closing - _FOOTER.size
+        self._footer = self._bytes(self._footer_at, _FOOTER.size) if self._footer_at > 0 else b""
+        self._closed = self._closed and self._footer[:9] == _HEAD.pack(Opcode.FOOTER, _FOOTER.size - _HEAD.size)
+
+    def named_in_summary(self) -> Iterator[McapRecord]:
+        """The schemas and channels that the file's end repeats, if it has one that is whole: so the
+        chunk that held them first may be damaged.
+        """
+        at = self._summary() if self._closed else 0
+        while 0 < at < self._footer_at:
+            opcode, end = self._head(at)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._parsed(opcode, self._content(at, end))
+            at = end
+
+    def _summary(self) -> int:
+        """The first byte of the summary if its checksum is right, else 0."""
+        _, _, start, _, checksum = _FOOTER.unpack(self._footer)
+        if not 0 < start <= self._footer_at or not checksum:
+            return 0
+        covered = self._bytes(start, self._footer_at + _FOOTER.size - 4 - start)
+        return int(start) if zlib.crc32(covered) == checksum else 0
+
+    def records(self) -> Iterator[McapRecord]:
+        """The records of the data section, those in chunks one by one."""
+        at = len(MCAP0_MAGIC)
+        while True:
+            end = None
+            try:
+                opcode, end = self._head(at)
+                content = self._content(at, end)
+                found = self._parsed(opcode, content)
+            except _BROKEN as error:
+                self._checksum = None
+                resume_at = self._resume_at(at, end)
+                why = str(error) or type(error).__name__
+                if resume_at is None:
+                    self._faults.append(FileFault(not self._closed, at, self._size - at, why))
+                    return
+                self._faults.append(FileFault(False, at, resume_at - at, why))
+                at = resume_at
+                continue
+            if self._checksum is not None:
+                self._checksum = zlib.crc32(content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum))
+            yield from found
+            if opcode == Opcode.DATA_END:
+                self._end(end)
+                return
+            at = end
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Opcode and end of the record at a byte."""
+        if at + _HEAD.size > self._size:
+            raise ValueError("the file ends before the recording does")
+        opcode, length = _HEAD.unpack(self._bytes(at, _HEAD.size))
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END and opcode < 0x80:
+            raise ValueError(f"no record of MCAP has the type {opcode}")
+        if at + _HEAD.size + length > self._size:
+            raise ValueError(f"a record of {length} bytes reaches over the end of the file")
+        return opcode, at + _HEAD.size + length
+
+    def _parsed(self, opcode: int, content: bytes) -> list[McapRecord]:
+        """The records in one record, its checksum verified; several for a chunk."""
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.CHUNK:
+            self._chunked = True
+            return breakup_chunk(Chunk.read(stream), validate_crc=True)
+        if _COMPRESSION.match(content, 28):
+            raise ValueError(f"a chunk by its content, of type {opcode} by its head")
+        if opcode == Opcode.MESSAGE:
+            if self._chunked:
+                raise ValueError("a message outside the chunks")
+            return [Message.read(stream, len(content))]
+        if opcode == Opcode.ATTACHMENT:
+            checksum = int.from_bytes(content[-4:], "little")
+            if checksum and zlib.crc32(content[:-4]) != checksum:
+                raise ValueError("an attachment's checksum is wrong")
+            return [Attachment.read(stream)]
+        if opcode == Opcode.DATA_END:
+            recorded = DataEnd.read(stream).data_section_crc
+            if recorded and self._checksum is not None and recorded != self._checksum:
+                why = "the checksum over all data is wrong, outside of what has one of its own"
+                self._faults.append(FileFault(False, 0, self._stream.tell(), why))
+            return []
+        if opcode not in _NAMING:
+            return []
+        return [_NAMING[opcode].read(stream)]
+
+    def _resume_at(self, at: int, end: int | None) -> int | None:
+        """The byte at which reading continues behind a broken record: its end if a record begins
+        there, else the next whole chunk; None where there is none.
+        """
+        if end is not None:
+            with contextlib.suppress(ValueError):
+                self._head(end)
+                return end
+        for block_at in range(at + 1, self._size, _BLOCK):
+            block = self._bytes(block_at, _BLOCK + _BEFORE_COMPRESSION + 8)
+            for mark in _COMPRESSION.finditer(block):
+                chunk_at = block_at + mark.start() - _BEFORE_COMPRESSION
+                if chunk_at > at and self._is_chunk(chunk_at):
+                    return chunk_at
+        return None
+
+    def _is_chunk(self, at: int) -> bool:
+        try:
+            opcode, end = self._head(at)
+            if opcode == Opcode.CHUNK:
+                breakup_chunk(Chunk.read(ReadDataStream(BytesIO(self._content(at, end)))), validate_crc=True)
+        except _BROKEN:
+            return False
+        return opcode == Opcode.CHUNK
+
+    def _end(self, at: int) -> None:
+        """Verifies what follows the data section."""
+        if self._closed:
+            _, _, start, _, checksum = _FOOTER.unpack(self._footer)
+            if checksum and start and not self._summary():
+                self._faults.append(FileFault(False, at, self._size - at, "the summary's checksum is wrong"))
+        else:
+            whole = self._footer[:1] == bytes([Opcode.FOOTER])
+            why = "the closing bytes are not those of MCAP" if whole else "nothing closes the file"
+            self._faults.append(FileFault(not whole, at, self._size - at, why))
+
+    def _content(self, at: int, end: int) -> bytes:
+        return self._bytes(at + _HEAD.size, end - at - _HEAD.size)
+
+    def _bytes(self, at: int, count: int) -> bytes:
+        self._stream.seek(at)
+        return self._stream.read(count)
+
+
+def full_name(schema: Schema | None) -> str:
+    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`; empty without a schema."""
+    kind = "" if schema is None else schema.name
+    return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
+
+
+def next_whole(messages: Iterator[Found], path: Path) -> Found | None:
+    """The next message of an indexed file, None at its end.
+
+    Raises RecordingError where the file is damaged.
+    """
+    try:
+        return next(messages, None)
+    except _BROKEN as error:
+        raise RecordingError(f"{path} is damaged: {type(error).__name__} {error}".strip()) from None

@@ -1,0 +1,122 @@
+"""Read files of motion capture: CSV as Motive exports it, and C3D.
+
+Poses are in metres in the axes of the capture system; markers are not turned.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from service.contract.explain import in_words
+from service.core.frame import Vector
+from service.files.mcap_file import RecordingError
+
+FRAME = "motion capture"
+UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "m": 1.0, "cm": 0.01, "mm": 0.001}
+POSED = ("Rigid Body", "Bone", "Marker")  # of the types of columns; markers of a body are part of it
+COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(("Rotation", axis) for axis in "XYZW")
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+BIG_ENDIAN = 86  # the processor that a C3D file names
+LATEST_S = 1e9  # a frame may be this long after the start of its take: 30 years
+
+Captured = dict[str, tuple[list[int], Vector]]
+"""Stamps (N,) [ns] and poses (N, 7) [m] by the name of a body or marker; NaN: it is not seen."""
+
+
+def read_motive(path: Path) -> Captured:
+    """The rigid bodies, bones and single markers of a take exported by Motive. Raises
+    RecordingError.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path} is not a CSV file that can be read: {in_words(error, named=False)}") from None
+    about = dict(zip(rows[0][::2], rows[0][1::2], strict=False)) if rows else {}
+    axes_at = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
+    if "Format Version" not in about or axes_at < 4:
+        raise RecordingError(
+            f"{path} is not a CSV file as Motive exports it (Format Version in its first row, Frame in the row above "
+            "the numbers). Other tables become takes from arrays: docs/arrays.md"
+        )
+    unit = about.get("Length Units", "").lower()
+    if unit not in UNITS_M or about.get("Rotation Type", "Quaternion") != "Quaternion":
+        raise RecordingError(
+            f"{path}: Length Units {about.get('Length Units')!r}, Rotation Type {about.get('Rotation Type')!r}; export "
+            "it in Meters, Centimeters or Millimeters, with Rotation Type Quaternion"
+        )
+    labelled = {row[1]: row for row in rows[1:axes_at] if len(row) > 1 and row[1] in ("Type", "Name")}
+    types, names = labelled.get("Type", rows[1]), labelled.get("Name", rows[2])
+    columns: dict[str, dict[tuple[str, str], int]] = {}
+    for i, head in enumerate(zip(types, names, rows[axes_at - 1], rows[axes_at], strict=False)):
+        if head[0] in POSED and head[2:] in COLUMNS:
+            columns.setdefault(head[1], {})[head[2:]] = i
+    table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
+    for values, row in zip(table, rows[axes_at + 1 :], strict=True):
+        try:
+            values[: len(row)] = [float(cell) if cell else np.nan for cell in row[: len(values)]]
+        except ValueError as error:
+            raise RecordingError(f"{path}: frame {row[0]}: {error}; numbers and empty cells needed") from None
+    stamps, out = _stamps(path, table[:, 1]), Captured()
+    for name, found in columns.items():
+        if all(one in found for one in COLUMNS[:3]):
+            poses = np.tile([np.nan] * 3 + list(UNTURNED), (len(table), 1))
+            for k, one in enumerate(COLUMNS):
+                if one in found:
+                    poses[:, k] = table[:, found[one]] * (UNITS_M[unit] if k < 3 else 1.0)
+            out[name] = stamps, poses
+    return out
+
+
+def read_c3d(path: Path) -> Captured:
+    """The markers of a C3D file. Raises RecordingError."""
+    import ezc3d  # heavy, and few recordings need it
+
+    try:
+        found = ezc3d.c3d(str(path))
+        about = found["parameters"]["POINT"]
+        labels, units = about["LABELS"]["value"], about["UNITS"]["value"]
+        rate_hz, points = float(about["RATE"]["value"][0]), np.asarray(found["data"]["points"], np.float64)
+    except Exception as error:  # the library raises exceptions of many kinds
+        raise RecordingError(f"{path} is not a C3D file that can be read: {in_words(error, named=False)}") from None
+    unit = str(units[0]).strip().lower() if units else ""
+    if unit not in UNITS_M or not rate_hz > 0:
+        raise RecordingError(f"{path}: unit {unit!r}, {rate_hz:g} Hz; m, cm or mm needed, and a rate above 0")
+    raw = path.read_bytes()
+    order = ">u2" if raw[512 * (raw[0] - 1) + 3] == BIG_ENDIAN else "<u2"
+    head = np.frombuffer(raw[:10], order)  # words 4 and 5 of a file number its first and last frame
+    announced = int(head[4]) - int(head[3]) + 1
+    if announced > points.shape[2]:
+        raise RecordingError(f"{path}: cut: {points.shape[2]} of {announced} frames are there; copy or export it again")
+    stamps = _stamps(path, np.arange(points.shape[2]) / rate_hz)
+    turned = np.tile(UNTURNED, (points.shape[2], 1))
+    names = [str(label).strip() for label in labels[: points.shape[1]]]
+    return {
+        # of two that have one name, none is it
+        f"{name} {names[:i].count(name) + 1}" if names.count(name) > 1 else name: (
+            stamps,
+            np.hstack([UNITS_M[unit] * points[:3, i].T, turned]),
+        )
+        for i, name in enumerate(names)
+    }
+
+
+def _stamps(path: Path, seconds: Vector) -> list[int]:
+    """Stamps [ns] of the times (N,) [s] of a take's frames. Raises RecordingError."""
+    if not len(seconds):
+        raise RecordingError(f"{path} holds no frame, 2 needed: export the take again, over all its frames")
+    for i in np.flatnonzero(~(np.abs(seconds) <= LATEST_S))[:1]:
+        raise RecordingError(
+            f"{path}: frame {i + 1} of {len(seconds)} is at {seconds[i]:g} s, up to {LATEST_S:g} s needed: export the "
+            "take again"
+        )
+    for i in np.flatnonzero(np.diff(seconds) < 0)[:1]:
+        raise RecordingError(
+            f"{path}: frame {i + 2} of {len(seconds)} is at {seconds[i + 1]:g} s, and the one before at "
+            f"{seconds[i]:g} s; times that grow needed: export the take again"
+        )
+    stamps: list[int] = np.round(1e9 * seconds).astype(np.int64).tolist()
+    return stamps

@@ -1,0 +1,281 @@
+"""Replay: the core run on one recording or on several that follow each other, compared frame by
+frame with what it decided then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from service.contract import channels
+from service.contract.messages import WireError
+from service.core.controller import Controller, outgoing, run
+from service.core.frame import Event, Frame, Tick, differences, encode
+from service.files.mcap_file import RecordingError, machine
+from service.files.recording import Recorder, Recording
+from service.files.steps import Gap, Step, checksum
+from service.learning.skill_file import SkillError, StoredSkill, decoded
+
+TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
+POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
+
+
+@dataclass
+class Pause(Gap):
+    """A gap, and the tick from whose state the replay continued."""
+
+    resumed: int | None = None
+
+    def __str__(self) -> str:
+        continued = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
+        return f"{super().__str__()}; {continued}"
+
+
+@dataclass
+class Replay:
+    """The result of a replay: how many frames were compared and are identical, where and by how
+    much others differ, and what is missing.
+    """
+
+    ticks: int = 0
+    identical: int = 0
+    missing: list[Pause] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    truncated: bool = False
+    joined: int = 0
+    first_difference: str = ""
+    largest: dict[str, float] = field(default_factory=dict)
+    recorded_on: str = ""
+    here: str = ""
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing is missing and every frame is identical, bit for bit."""
+        complete = not (self.missing or self.faults or self.truncated)
+        return self.ticks > 0 and self.identical == self.ticks and complete
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether no recorded position differs by more than 10 µm or 10 µrad."""
+        return self.ticks > 0 and all(self.largest.get(name, 0.0) <= TOLERANCE for name in POSITIONS)
+
+    def text(self) -> str:
+        """The result for people to read."""
+        lines = [f"{self.ticks} ticks, {self.identical} frames identical"]
+        if self.joined:
+            lines.append(f"{self.joined + 1} recordings join without a gap")
+        lines += [*map(str, self.missing), *self.faults]
+        if not self.ticks:
+            lines.append("nothing to compare: the recording holds no state to start from")
+        if self.first_difference:
+            lines.append(self.first_difference)
+            largest = ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
+            lines.append(f"largest differences: {largest or 'none in a frame that is kept as a whole'}")
+            if self.recorded_on != self.here:
+                lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
+        return "\n".join(lines)
+
+
+def replay(
+    first: Path | str,
+    *more: Path | str,
+    after: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    output: Path | None = None,
+) -> Replay:
+    """Runs the core on a recording, and on those that follow it, and compares every frame.
+
+    What is decided now is written to `output`, which is for one recording without gaps.
+
+    It starts from the first state or, with `after`, from the first one at or after that tick, and
+    again from the state behind each gap. Two recordings join without a gap where the second begins
+    with the state in which the first ends. Raises RecordingError.
+    """
+    recordings = [Recording.open(path) for path in (first, *more)]
+    if output is not None and (more or output.resolve() == Path(first).resolve()):
+        raise RecordingError(f"{output} is to hold what one other recording becomes: not several, nor itself")
+    result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
+    before: Step | None = None
+    with threadpool_limits(1):
+        for i, recording in enumerate(recordings):
+            before = _Comparison(recording, result, after, before, i > 0, progress, output).compared()
+            result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
+            result.truncated = result.truncated or recording.truncated
+    return result
+
+
+class _Skills:
+    """The skills of a recording by digest, as far as it has been read."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._found: dict[bytes, StoredSkill] = {}
+        self.decoded(recording.skill)
+
+    def decoded(self, data: bytes) -> StoredSkill:
+        """The skill in the bytes of its file; the same object each time. Raises SkillError."""
+        skill = decoded(data, origin="the recording", recorded=True)
+        return self._found.setdefault(skill.digest, skill)
+
+    def events(self, step: Step) -> tuple[Event, ...]:
+        """The events of a step, as the core takes them. Raises RecordingError."""
+        if step.skill:
+            self.decoded(step.skill)
+        return tuple(self._event(kind, payload) for kind, payload in step.events)
+
+    def in_force(self, start: Step) -> StoredSkill | None:
+        """The skill in force after a step with a state; None where it has not been read."""
+        assert start.state is not None
+        return self._found.get(start.state["skill"].tobytes())
+
+    def _event(self, kind: str, payload: bytes) -> Event:
+        channel = channels.BY_KEY[kind]
+        try:
+            if kind == "skill":
+                return Event(kind, payload, self.decoded(payload))
+            return Event(kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None)
+        except (WireError, SkillError) as error:
+            raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
+
+
+@dataclass
+class _Comparison:
+    """Compares a recording from gap to gap; each part is run by a controller of its own."""
+
+    recording: Recording
+    result: Replay
+    after: int | None
+    last: Step | None  # that was read
+    follows: bool  # another recording
+    progress: Callable[[int], None] | None
+    output: Path | None
+    recorder: Recorder | None = None
+    gap_at: Step | None = None
+
+    def __post_init__(self) -> None:
+        self._skills, self._steps = _Skills(self.recording), self.recording.steps(whole=False)
+
+    def _anew(self, skill: StoredSkill, start: Step) -> contextlib.AbstractContextManager[Recorder | None]:
+        """What takes down what is decided now, if that is asked for."""
+        if self.output is None:
+            return contextlib.nullcontext()
+        if self.result.missing:
+            raise RecordingError(f"{self.output} cannot be written: {self.result.missing[-1]}")
+        settings, urdf = self.recording.settings, self.recording.urdf
+        return Recorder(self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf)
+
+    def compared(self) -> Step | None:
+        """The last step, once all are compared."""
+        start = next(self._steps, None)
+        if start is not None and not self._begins(start):
+            start = self._next_start(start)
+        while start is not None:
+            skill = self._skills.in_force(start)
+            assert skill is not None
+            self._controller = Controller(self.recording.settings, skill, start.state, urdf=self.recording.urdf)
+            self.last, self.gap_at = start, None
+            with self._anew(skill, start) as self.recorder:
+                run(self._controller, self._ticks(), [self.compare])
+            start = None if self.gap_at is None else self._next_start(self.gap_at)
+        return self.last
+
+    def _begins(self, start: Step) -> bool:
+        """Whether the first step has a state to start from; notes what is missing before it."""
+        before, result = self.last, self.result
+        self._skills.events(start)
+        joins = (
+            before is not None
+            and None not in (before.state, start.state)
+            and start.frame is None
+            and encode(before.state) == encode(start.state)  # type: ignore[arg-type]
+        )
+        if joins:
+            result.joined += 1
+        elif self.follows or start.lost or start.damage:
+            why = "" if start.lost else start.damage or f"{self.recording.path.name} begins anew"
+            self._note(start, why)
+        return start.state is not None and self.after is None and self._resumes(start)
+
+    def _note(self, step: Step, why: str) -> None:
+        before = None if self.last is None else self.last.tick
+        self.result.missing.append(Pause(before, step.tick, step.lost, why))
+
+    def _resumes(self, step: Step) -> bool:
+        """Whether a controller can continue from the state of a step."""
+        skill = self._skills.in_force(step)
+        for gap in reversed(self.result.missing):
+            if gap.resumed is not None:
+                break
+            if skill is None and "skill" not in gap.why:
+                gap.why += "; the skill then in force is not there"
+            gap.resumed = None if skill is None else step.tick
+        return skill is not None
+
+    def _next_start(self, step: Step | None) -> Step | None:
+        """The next step, `step` or later, from whose state a controller can continue."""
+        while step is not None:
+            self._skills.events(step)
+            self.last = step
+            wanted = self.after is None or step.tick >= self.after
+            if step.state is not None and wanted and self._resumes(step):
+                return step
+            step = next(self._steps, None)
+            if step is not None and (step.lost or step.damage):
+                self._note(step, step.damage)
+        return None
+
+    def _ticks(self) -> Iterator[Tick]:
+        """The ticks up to the next gap. Raises RecordingError."""
+        for step in self._steps:
+            assert self.last is not None
+            if step.tick <= self.last.tick:
+                raise RecordingError(
+                    f"{self.recording.path}: tick {step.tick} comes after tick {self.last.tick}; growing ticks needed"
+                )
+            if step.lost or step.damage:
+                self._note(step, step.damage)
+                self.gap_at = step
+                return
+            events = self._skills.events(step)
+            self.last = step
+            yield Tick(step.tick, events)
+
+    def compare(self, tick: Tick, frame: Frame) -> None:
+        """Compares the newest tick's frame, and the state after it, with what was recorded."""
+        step, result, checksums = self.last, self.result, self.recording.checksums
+        assert step is not None
+        different = {} if step.frame is None else differences(step.frame, frame)
+        state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
+        if step.state is not None and state is not None:
+            different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
+        outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
+        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        if self.recorder:
+            self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
+        result.ticks += 1
+        result.identical += same
+        if not same and not result.first_difference:
+            fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
+            result.first_difference = f"first difference at tick {tick.index}: {fields or 'its checksum'}"
+        for name, value in different.items():
+            result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
+        if self.progress is not None and result.ticks % 1000 == 0:
+            self.progress(result.ticks)
+
+
+def ticks(recording: Recording) -> Iterator[Tick]:
+    """The ticks of a recording, as the core takes them."""
+    skills = _Skills(recording)
+    for step in recording.steps(outputs=False):
+        yield Tick(step.tick, skills.events(step))
+
+
+def _named(metadata: dict[str, str]) -> str:
+    return (
+        ", ".join(f"{name} {metadata[name]}" for name in ("cpu", "numpy", "blas") if name in metadata)
+        or "an unnamed machine"
+    )

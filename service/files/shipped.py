@@ -1,0 +1,54 @@
+"""The files shipped beside the code: recordings, demonstrations, the soldering skill, and cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from service.settings.arm_description import UnreadableError
+from service.settings.config import WAM, Settings, converted, load
+
+if TYPE_CHECKING:
+    from service.learning.skill_file import StoredSkill
+
+SHIPPED_SKILL = "soldering.npz"
+ARMS = ("wam", "franka", "ur5")  # that cells are shipped with
+
+
+def recordings() -> Path:
+    """The folder of the shipped recordings and their skill."""
+    service = Path(__file__).parents[1]
+    folders = (service / "recordings", service.parent / "recordings")
+    return next((folder for folder in folders if folder.is_dir()), folders[1])
+
+
+def skills_folder(settings: Settings) -> Path:
+    """The folder of a cell's skills and of the demonstrations that they were learned from."""
+    return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
+
+
+def shipped_skill() -> StoredSkill:
+    """The skill that the service runs by default."""
+    from service.learning.skill_file import decoded  # heavy, and most commands do without
+
+    path = recordings() / SHIPPED_SKILL
+    return decoded(path.read_bytes(), origin=str(path))
+
+
+def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
+    """The settings of a shipped cell, by its arm, or those in a file; with `rate_hz`, at that rate.
+
+    Raises SettingsError.
+    """
+    if rate_hz is not None:
+        given = msgspec.to_builtins(cell_of(arm))
+        return converted(given | {"rate_hz": rate_hz}, origin="command line")
+    if arm == "wam":
+        return Settings()
+    if arm in ARMS:
+        return load(WAM.with_name(f"{arm}.toml"))
+    if not Path(arm).suffix and not Path(arm).exists():
+        raise UnreadableError(f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed")
+    return load(Path(arm))

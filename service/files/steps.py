@@ -1,0 +1,130 @@
+"""The steps of a recording, assembled from its messages: what each tick consumed, what it decided,
+and where ticks are missing.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from service.contract import cdr, channels
+from service.contract.messages import WireError
+from service.core.frame import TIMING, Frame, Outputs, Record, decode, encode, frame_layout, state_layout
+from service.files.mcap_file import RecordingError
+from service.files.mcap_reader import Messages
+from service.settings.config import Settings
+
+_RECORDS = ("frame", "timing", "state")
+REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
+
+
+class Step(NamedTuple):
+    """One recorded tick: what it consumed, what it decided, and the state after it if recorded.
+
+    A step without `frame` holds only a state: before the first tick, or the first behind damage;
+    or of its frame a checksum is kept.
+    Where ticks were `lost` before this one, replay continues from its `state` with the skill in
+    force, which is recorded again where it may have changed. `damage` says why what was recorded
+    before this step cannot be read; empty: it can.
+    """
+
+    tick: int
+    events: tuple[tuple[str, bytes], ...] = ()
+    frame: Record | None = None
+    timing: Record | None = None
+    state: Record | None = None
+    skill: bytes | None = None
+    lost: int = 0
+    time_ns: int = 0
+    damage: str = ""
+
+
+@dataclass
+class Gap:
+    """Missing ticks: the ticks around them (None: the beginning, the end), how many were counted as
+    lost, and why.
+    """
+
+    after: int | None
+    before: int | None
+    lost: int
+    why: str
+
+    def __str__(self) -> str:
+        where = "before the first tick" if self.after is None else f"after tick {self.after}"
+        if self.before is not None:
+            where = f"before tick {self.before}" if self.after is None else f"{where}, before tick {self.before}"
+        lost = f"{self.lost} tick{'s' * (self.lost != 1)} not recorded" if self.lost else ""
+        return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
+
+
+def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
+    """A number (32 bits) for what a tick decided and published, and for the state after it if
+    given.
+    """
+    parts = (encode(frame), *(payload for _, payload in outputs), b"" if state is None else encode(state))
+    return zlib.crc32(b"".join(parts))
+
+
+def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
+    """Every complete tick, in order, after the initial state if there is one; without `outputs`
+    only its inputs; with a frame each where all are there as a `whole`. Raises RecordingError on
+    what cannot be decoded.
+    """
+    names = channels.keys_by_topic(settings.cell, REPLAYED)
+    joints = len(settings.joints.names)
+    layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
+    step: dict[str, Any] | None = None
+    seen, damage = 0, ""
+
+    def finished() -> Iterator[Step]:
+        """The step in progress, unless its rest is damaged or cut."""
+        if step is None:
+            return
+        numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
+        lacks_frame = outputs and whole and "frame" not in step
+        if len(messages.faults) > seen and (len(came) != len(numbers) or lacks_frame):
+            return
+        kinds = [_kind(number) for number in numbers]
+        if came != kinds or lacks_frame:
+            frame = "a" if "frame" in step else "no"
+            raise WireError(f"tick {step['tick']} lists {kinds}; {came} and {frame} frame follow")
+        yield Step(**step | {"events": tuple(step["events"])})
+
+    try:
+        for _, channel, message in messages:
+            if len(messages.faults) > seen:
+                yield from finished()
+                damage = "; ".join(str(fault) for fault in messages.faults[seen:])
+                step, seen = None, len(messages.faults)
+            name = names.get(channel.topic)
+            if name is None or (name in _RECORDS and not outputs):
+                continue
+            data = message.data
+            if name == "tick":
+                yield from finished()
+                index, kinds, lost = cdr.decode_tick(data)
+                step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
+                step["damage"], damage = damage, ""
+            elif step is None:
+                if name == "state":
+                    alone = decode(data, layouts["state"])
+                    yield Step(int(alone["tick"]), state=alone, damage=damage)
+                    damage = ""
+            elif name in _RECORDS:
+                step[name] = decode(data, layouts[name])
+            elif name == "skill_in_force":
+                step["skill"] = cdr.decode_skill(data)
+            else:
+                step["events"].append((name, cdr.decode_skill(data) if name == "skill" else data))
+        yield from finished()
+    except WireError as error:
+        raise RecordingError(f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
+
+
+def _kind(number: int) -> str:
+    if number not in channels.EVENT_KINDS:
+        raise WireError(f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known")
+    return channels.EVENT_KINDS[number]

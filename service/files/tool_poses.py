@@ -1,0 +1,28 @@
+"""Tool poses by forward kinematics, for demonstrations in which nobody tracks the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.core.arm.stage import Arm
+from service.core.frame import Vector
+from service.settings.config import Settings
+
+MOST_HZ = 100  # of poses; arms publish their joints more often than a demonstration needs
+
+
+def tool_poses(
+    settings: Settings, urdf: str, stamps_ns: NDArray[np.int64], joints: Vector
+) -> tuple[Vector, NDArray[np.int64]]:
+    """The tool's poses (M, 7), x y z [m] and quaternion x y z w in frame `base`, for joints (N, J)
+    [rad] stamped `stamps_ns` (N,); and the indices (M,) of these, at most MOST_HZ a second.
+    """
+    lasts_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
+    step = max(1, int(len(stamps_ns) / lasts_s / MOST_HZ + 0.01)) if lasts_s else 1
+    kept = np.arange(0, len(stamps_ns), step)
+    arm = Arm(settings, urdf)
+    poses = [arm.at(q) for q in joints[kept]]
+    quaternions = Rotation.from_matrix([pose.rotation for pose in poses]).as_quat()
+    return np.hstack([[pose.position for pose in poses], quaternions]), kept

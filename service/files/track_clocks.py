@@ -1,0 +1,77 @@
+"""Bring tracks to stamps of one clock, which does not begin anew meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from service.core.intake.tuning import DELAY_WINDOW_S
+from service.files.track import Track, clock_parts
+
+LARGEST_DELAY_S = 0.2  # delays from stamp to recording may differ by this between streams of one clock
+
+
+class OneClock(NamedTuple):
+    """Tracks with stamps of one clock: `logged` if these are the times of recording, `part` if they
+    are that part of each stream between two beginnings of its clock. `remark` says why; empty: the
+    stamps are used as they are.
+    """
+
+    tracks: list[Track]
+    logged: bool = False
+    part: int | None = None
+    remark: str = ""
+
+
+def by_one_clock(tracks: Sequence[Track]) -> OneClock:
+    """The tracks by the times of recording where their stamps are of different clocks, or of one
+    that begins anew. Without such times, the part of them in which no clock begins anew.
+    """
+    if not all(len(track.poses) for track in tracks):
+        return OneClock(list(tracks))
+    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
+    anew = list(dict.fromkeys(track.name for track in tracks if not _is_steady(track)))
+    is_apart = max(ahead_s) - min(ahead_s) > LARGEST_DELAY_S
+    if (anew or is_apart) and _are_usable(tracks):
+        clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
+        why = f"stamps are of different clocks (against the recorder's {clocks})"
+        if anew:
+            why = f"the clock of {', '.join(anew)} begins anew meanwhile, or is set"
+        logged = [track._replace(stamps_ns=track.logged_ns) for track in tracks]
+        return OneClock(logged, logged=True, remark=f"{why}: the times of recording count instead")
+    parts = [clock_parts(track.stamps_ns) for track in tracks]
+    counts = [len(one) for one in parts]
+    if max(counts) == 1:
+        return OneClock(list(tracks))
+    part = 0  # in the first one, the clocks of all streams are those with which the take began
+    if len(set(counts)) == 1:
+        part = int(np.argmax([sum(len(one[i]) for one in parts) for i in range(counts[0])]))
+    kept = [track.at(one[part]) for track, one in zip(tracks, parts, strict=True)]
+    left = sum(len(track.stamps_ns) for track in tracks) - sum(len(track.stamps_ns) for track in kept)
+    whose = ", ".join(dict.fromkeys(track.name for track, count in zip(tracks, counts, strict=True) if count > 1))
+    lasts_s = max(float(np.ptp(track.stamps_ns)) for track in kept) / 1e9
+    remark = (
+        f"the clock of {whose} begins anew, and the times of recording with it: part {part + 1} of {max(counts)} is "
+        f"used, of {lasts_s:.1f} s; {left} poses are left out"
+    )
+    return OneClock(kept, part=part, remark=remark)
+
+
+def _is_steady(track: Track) -> bool:
+    """True if the least delay from stamp to recording agrees from second to second. A hold
+    up delays samples; it does not make any of them faster.
+    """
+    if not np.ptp(track.logged_ns):
+        return True
+    ahead_s = (track.stamps_ns - track.logged_ns) / 1e9
+    second = ((track.logged_ns - track.logged_ns.min()) / (1e9 * DELAY_WINDOW_S)).astype(np.int64)
+    fastest = np.full(int(second.max()) + 1, -np.inf)
+    np.maximum.at(fastest, second, ahead_s)
+    return bool(np.ptp(fastest[np.isfinite(fastest)]) <= LARGEST_DELAY_S)
+
+
+def _are_usable(tracks: Sequence[Track]) -> bool:
+    """True if the times of recording follow the times at which the samples were made."""
+    return all(np.ptp(track.logged_ns) > 0 and len(clock_parts(track.logged_ns)) == 1 for track in tracks)

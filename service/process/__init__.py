@@ -1,0 +1,1 @@
+"""Child processes, interrupts, one BLAS thread, and the progress that commands print."""

@@ -1,1 +1,0 @@
-"""The scribe process and its files: recordings (MCAP) written, read and replayed."""

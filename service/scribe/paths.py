@@ -1,0 +1,98 @@
+"""The paths of a cell's recordings: names for the next ones; old ones beyond the limits."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from service.files.mcap_reader import Messages
+from service.settings.config import Settings
+
+MB = 1e6
+
+
+class RecordingPaths:
+    """The paths of one recording after another.
+
+    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, which sort by time. Else they are
+    `recording` and `rrd`, the later ones numbered.
+    """
+
+    def __init__(
+        self, settings: Settings, folder: str | None, recording: str | None, rrd: str | None, *, attempt: int = 1
+    ) -> None:
+        self._settings = settings
+        self._folder = None if folder is None else Path(folder)
+        self._explicit = [None if path is None else Path(path) for path in (recording, rrd)]
+        self._number = attempt
+        self._newest = datetime.min.replace(tzinfo=UTC)
+        self._own: dict[str, bool] = {}  # whether a recording is this cell's, by its stem
+        self._cell = settings.cell.replace("/", "-")
+        self.keep_mb_left: float | None = None  # before the oldest are removed; None: no limit, or not known yet
+
+    def next(self) -> tuple[Path | None, Path | None]:
+        """Paths of the next recording and of the drawing beside it; None where it is not wanted."""
+        if self._folder is None:
+            while True:
+                number, self._number = self._number, self._number + 1
+                recording, rrd = (
+                    path and (path if number == 1 else path.with_stem(f"{path.stem}-{number}"))
+                    for path in self._explicit
+                )
+                if number == 1 or not any(path is not None and path.exists() for path in (recording, rrd)):
+                    return recording, rrd
+        at = max(datetime.now(UTC).replace(microsecond=0), self._newest + timedelta(seconds=1))
+        while any(path.exists() for path in self._named(at)):
+            at += timedelta(seconds=1)
+        self._newest = at
+        recording, rrd = self._named(at)
+        return recording, rrd if self._settings.files.rerun else None
+
+    def _named(self, at: datetime) -> tuple[Path, Path]:
+        assert self._folder is not None
+        stem = f"{self._cell}-{at:%Y%m%dT%H%M%SZ}"
+        return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
+
+    def prune(self, writing: Path | None) -> list[Path]:
+        """The oldest recordings beyond the limits, now removed; never the one being written."""
+        keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
+        if self._folder is None or not (keep_bytes or keep_s):
+            return []
+        own_names = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
+        found: dict[str, list[tuple[Path, int, float]]] = {}
+        for path in self._folder.glob("*Z*.*"):
+            if path.suffix in (".mcap", ".rrd") and own_names.fullmatch(path.stem) and self._is_own(path):
+                with contextlib.suppress(OSError):
+                    about = path.stat()
+                    found.setdefault(path.stem, []).append((path, about.st_size, about.st_mtime))
+        total = sum(size for files in found.values() for _, size, _ in files)
+        removed: list[Path] = []
+        for stem in sorted(found):
+            files = found[stem]
+            too_old = keep_s and time.time() - max(changed for *_, changed in files) > keep_s
+            too_much = keep_bytes and total > keep_bytes
+            if (writing is not None and stem == writing.stem) or not (too_old or too_much):
+                continue
+            for path, size, _ in files:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    total -= size
+                    removed.append(path)
+        self.keep_mb_left = max(0.0, keep_bytes - total) / MB if keep_bytes else None
+        return removed
+
+    def _is_own(self, path: Path) -> bool:
+        """Whether a recording, or the drawing beside it, is this cell's.
+
+        Another cell's name may be the same once its slashes are replaced.
+        """
+        if path.stem not in self._own:
+            messages = Messages(path.with_suffix(".mcap"))
+            with contextlib.suppress(OSError):
+                next(iter(messages), None)
+            cell = messages.metadata.get("thirdhand", {}).get("cell", self._settings.cell)
+            self._own[path.stem] = cell == self._settings.cell
+        return self._own[path.stem]

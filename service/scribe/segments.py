@@ -1,0 +1,302 @@
+"""The ticks that the scribe receives, written into one recording after another.
+
+A recording that is large or old enough ends at a tick whose state is known, and the next begins
+with that state, so that no tick is missing between them. A recording that fails is left as it is;
+the next one begins as soon as that is possible. Ticks lost meanwhile are counted, and marked there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from service.core.frame import Record
+from service.files.recording import Recorder
+from service.scribe.paths import MB, RecordingPaths
+from service.scribe.protocol import TickMessage
+from service.settings.config import Settings
+
+RETRY_S = 1.0
+SAMPLE_S, GROWTH_S, LEAST_GROWTH_S = 5.0, 600.0, 10.0  # how often sizes are noted, over how long growth is told
+ROOM_BYTES = 1_000_000  # some seconds of ticks; a disk that was full is tried again once this is free
+PRUNE_S = 5.0
+
+
+class Segments:
+    """Writes ticks and notes; `say` is called once with what fails, in words.
+
+    `draw` is called with the path of the drawing beside a new recording. Of the ticks received,
+    `kept` are on disk and `lost` never will be. No recording on disk marks `unmarked` of the lost
+    ticks yet; it begins with those of others that went before.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        paths: RecordingPaths,
+        *,
+        say: Callable[[str], None],
+        draw: Callable[[Path], None],
+        unmarked: int = 0,
+    ) -> None:
+        self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
+        self._recorder: Recorder | None = None
+        self._wanted = True
+        self._skill: bytes | None = None
+        self._rrd: Path | None = None
+        self._complete: Path | None = None
+        self._kept = self.lost = 0
+        self._unmarked = unmarked
+        self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
+        self._began = self._tried = self._pruned = -1e9
+        self._full = self._moved = self._drawn = False
+        self._failure: object = None  # the last that was reported
+        self._written = 0  # bytes in files that have ended
+        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], bytes in all
+
+    @property
+    def kept(self) -> int:
+        """Ticks on disk."""
+        return self._kept + (self._recorder.kept if self._recorder is not None else 0)
+
+    @property
+    def unmarked(self) -> int:
+        """Lost ticks that no recording on disk marks yet."""
+        return self._unmarked + self._marked_pending
+
+    @property
+    def path(self) -> Path | None:
+        """The recording being written, or that was written last and is complete."""
+        return self._complete if self._recorder is None else self._recorder.path
+
+    @property
+    def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
+        """`starting` before there is a skill; `drawing` where no recording is wanted."""
+        if self._skill is None or not self._wanted:
+            return "starting" if self._skill is None else "drawing"
+        return "interrupted" if self._recorder is None else "recording"
+
+    def begin(self, skill: bytes | None, state: Record | None) -> None:
+        """Begins with a skill and a state; without them, with the first that are received."""
+        self._skill = skill
+        if skill is not None:
+            self._recorder = self._opened(state)
+
+    def _opened(self, state: Record | None) -> Recorder | None:
+        """A new recording and drawing, if it can be begun; the first drawing begins in any case."""
+        self._tried = time.monotonic()
+        path, rrd = self._paths.next()
+        self._wanted = path is not None
+        recorder = None if path is None else self._recorder_at(path, state)
+        if recorder is not None or not self._wanted:
+            self._marked = self._marked_pending = 0
+            self._began, self._moved = self._tried, False
+        elif self._rrd is not None:
+            return None
+        self._written += _bytes_of(self._rrd)
+        self._rrd, self._drawn = rrd, False
+        if rrd is not None:
+            self._draw(rrd)
+        return recorder
+
+    def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
+        assert self._skill is not None
+        try:
+            if self._full and shutil.disk_usage(_existing_folder(path)).free < ROOM_BYTES:
+                return None
+            return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
+        except OSError as error:
+            self._failed(path, error)
+            _discard(path)
+            return None
+
+    def free_mb(self) -> float | None:
+        """Free space where the recording is written [MB]; None where none is written."""
+        with contextlib.suppress(OSError):
+            return None if self.path is None else round(shutil.disk_usage(_existing_folder(self.path)).free / 1e6)
+        return None
+
+    def mb_per_hour(self) -> float | None:
+        """Growth of recordings and drawings lately [MB/h]; None where it is not known yet."""
+        if not self._sizes:
+            return None
+        (begin_s, begin), now_s = self._sizes[0], time.monotonic()
+        if now_s - begin_s < LEAST_GROWTH_S:
+            return None
+        return round((self._written + self._size() - begin) / MB * 3600 / (now_s - begin_s), 1)
+
+    @property
+    def keep_mb_left(self) -> float | None:
+        """Growth before the oldest recordings are removed [MB]; None where they are not."""
+        left = self._paths.keep_mb_left
+        return None if left is None else round(left)
+
+    def _size(self) -> int:
+        """Bytes in the files being written."""
+        return _bytes_of(self._rrd) + (0 if self._recorder is None else self._recorder.size)
+
+    def _failed(self, path: Path, error: OSError) -> None:
+        self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        cause = error.errno or str(error)
+        if cause != self._failure:
+            self._failure = cause
+            self._say(f"recording to {path} ended: {error.strerror or error}; it continues once that is repaired")
+
+    def write(self, received: TickMessage) -> int:
+        """Writes a tick; the number of missing ticks before it, if it is marked now, else 0."""
+        self._skill = next(
+            (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"), self._skill
+        )
+        self._skill = received.skill or self._skill
+        now = time.monotonic()
+        may_begin = received.state is not None and self._skill is not None
+        if may_begin and self._recorder is None and now - self._tried > RETRY_S and (self._wanted or self._due(now)):
+            self._recorder = self._opened(None)
+        if self._recorder is None:
+            if self._wanted:
+                self.lost += 1
+                self._unmarked += 1 + received.lost
+            else:
+                self._kept += 1  # drawing was all that was asked for
+            return 0 if self._wanted else received.lost
+        missing = received.lost + self._unmarked
+        self._marked += missing
+        self._marked_pending += missing
+        self._unmarked = 0
+        self._safely(lambda recorder: _write_tick(recorder, received, missing))
+        if self._recorder is not None and not self._recorder.pending:
+            self._marked_pending = 0
+        if self._recorder is not None and received.state is not None and self._due(now):
+            self._next(received.state)
+        return missing
+
+    def _due(self, now: float) -> bool:
+        files = self._settings.files
+        sizes = [self._recorder.size] if self._recorder is not None else []
+        sizes.append(_bytes_of(self._rrd))
+        too_large = max(sizes, default=0) > files.segment_mb * MB
+        return too_large or self._moved or now - self._began > files.segment_minutes * 60
+
+    def _next(self, state: Record) -> None:
+        """Continues in a new recording, which begins with the old one's last state; stays in the
+        old one where none can be begun.
+        """
+        self._safely(Recorder.flush)
+        new = None if self._recorder is None else self._opened(state)
+        if new is not None:
+            self._end()
+            self._recorder = new
+
+    def _end(self) -> None:
+        """Ends the recording in progress."""
+        self._safely(Recorder.close)
+        if self._recorder is not None:
+            self._kept += self._recorder.kept
+            self._written += self._recorder.size
+            self._recorder = None
+
+    def _safely(self, act: Callable[[Recorder], None]) -> None:
+        """Acts on the recording; where that fails it ends, and its pending ticks are lost."""
+        recorder = self._recorder
+        if recorder is None:
+            return
+        try:
+            act(recorder)
+        except OSError as error:
+            self._failed(recorder.path, error)
+            self._leave(recorder, recorder.pending, self._marked_pending if recorder.pending else 0)
+
+    def _leave(self, recorder: Recorder, lost: int, unmarked: int) -> None:
+        recorder.abandon()
+        self._written += recorder.size
+        self._recorder = None
+        self._kept += recorder.kept + recorder.pending - lost
+        self.lost += lost
+        self._unmarked += lost + unmarked
+        self._marked_pending = 0
+        self._tried = time.monotonic() if self._full else -1e9
+        if not recorder.kept:
+            _discard(recorder.path)
+
+    def note(self, key: str, text: str, time_ns: int) -> None:
+        """Writes a text under `<cell>/<key>`."""
+        self._safely(lambda recorder: recorder.note(key, text, time_ns))
+
+    def flush(self) -> None:
+        """Hands what was written to the operating system, and checks that the files are at their
+        paths; every PRUNE_S the oldest recordings are removed.
+        """
+        self._safely(Recorder.flush)
+        self._check_files()
+        if not self._sizes or time.monotonic() - self._sizes[-1][0] > SAMPLE_S:
+            self._sizes.append((time.monotonic(), self._written + self._size()))
+        if time.monotonic() - self._pruned > PRUNE_S:
+            self._pruned = time.monotonic()
+            with contextlib.suppress(OSError):
+                self._paths.prune(self.path)
+
+    def _check_files(self) -> None:
+        recorder = self._recorder
+        if recorder is None:
+            return
+        self._marked_pending = 0
+        if recorder.kept:
+            self._full, self._failure = False, None
+        lost_name = recorder.lost_name()
+        if lost_name == "removed":
+            self._say(f"recording {recorder.path} was removed while it was written; the next one begins")
+            self._leave(recorder, recorder.kept + recorder.pending, self._marked)
+        elif lost_name and not self._moved:
+            self._moved = True
+            self._say(f"recording {recorder.path} was moved while it was written; the next one begins")
+        if self._rrd is not None:
+            self._moved = self._moved or (self._drawn and not self._rrd.exists())
+            self._drawn = self._rrd.exists()
+
+    def close(self) -> None:
+        """Ends the recording."""
+        self.flush()
+        path = self.path
+        self._end()
+        self._complete = path if self._failure is None else None
+
+
+def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None:
+    time_ns = int(received.timing["time_ns"])
+    recorder.write(
+        received.tick,
+        received.frame,
+        time_ns=time_ns,
+        timing=received.timing,
+        state=received.state,
+        skill=received.skill,
+        lost=missing,
+        outputs=received.outputs,
+    )
+    if missing:
+        recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)
+
+
+def _bytes_of(path: Path | None) -> int:
+    """The size of a file; 0 where there is none."""
+    with contextlib.suppress(OSError):
+        return 0 if path is None else path.stat().st_size
+    return 0
+
+
+def _discard(path: Path) -> None:
+    """Removes a recording without a tick."""
+    if path.is_file():
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def _existing_folder(path: Path) -> Path:
+    """The nearest folder above a path that exists."""
+    return next((folder for folder in path.parents if folder.is_dir()), Path("/"))

@@ -1,0 +1,1 @@
+"""A cell's configuration and network, the description of its arm, and the colours of drawings."""

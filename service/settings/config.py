@@ -1,0 +1,486 @@
+"""Settings of one cell: a TOML file, validated whole before anything starts.
+
+Units stand in the names or beside them, defaults are safe.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from service.contract import ros2
+from service.contract.explain import InvalidError, in_words, validated
+from service.settings.arm_description import SettingsError, UnreadableError, check, completed, description
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.network import Network, Ros2
+from service.settings.urdf import Urdf, UrdfError
+
+WAM = Path(__file__).parents[1] / "arms" / "wam.urdf"
+RATES_HZ = (50, 1000)  # slowest and fastest
+LONGEST_CELL = 200  # bytes: a recording's name is the cell's and its time, and of 255 bytes at most
+REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
+SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
+Cell = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
+    ),
+]
+Point = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
+PerJoint = tuple[float, ...]
+
+# Relative paths start from the folder of the configuration, or from the current folder.
+BESIDE = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
+FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+PRISMATIC_M = 0.5  # what a tolerance of 1 rad is for a prismatic joint: the tool moves as far on a lever of 0.5 m
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One table of the file; an unknown name in it is an error."""
+
+
+class HandSettings(Section, frozen=True):
+    """How a tracker's poses become hand positions in frame `base`."""
+
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
+    unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
+    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is in motion
+    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # a slow hand counts as still after this time
+    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
+    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
+    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
+
+
+class ToolSettings(Section, frozen=True):
+    """The tool: where it sits on the tool plate, and how fast it may move."""
+
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
+    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
+    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
+    orientation: Literal["direction", "full"] = "direction"  # follow the direction of the tool's +z, or all axes
+    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
+    max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
+    radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
+    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
+    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
+
+    @property
+    def acceleration(self) -> float:
+        """Acceleration limit of the setpoint [m/s²], as a norm: `max_acceleration`, but at most
+        `max_speed` within 80 ms.
+
+        A tool that may move slowly but accelerate fast passes its speed limit in a stop: what its
+        joints add to the speed while they end their accelerations is a² / (2 jerk).
+        """
+        return min(self.max_acceleration, FASTEST_SPEED_UP * self.max_speed)
+
+    @property
+    def jerk(self) -> float:
+        """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most that acceleration
+        within 25 ms.
+        """
+        return min(self.max_jerk, FASTEST_JERK * self.max_speed)
+
+    @property
+    def stop_acceleration(self) -> float:
+        """Acceleration of each axis in a stop [m/s²], with which the norm keeps `acceleration`."""
+        return 0.4 * self.acceleration
+
+    @property
+    def stop_jerk(self) -> float:
+        """Jerk of each axis in a stop [m/s³], with which the norm keeps `jerk`."""
+        return self.jerk / math.sqrt(3.0)
+
+
+class ArmSettings(Section, frozen=True):
+    """The arm: which, where its joint states come from, its posture when none come, and when
+    following it is a fault.
+    """
+
+    urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
+    packages: tuple[
+        str, ...
+    ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
+    plate: str = "tool_plate"  # the link that carries the tool
+    source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
+    posture: PerJoint = (
+        0.1761,
+        0.8604,
+        -0.5,
+        2.5414,
+        -0.4273,
+        -1.0823,
+        0.0,
+    )  # [rad] preferred posture, and the start with `assumed`
+    link_radius: Positive = 0.07  # [m] radius of links without a collision shape
+    fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm without joint states is at fault
+
+
+class JointSettings(Section, frozen=True):
+    """The arm's joints in chain order, and the limits that no command ever leaves [rad, rad/s,
+    rad/s², rad/s³], for prismatic (sliding) joints [m, m/s, m/s², m/s³].
+
+    A continuous joint has the limits ±6000 rad unless narrower ones are given. It is commanded in
+    the turn in which `joints/state` reports it when the arm becomes ready, and onward from there;
+    states that wrap at ±pi and states that count turns are both accepted. Tolerances in rad that
+    the service applies to every joint are half as many metres for a prismatic one.
+    """
+
+    names: tuple[str, ...] = (  # as `joints/state` and `joints/command` name them
+        "wam/base_yaw_joint",
+        "wam/shoulder_pitch_joint",
+        "wam/shoulder_yaw_joint",
+        "wam/elbow_pitch_joint",
+        "wam/wrist_yaw_joint",
+        "wam/wrist_pitch_joint",
+        "wam/palm_yaw_joint",
+    )
+    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()  # from the URDF; empty: all revolute
+    lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
+    upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
+    velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
+    acceleration: PerJoint = (6.0, 9.0, 15.0, 20.0, 20.0, 20.0, 20.0)  # [rad/s²]
+    jerk: PerJoint = (300.0, 450.0, 500.0, 500.0, 500.0, 500.0, 500.0)  # [rad/s³]
+
+    @property
+    def every_kind(self) -> tuple[str, ...]:
+        """The kind of each joint."""
+        return self.kinds or ("revolute",) * len(self.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each joint's position."""
+        return tuple("m" if kind == "prismatic" else "rad" for kind in self.every_kind)
+
+    @property
+    def per_rad(self) -> tuple[float, ...]:
+        """Tolerance of each joint, in its own unit, for a tolerance of 1 rad."""
+        return tuple(PRISMATIC_M if kind == "prismatic" else 1.0 for kind in self.every_kind)
+
+
+class Reach(Section, frozen=True):
+    """Where targets may lie: a shell around the shoulder, in front of the base plate and above the
+    table [m].
+    """
+
+    centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
+    inner: Positive = 0.35  # [m] inner radius of the shell
+    outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] outer radius of the shell
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] least x, in front of the base plate
+    min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] least z, above the table
+
+
+class People(Section, frozen=True):
+    """How near the arm may come to people, and how fast: speed and separation as in ISO/TS 15066.
+
+    A hand is a capsule from where it is tracked toward the elbow. A part of the arm may approach it
+    as fast as it can still stop `clearance` away, if the hand comes on as fast as now and the stop
+    begins `hands.stale_ms` (so long a hand may move unseen) and `reaction_ms` late. A hand that is
+    not seen for longer is taken to come ever faster, by 5 m/s², up to `unknown_speed`.
+    """
+
+    radius: Positive = 0.04  # [m] radius of hand and forearm
+    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
+    toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand; fingers reach out farther
+    brake: Positive = 3.0  # [m/s²] the slowest joint of the shipped arm brakes its stretched tool by 5
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
+    unknown_speed: Positive = 1.6  # [m/s] assumed speed of a hand that was only just seen
+    tremor_speed: Positive = 0.1  # [m/s] nothing is foreseen of a slower hand: it trembles; all of it at twice that
+
+
+class Box(Section, frozen=True):
+    """Something that stands around, parallel to the axes of frame base [m]."""
+
+    centre: Point
+    half_size: tuple[Positive, Positive, Positive]
+
+
+class Obstacles(Section, frozen=True):
+    """What the arm keeps away from besides people: the table, itself, and boxes."""
+
+    boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] least distance; from the arm itself at most 0.01
+    brake: Positive = 2.0  # [m/s²] deceleration that is assumed toward them
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
+
+
+class Table(Section, frozen=True):
+    """The table: its top [m], in pictures, in the simulated bench, and for the arm, which keeps
+    away from it and all below.
+    """
+
+    centre: Point = (0.80, 0.0, 0.0)  # [m]
+    half_size: tuple[Positive, Positive] = (0.45, 0.60)  # [m] along x and y
+
+
+class SkillSettings(Section, frozen=True):
+    """How the skill is followed."""
+
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # the tool is this far ahead of the teacher's timing
+
+
+class Files(Section, frozen=True):
+    """Where skills are read, and via-points, recordings and viewer files are written."""
+
+    skills: str = ""  # a folder; empty: the shipped recordings
+    state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
+    record: str = ""  # a folder; empty: nothing is recorded
+    rerun: bool = True  # write an .rrd file beside each recording
+    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
+    segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
+    segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's recordings; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # recordings older than this are deleted; 0: no limit
+
+
+class Settings(Section, frozen=True):
+    """All settings of one cell."""
+
+    cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
+    hands: HandSettings = msgspec.field(default_factory=HandSettings)
+    tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
+    arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
+    joints: JointSettings = msgspec.field(default_factory=JointSettings)
+    reach: Reach = msgspec.field(default_factory=Reach)
+    table: Table = msgspec.field(default_factory=Table)
+    people: People = msgspec.field(default_factory=People)
+    obstacles: Obstacles = msgspec.field(default_factory=Obstacles)
+    network: Network = msgspec.field(default_factory=Network)
+    ros2: Ros2 = msgspec.field(default_factory=Ros2)
+    files: Files = msgspec.field(default_factory=Files)
+    skill: SkillSettings = msgspec.field(default_factory=SkillSettings)
+
+    def __post_init__(self) -> None:
+        if problems := list(self._problems()):
+            raise ValueError("\n".join(problems))
+
+    def _problems(self) -> Iterator[str]:
+        """What is wrong with values that are right each by itself."""
+        unusable = [path for path, value in _numbers(msgspec.to_builtins(self), "$") if not math.isfinite(value)]
+        yield from (f"{path}: not finite; a finite number needed" for path in unusable)
+        if {".", ".."} & set(self.cell.split("/")):
+            yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
+        if (size := len(self.cell.encode())) > LONGEST_CELL:
+            yield f"$.cell: a name of {size} bytes given; at most {LONGEST_CELL} accepted, as files are named by it"
+        if unusable:
+            return
+        if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
+            yield (
+                f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
+                "none of them with a digit first, joined by slashes needed"
+            )
+        named = [topic.name for topic in ros2.of_settings(self.ros2)]
+        if named and self.network.ros2_domain is None:
+            yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
+        if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
+            yield f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, in any order"
+        for path, pose in (
+            ("$.hands.base_from_tracker", self.hands.base_from_tracker),
+            ("$.tool.plate_from_tool", self.tool.plate_from_tool),
+        ):
+            norm = math.hypot(*pose[3:])
+            if abs(norm - 1.0) > 1e-3:
+                yield f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)"
+        if not math.hypot(*self.people.toward_elbow) > 1e-6:
+            yield f"$.people.toward_elbow: {list(self.people.toward_elbow)} given; a direction needed"
+        if self.tool.fault_speed < self.tool.max_speed:
+            yield (
+                f"$.tool.fault_speed: {self.tool.fault_speed} given; "
+                f"at least $.tool.max_speed = {self.tool.max_speed} needed"
+            )
+        if self.reach.inner >= self.reach.outer:
+            yield f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
+        yield from self._problems_of_joints()
+
+    def _problems_of_joints(self) -> Iterator[str]:
+        count = len(self.joints.names)
+        if not count or len(set(self.joints.names)) < count:
+            yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
+            return
+        fields: dict[str, tuple[object, ...]] = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS}
+        fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
+        uneven = {path: values for path, values in fields.items() if len(values) != count}
+        for path, values in uneven.items():
+            what = "kinds" if path == "$.joints.kinds" else "numbers"
+            yield f"{path}: {len(values)} {what}, {count} needed, one for each of $.joints.names"
+        if uneven:
+            return
+        widest = self._widest()
+        for name in LIMITS:
+            for i, (given, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
+                if name == "lower" and given < bound:
+                    yield f"$.joints.lower[{i}]: {given} given; {bound} or more accepted"
+                if name == "upper" and given > bound:
+                    yield f"$.joints.upper[{i}]: {given} given; {bound} or less accepted"
+                if name not in ("lower", "upper") and not 0 < given <= bound:
+                    yield f"$.joints.{name}[{i}]: {given} given; above 0, up to {bound} accepted"
+        for i, (low, high, at) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
+            if not low < high:
+                yield f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed"
+            elif not low <= at <= high:
+                yield f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted"
+
+    def _widest(self) -> dict[str, PerJoint]:
+        """Bounds of the limits: the defaults for the shipped arm, none for others."""
+        if not self.arm.urdf:
+            return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
+        n = len(self.joints.names)
+        return {name: (-math.inf if name == "lower" else math.inf,) * n for name in LIMITS}
+
+    @property
+    def period_s(self) -> float:
+        """Duration of one tick [s]."""
+        return 1.0 / self.rate_hz
+
+
+def urdf_path(settings: Settings) -> Path:
+    """Where the arm's URDF is."""
+    return Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM
+
+
+def robot_description(settings: Settings) -> str:
+    """The arm's URDF, with a capsule around each collision mesh. Raises SettingsError."""
+    return description(urdf_path(settings), settings.arm.packages)
+
+
+def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _numbers(inner, f"{path}.{name}")
+    elif isinstance(value, list | tuple):
+        for i, inner in enumerate(value):
+            yield from _numbers(inner, f"{path}[{i}]")
+    elif isinstance(value, float):
+        yield path, value
+
+
+def _make_paths_absolute(given: Any, folder: Path | None) -> None:
+    """Makes every path absolute, so that its meaning no longer depends on a folder. Raises
+    SettingsError.
+    """
+    for section, name in (*BESIDE, *FROM_HERE):
+        table = given.get(section) if isinstance(given, dict) else None
+        value = table.get(name) if isinstance(table, dict) else None
+        base = folder if folder is not None and (section, name) in BESIDE else Path()
+        if isinstance(table, dict) and isinstance(value, str):
+            table[name] = _absolute(value, base, f"[{section}] {name}")
+        elif isinstance(table, dict) and isinstance(value, list | tuple):
+            table[name] = [
+                _absolute(one, base, f"[{section}] {name}, entry {i + 1}") if isinstance(one, str) else one
+                for i, one in enumerate(value)
+            ]
+
+
+def _absolute(value: str, base: Path, where: str) -> str:
+    """A path, from `base` where it is relative; none stays none. Raises SettingsError."""
+    if "\0" in value:
+        raise SettingsError(f"{where}: {value!r} given; a path holds no zero bytes")
+    try:
+        return str((base / Path(value).expanduser()).absolute()) if value else ""
+    except RuntimeError:
+        raise SettingsError(f"{where}: {value!r} given; there is no such user's folder") from None
+
+
+def _mistakes(given: Any) -> list[str]:
+    try:
+        validated(given, Settings)
+    except InvalidError as error:
+        return [str(error)]
+    return []
+
+
+def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
+    """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
+
+    Relative paths of URDF, packages, certificate and Zenoh configuration start from `folder`, those
+    of [files] from the current folder; all become absolute here. What is not said of an arm with a
+    URDF of its own is taken from there; no limit may be wider than the URDF's.
+    """
+    try:
+        _make_paths_absolute(given, folder)
+        arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
+        if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
+            try:
+                own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
+                given = completed(given, Urdf(own, origin=arm["urdf"]))
+            except (UrdfError, SettingsError) as error:  # all else that is wrong, but for what is the arm's
+                others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
+                raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
+        settings = validated(given, Settings)
+        urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
+        check(settings.joints, urdf, settings.arm.plate)
+        if settings.arm.urdf:
+            settings = _with_reach(settings, urdf, set(reach) if isinstance(reach, dict) else set())
+    except (UrdfError, SettingsError, InvalidError) as error:
+        raise SettingsError(f"{origin}: {error}") from None
+    return settings
+
+
+def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
+    """The settings with the reach that follows from the arm's kinematics, but for what is `said`.
+
+    Raises SettingsError where the arm reaches too little of it.
+    """
+    from service.settings.reachable import Shell, workspace_of  # heavy, and few arms need it
+
+    workspace = workspace_of(
+        urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
+    )
+    reach = settings.reach
+    found = workspace.shell(reach.min_x, reach.min_z)
+    outer = reach.outer if "outer" in said else min(found.outer, reach.outer)
+    inner = reach.inner if "inner" in said else min(found.inner, found.inner / found.outer * outer)
+    centre = reach.centre if "centre" in said else found.centre
+    reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
+    share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
+    needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
+    if share < needed:
+        raise SettingsError(
+            f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
+            f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
+            f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
+        )
+    return msgspec.structs.replace(settings, reach=reach)
+
+
+def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
+    """Settings from TOML text, as `converted` takes them. Raises SettingsError."""
+    try:
+        given = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{origin}: {error}") from None
+    except RecursionError:
+        raise SettingsError(f"{origin}: tables or lists in each other, too deep to be meant") from None
+    return converted(given, origin=origin, folder=folder)
+
+
+def load(path: Path) -> Settings:
+    """Settings from a TOML file. Raises SettingsError, UnreadableError."""
+    try:
+        text = content(path, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
+    except (OSError, UnusableError, UnicodeDecodeError) as error:
+        raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
+    return parse(text, origin=str(path), folder=path.parent)

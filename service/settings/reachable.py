@@ -1,0 +1,214 @@
+"""Where an arm's tool can be, by its kinematics, and the shell around its shoulder that it reaches.
+
+For N postures, drawn evenly over the joints' limits: position of the tool
+
+    p = T_1 R_1(q_1) T_2 R_2(q_2) ... T_plate p_tool.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from service.settings.urdf import Joint
+
+Vectors = NDArray[np.float64]
+POSTURES = 30_000  # with more the shell's radii change by less than 1 %
+POINTS = 8_000  # of space that are tested
+SPACING = 0.03  # of the arm's extent: a point is reached when the tool is that near in one of the postures
+RAIL_STEPS = 9  # positions of a prismatic joint below the first one that turns
+NEIGHBOURS = 12  # postures that are looked at for each point
+MORE_NEIGHBOURS = 64  # postures that are looked at for a point that is near none of those
+CERTAIN = 0.08  # of the arm's extent: the tool is never farther from its position in the nearest posture than 0.072
+REACHED = 0.95  # share of the points at a distance from the shoulder that the arm reaches there
+LAYERS = 40  # distances from the shoulder that are tested
+FOLDED = 0.4  # of the outer radius: nearer to its shoulder an arm is folded onto itself
+STRETCHED = 0.96  # of the maximum distance: farther out an arm is singular
+
+
+class Shell(NamedTuple):
+    """Places between two distances from a point [m]."""
+
+    centre: tuple[float, float, float]
+    inner: float
+    outer: float
+
+
+class Workspace:
+    """Positions of an arm's tool (N, 3) [m], frame of the root link."""
+
+    def __init__(
+        self, chain: Sequence[Joint], lower: Sequence[float], upper: Sequence[float], plate_from_tool: Sequence[float]
+    ) -> None:
+        moving = [joint for joint in chain if joint.kind != "fixed"]
+        ends = np.array([_turns(low, high) for low, high in zip(lower, upper, strict=True)])
+        shares = _spread(POSTURES, len(moving))
+        self.postures = ends[:, 0] + shares * (ends[:, 1] - ends[:, 0])
+        rails = next((i for i, joint in enumerate(moving) if joint.kind != "prismatic"), 0)
+        unmoved = self.postures.copy()
+        unmoved[:, :rails] = 0.0
+        from_rails, self.directions, axes = _placed(chain, unmoved, plate_from_tool)
+        along = np.array([axis for _, axis in axes[:rails]]).reshape(rails, 3)
+        self.positions = from_rails + self.postures[:, :rails] @ along
+        self._turns, self._axis = moving[rails].kind != "prismatic", axes[rails][1]
+        self._centre, self._first = _shoulder(axes[rails:]), ends[rails]
+        self.shoulder = self._centre + ends[:rails].mean(axis=1) @ along
+        self._reach = float(np.linalg.norm(from_rails - self._centre, axis=1).max())
+        self.extent = float(np.linalg.norm(self.positions - self.shoulder, axis=1).max())
+        steps = [np.linspace(low, high, RAIL_STEPS) for low, high in ends[:rails]]
+        self._stops = [np.array(stop) @ along for stop in itertools.product(*steps)] if rails else [np.zeros(3)]
+        flat, angles = self._flattened(from_rails)
+        self._tree, self._starts = cKDTree(flat), angles - self.postures[:, rails]
+
+    def reaches(self, points: Vectors) -> NDArray[np.bool_]:
+        """True for each of the points (M, 3) that is near the tool in one of the postures."""
+        return np.asarray(self._nearest(points, NEIGHBOURS) <= SPACING * self._reach)
+
+    def beyond(self, points: Vectors) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from where the tool can be; 0 where it comes."""
+        out = np.where(self.reaches(points), 0.0, math.inf)
+        out[out > 0.0] = self._nearest(points[out > 0.0], MORE_NEIGHBOURS)
+        return np.where(out > CERTAIN * self.extent, out, 0.0)
+
+    def _nearest(self, points: Vectors, neighbours: int) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from the tool in the nearest of the postures, with
+        the rails below the first joint that turns at any of their stops.
+        """
+        return np.asarray(np.min([self._distances(points - stop, neighbours) for stop in self._stops], axis=0))
+
+    def _distances(self, points: Vectors, neighbours: int) -> Vectors:
+        """Distances (M,) [m] of points (M, 3) from the tool in the nearest posture with the rails
+        at 0.
+
+        The first joint turns the tool on a circle of radius r about its axis. A point that is d
+        from the circle, and turned by an angle a beyond the joint's limits, is at
+        sqrt(d² + (2 r sin(a / 2))²).
+        """
+        flat, angles = self._flattened(points)
+        distances, found = map(np.asarray, self._tree.query(flat, k=neighbours))
+        if not self._turns:
+            return np.asarray(distances.min(axis=1))
+        lower, upper = self._first
+        turn = (angles[:, None] - self._starts[found] - lower) % (2 * math.pi)
+        excess = np.where(turn <= upper - lower, 0.0, np.minimum(turn - (upper - lower), 2 * math.pi - turn))
+        return np.asarray(np.hypot(distances, 2.0 * flat[:, :1] * np.sin(excess / 2.0)).min(axis=1))
+
+    def _flattened(self, points: Vectors) -> tuple[Vectors, Vectors]:
+        """Distances of points (M, 3) from the first axis and heights along it (M, 2), and angles
+        about it (M,); the points themselves and 0 where no joint turns.
+        """
+        if not self._turns:
+            return points, np.zeros(len(points))
+        one = np.linalg.svd(self._axis[None])[2][1]  # any direction across the axis
+        away = points - self._centre
+        x, y = away @ one, away @ np.cross(self._axis, one)
+        return np.column_stack((np.hypot(x, y), away @ self._axis)), np.arctan2(y, x)
+
+    def shell(self, min_x: float, min_z: float) -> Shell:
+        """The widest shell around the shoulder of which the arm reaches about all above `min_z` and
+        before `min_x`.
+        """
+        points, distances = _ball(self.shoulder, self.extent, min_x, min_z)
+        edges = np.linspace(0.0, self.extent, LAYERS + 1)
+        layer = np.digitize(distances, edges) - 1
+        reached, counts = self.reaches(points), np.bincount(layer, minlength=LAYERS)[:LAYERS]
+        shares = np.bincount(layer, weights=reached, minlength=LAYERS)[:LAYERS] / np.maximum(counts, 1)
+        first, last = _longest((shares >= REACHED * shares.max(initial=0.0)) & (counts > 0))
+        outer = min(edges[last], STRETCHED * self.extent)
+        inner = max(edges[first], FOLDED * outer)
+        x, y, z = self.shoulder.tolist()
+        return Shell((round(x, 4), round(y, 4), round(z, 4)), round(float(inner), 4), round(float(outer), 4))
+
+    def share(self, shell: Shell, min_x: float, min_z: float) -> float:
+        """Share of a shell, above `min_z` and before `min_x`, that the arm reaches; 0 where nothing
+        of it is left.
+        """
+        points, distances = _ball(np.array(shell.centre), shell.outer, min_x, min_z)
+        points = points[distances >= shell.inner]
+        return float(self.reaches(points).mean()) if len(points) else 0.0
+
+
+@functools.cache
+def workspace_of(
+    chain: tuple[Joint, ...], lower: tuple[float, ...], upper: tuple[float, ...], plate_from_tool: tuple[float, ...]
+) -> Workspace:
+    """A workspace, kept."""
+    return Workspace(chain, lower, upper, plate_from_tool)
+
+
+def _spread(count: int, dimensions: int) -> Vectors:
+    """Points (N, D) spread evenly over a unit cube: n times the powers of 1 / g, modulo 1, with
+    g^(D + 1) = g + 1 (an additive recurrence of low discrepancy).
+    """
+    g = 2.0
+    for _ in range(50):
+        g = (1.0 + g) ** (1.0 / (dimensions + 1))
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * g ** -np.arange(1.0, dimensions + 1)) % 1.0)
+
+
+def _turns(lower: float, upper: float) -> tuple[float, float]:
+    """Limits of at most one turn [rad]."""
+    return (lower, upper) if upper - lower <= 2 * math.pi else (-math.pi, math.pi)
+
+
+def _ball(centre: Vectors, radius: float, min_x: float, min_z: float) -> tuple[Vectors, Vectors]:
+    """Points (M, 3) spread evenly over a ball, above and before these, and their distances from its
+    centre (M,).
+    """
+    points = centre + radius * (2.0 * _spread(POINTS, 3) - 1.0)
+    distances = np.linalg.norm(points - centre, axis=1)
+    kept = (distances <= radius) & (points[:, 0] >= min_x) & (points[:, 2] >= min_z)
+    return points[kept], distances[kept]
+
+
+def _longest(flags: NDArray[np.bool_]) -> tuple[int, int]:
+    """Begin and end of the longest run of true flags; all of them where none is."""
+    runs = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0])).reshape(-1, 2)
+    begin, end = max(runs.tolist(), key=lambda run: run[1] - run[0], default=(0, len(flags)))
+    return begin, end
+
+
+def _placed(
+    chain: Sequence[Joint], postures: Vectors, plate_from_tool: Sequence[float]
+) -> tuple[Vectors, Vectors, list[tuple[Vectors, Vectors]]]:
+    """The tool's positions and where its +z points (N, 3); each joint's origin and axis with those
+    before it at 0.
+    """
+    count = len(postures)
+    turn, at = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    rest_turn, rest_at, axes, number = np.eye(3), np.zeros(3), [], 0
+    for joint in chain:
+        own = Rotation.from_quat(joint.rotation).as_matrix()
+        at, turn = at + turn @ np.array(joint.translation), turn @ own
+        rest_at, rest_turn = rest_at + rest_turn @ np.array(joint.translation), rest_turn @ own
+        if joint.kind == "fixed":
+            continue
+        axis = np.array(joint.axis)
+        axes.append((rest_at, rest_turn @ axis))
+        q = postures[:, number]
+        number += 1
+        if joint.kind == "prismatic":
+            at = at + (turn @ axis) * q[:, None]
+        else:
+            turn = turn @ Rotation.from_rotvec(q[:, None] * axis).as_matrix()
+    x, y, z, *quaternion = plate_from_tool
+    return at + turn @ np.array([x, y, z]), (turn @ Rotation.from_quat(quaternion).as_matrix())[:, :, 2], axes
+
+
+def _shoulder(axes: Sequence[tuple[Vectors, Vectors]]) -> Vectors:
+    """The point of the first axis that is nearest to the second; with parallel axes, or one alone,
+    the foot of the second's origin.
+    """
+    (at, along), (other, across) = axes[0], axes[min(1, len(axes) - 1)]
+    between, cosine = other - at, float(along @ across)
+    if 1.0 - cosine * cosine > 1e-6:
+        between = between - across * ((between @ across) - cosine * (between @ along)) / (1.0 - cosine * cosine)
+    return np.asarray(at + along * (between @ along))

@@ -1,0 +1,251 @@
+"""Reads an arm's URDF: the chain's joints to the tool, their limits, links' poses and shapes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from service.contract.explain import ExplainedError
+from service.contract.messages import Quaternion, Transform, Vector3
+from service.settings.link_tree import root_of
+from service.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three
+
+KINDS = ("revolute", "continuous", "prismatic")  # of joints that an arm may have
+CONTINUOUS_RAD = 6000.0  # limit of a continuous joint each way: 950 turns, so that positions keep their precision
+
+
+class UrdfError(ExplainedError, ValueError):
+    """A robot description that cannot be used: says what is wrong with it and what would do."""
+
+
+class Joint(NamedTuple):
+    """A joint: the links it connects, where it sits in the parent, and for a movable one its axis
+    and limits [rad, rad/s], of a prismatic one [m, m/s].
+    """
+
+    name: str
+    kind: str  # as in the URDF: fixed, revolute, ...
+    parent: str
+    child: str
+    translation: Vector3
+    rotation: Quaternion
+    axis: Vector3
+    lower: float
+    upper: float
+    velocity: float
+    mimics: str = ""  # the joint whose motion it follows
+
+
+class Shape(NamedTuple):
+    """A collision shape of a link, and where it sits in that link's frame."""
+
+    link: str
+    kind: str  # box, cylinder, sphere, capsule, mesh
+    size: tuple[float, ...]
+    """[m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: the ends of
+    the axis (2, 3) and the radius of a capsule that covers it, or nothing.
+    """
+    translation: Vector3
+    rotation: Quaternion
+
+
+class Urdf:
+    """A robot description, read. Raises UrdfError."""
+
+    def __init__(self, text: str, *, origin: str = "the URDF") -> None:
+        self.origin = origin
+        try:
+            self._robot = element_of(text)
+            links = [link.get("name", "") for link in self._robot.findall("link")]
+            self.joints = tuple(_joint(element) for element in self._robot.findall("joint"))
+            if self._robot.tag != "robot" or not self.joints:
+                raise ValueError("a <robot> with joints needed")
+            self.root = root_of(links, self.joints)
+            check_numbers(self._robot)
+            self.shapes = tuple(
+                _shape(link.get("name", ""), one)
+                for link in self._robot.findall("link")
+                for one in link.findall("collision")
+            )
+            if len(self.shapes) > MAX_SHAPES:
+                raise ValueError(f"{len(self.shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links fewer")
+        except ValueError as error:
+            raise UrdfError(f"{origin}: not a robot description: {error}") from None
+        self._above = {joint.child: joint for joint in self.joints}
+        parents = {joint.parent for joint in self.joints}
+        self.leaves = tuple(joint.child for joint in self.joints if joint.child not in parents)
+
+    def chain(self, tip: str) -> tuple[Joint, ...]:
+        """The joints from the root to link `tip`, in order. Raises UrdfError."""
+        found: list[Joint] = []
+        link = tip
+        while link != self.root:
+            if link not in self._above:
+                last = ", ".join(self.leaves)
+                raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
+            found.append(self._above[link])
+            link = found[-1].parent
+        return tuple(reversed(found))
+
+    def kinematics(self, names: Sequence[str]) -> str:
+        """Links and joints alone, as a URDF in which the joints of these names move."""
+        return kinematics(self._robot, {joint.name: joint.axis for joint in self.joints if joint.name in names})
+
+    def above(self, link: str) -> Joint | None:
+        """The joint whose child a link is; None for the root."""
+        return self._above.get(link)
+
+    def movable(self, tip: str) -> tuple[Joint, ...]:
+        """The joints from the root to link `tip` that turn or slide, in order; continuous ones have
+        the limits ±CONTINUOUS_RAD, and an infinite velocity where the description has none.
+
+        Raises UrdfError for a joint of another kind, without limits, or that follows another one.
+        """
+        moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
+        for joint in moving:
+            mistake = _lack(joint)
+            if joint.kind not in KINDS:
+                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+            elif joint.mimics:
+                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+            if mistake:
+                raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
+        if not moving:
+            raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
+        return moving
+
+    def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
+        """Each link in its parent link, for joint positions by name [rad, m]; others are at 0."""
+        return [_moved(joint, positions.get(joint.name, 0.0)) for joint in self.joints]
+
+
+def _moved(joint: Joint, position: float) -> Transform:
+    """A joint's child link in its parent link."""
+    at, turn = joint.translation, joint.rotation
+    if position and joint.kind == "prismatic":
+        dx, dy, dz = rotated(turn, joint.axis)
+        at = (at[0] + position * dx, at[1] + position * dy, at[2] + position * dz)
+    elif position:
+        turn = multiply(turn, about(joint.axis, position))
+    return Transform(joint.parent, joint.child, at, turn)
+
+
+def _limited(joint: Joint) -> Joint:
+    """The joint with limits of its position, which a continuous one does not have; its velocity
+    need not be limited either.
+    """
+    if joint.kind != "continuous":
+        return joint
+    velocity = math.inf if math.isnan(joint.velocity) else joint.velocity
+    return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD, velocity=velocity)
+
+
+def _lack(joint: Joint) -> str:
+    """Why a joint of the chain cannot be moved; empty where it can."""
+    is_continuous, unit = joint.kind == "continuous", "m" if joint.kind == "prismatic" else "rad"
+    if not any(joint.axis):
+        return "has the axis 0 0 0; a direction needed"
+    if not is_continuous and not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
+        given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
+        return f"{given}; lower below upper, within {FARTHEST:g} {unit}, needed in its <limit>"
+    if not 0.0 < joint.velocity <= FARTHEST and not (is_continuous and joint.velocity == math.inf):
+        given = f"has the velocity {_or_none(joint.velocity)}"
+        return f"{given}; above 0, up to {FARTHEST:g} {unit}/s, needed in its <limit>"
+    return ""
+
+
+def _or_none(number: float) -> str:
+    return "none" if math.isnan(number) else f"{number:g}"
+
+
+def _joint(element: Element) -> Joint:
+    name, kind = element.get("name", ""), element.get("type", "")
+    origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
+    try:
+        x, y, z = three(element.find("axis"), "xyz", "1 0 0")
+        norm = math.hypot(x, y, z) or 1.0  # a joint without an axis cannot move: `movable` refuses it
+        return Joint(
+            name,
+            kind,
+            _link(element, "parent"),
+            _link(element, "child"),
+            three(origin, "xyz", "0 0 0"),
+            _turn(origin),
+            (x / norm, y / norm, z / norm),
+            _limit(limit, "lower"),
+            _limit(limit, "upper"),
+            _limit(limit, "velocity"),
+            "" if mimic is None else mimic.get("joint", "another joint"),
+        )
+    except ValueError as error:
+        raise ValueError(f"joint {name!r}: {error}") from None
+
+
+def _limit(limit: Element | None, which: str) -> float:
+    """A limit as given, which only the joints before the plate need; NaN where it is no number."""
+    try:
+        return math.nan if limit is None else float(limit.get(which, "nan"))
+    except ValueError:
+        return math.nan
+
+
+COVER = "covered_by"  # an attribute of a mesh, which is ours: others do not look at it
+SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+COUNTS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}  # of the numbers in these
+FARTHEST = 1000.0  # [rad], [rad/s] limits of a joint
+MAX_SHAPES = 500  # an arm with a hand has 30
+
+
+def _shape(link: str, element: Element) -> Shape:
+    geometry, origin = element.find("geometry"), element.find("origin")
+    if geometry is None or not len(geometry):
+        raise ValueError(f"a collision of link {link!r} without geometry")
+    kind, given = geometry[0].tag, geometry[0]
+    try:
+        if kind == "mesh":
+            size = numbers(given, COVER, "")
+        elif kind in SIZES:
+            size = tuple(number for name in SIZES[kind] for number in numbers(given, name, ""))
+            if len(size) != COUNTS[kind] or not all(number > 0.0 for number in size):
+                raise ValueError(f"<{kind}> has no size; {' and '.join(SIZES[kind])} above 0 needed")
+        else:
+            raise ValueError(f"<{kind}> is no shape; {', '.join(SIZES)} and mesh accepted")
+        return Shape(link, kind, size, three(origin, "xyz", "0 0 0"), _turn(origin))
+    except ValueError as error:
+        raise ValueError(f"the collision of link {link!r}: {error}") from None
+
+
+def _turn(origin: Element | None) -> Quaternion:
+    roll, pitch, yaw = three(origin, "rpy", "0 0 0")
+    return multiply(about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll)))
+
+
+def _link(element: Element, which: str) -> str:
+    found = element.find(which)
+    return "" if found is None else found.get("link", "")
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The rotation b followed by the rotation a; x y z w."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotated(turn: Quaternion, vector: Sequence[float]) -> Vector3:
+    """A vector, rotated by a quaternion of norm 1."""
+    x, y, z, w = turn
+    product = multiply(multiply(turn, (vector[0], vector[1], vector[2], 0.0)), (-x, -y, -z, w))
+    return product[:3]
+
+
+def about(axis: Sequence[float], angle: float) -> Quaternion:
+    """The rotation by `angle` [rad] about a unit axis; x y z w."""
+    half = math.sin(angle / 2)
+    return (axis[0] * half, axis[1] * half, axis[2] * half, math.cos(angle / 2))

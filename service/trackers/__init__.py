@@ -1,0 +1,1 @@
+"""The hands' side: demonstrations captured from live trackers."""

@@ -1,0 +1,189 @@
+"""Damaged files: whatever byte is wrong is noticed, damage is told from a cut, and what follows it
+is read.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.opcode import Opcode
+
+from service.cli.view import convert
+from service.contract.cdr import encode_pose
+from service.contract.channels import POSE
+from service.contract.messages import PoseStamped
+from service.core.frame import encode
+from service.files.demonstration_reader import iter_hands, read_demonstration, write_demonstration
+from service.files.mcap_file import McapFile, RecordingError
+from service.files.recording import Recorder, Recording
+from service.files.steps import Step
+from service.learning.demonstration import Demonstration
+from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
+
+COUNT = 600
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A recording of 600 ticks in a dozen chunks."""
+    path = tmp_path_factory.mktemp("whole") / "a.mcap"
+    write(path, COUNT)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def frames(whole: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[int, bytes]:
+    """Its frames, by their ticks."""
+    _, steps = read(tmp_path_factory.mktemp("frames") / "a.mcap", whole)
+    return {step.tick: encode(step.frame) for step in steps if step.frame is not None}
+
+
+def records(data: bytes) -> list[tuple[int, int, int]]:
+    """Opcode, first byte and end of every record."""
+    found, at = [], 8
+    while at < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        found.append((opcode, at, at + 9 + length))
+        at += 9 + length
+    return found
+
+
+def chunks(data: bytes) -> list[tuple[int, int]]:
+    return [(start, end) for opcode, start, end in records(data) if opcode == Opcode.CHUNK]
+
+
+def flipped(data: bytes, at: int, mask: int = 0xFF) -> bytes:
+    out = bytearray(data)
+    out[at] ^= mask
+    return bytes(out)
+
+
+def read(path: Path, data: bytes) -> tuple[Recording, list[Step]]:
+    path.write_bytes(data)
+    recording = Recording.open(path)
+    return recording, list(recording.steps())
+
+
+@pytest.mark.parametrize("at", [0, 1, 3, 8, 17, 28, 34, 40, 70])
+@pytest.mark.parametrize("which", [0, 5, -1])
+def test_what_follows_a_damaged_chunk_is_read(
+    tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int
+) -> None:
+    """Wherever in a chunk, its head included: at most its ticks are missing, and that is said."""
+    recording, steps = read(tmp_path / "a.mcap", flipped(whole, chunks(whole)[which][0] + at, 0x11))
+    assert not recording.truncated
+    assert len(recording.faults) >= 1
+    assert all("damage at byte" in str(fault) for fault in recording.faults)
+    kept = [step.tick for step in steps if step.frame is not None]
+    assert all(encode(step.frame) == frames[step.tick] for step in steps if step.frame is not None)
+    missing = sorted(set(range(COUNT)) - set(kept))
+    assert missing == (list(range(missing[0], missing[-1] + 1)) if missing else [])
+    assert missing or at in (1, 17, 28)  # what is wrong there, only the checksum over all data knows
+    assert len(missing) <= 60
+    if missing and missing[-1] < COUNT - 1:
+        (behind,) = (step for step in steps if step.damage)
+        assert behind.tick == missing[-1] + 1
+
+
+def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
+    random = np.random.default_rng(3)
+    refused: list[str] = []
+    starts = [start for _, start, _ in records(whole)]
+    for at in [*random.integers(8, len(whole), 40).tolist(), *(start + 3 for start in starts[:60:4]), len(whole) - 4]:
+        try:
+            recording, steps = read(tmp_path / "a.mcap", flipped(whole, at, 0x10))
+        except RecordingError as error:
+            refused.append(str(error))
+            continue
+        assert recording.faults, f"byte {at}"
+        assert not recording.truncated, f"byte {at}"
+        assert len(steps) > COUNT * 0.8
+    assert refused
+    assert all("lacks settings, skill or arm" in error for error in refused)
+
+
+def test_damage_and_a_cut_are_told_apart_also_in_one_file(tmp_path: Path, whole: bytes) -> None:
+    third, tenth = chunks(whole)[3], chunks(whole)[10]
+    cut = flipped(whole, third[0] + 100)[: (tenth[0] + tenth[1]) // 2]
+    recording, steps = read(tmp_path / "a.mcap", cut)
+    assert [fault.cut for fault in recording.faults] == [False, True]
+    assert recording.truncated
+    assert str(recording.faults[1]).startswith(f"cut at byte {tenth[0]}: the end is missing")
+    assert len([step for step in steps if step.damage]) == 1
+    between_records, _ = read(tmp_path / "a.mcap", whole[: tenth[0]])
+    assert [str(fault) for fault in between_records.faults] == [
+        f"cut at byte {tenth[0]}: the end is missing (the file ends before the recording does)"
+    ]
+
+
+def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes) -> None:
+    (tmp_path / "a.mcap").write_bytes(flipped(whole, whole.index(b"skill.npz") + 300))
+    with pytest.raises(RecordingError, match=r"lacks settings, skill or arm.*an attachment's checksum is wrong"):
+        Recording.open(tmp_path / "a.mcap")
+
+
+def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_demonstration(
+        path, Demonstration(np.arange(3000) * 10_000_000, *np.random.default_rng(1).random((3, 3000, 7)))
+    )
+    start, end = chunks(path.read_bytes())[0]
+    path.write_bytes(flipped(path.read_bytes(), (start + end) // 2))
+    with pytest.raises(RecordingError, match=r"damage at byte .* no poses can be read; nothing is learned"):
+        read_demonstration(path)
+    with pytest.raises(RecordingError, match="is damaged"):
+        list(iter_hands(path))
+
+
+def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp_path: Path) -> None:
+    path, said, total = tmp_path / "a.mcap", list[str](), 300
+    file = McapFile(path, joints=0)
+    for i in range(total):
+        for key in ("x/hands/left", "x/hands/right", "x/tool/pose"):
+            pose = PoseStamped(i * 10_000_000, "base", (0.001 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            file.put(key, POSE.type, encode_pose(pose), i * 10_000_000, i)
+        if i % 50 == 49:
+            file.flush()
+    file.close()
+    assert len(read_demonstration(path, say=said.append).stamps_ns) == total
+    assert said == []
+    path.write_bytes(path.read_bytes()[: chunks(path.read_bytes())[3][0] + 100])
+    assert len(read_demonstration(path, say=said.append).stamps_ns) == 150
+    (line,) = said
+    assert "cut at byte" in line
+    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose are there")
+
+
+@pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])
+def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path: Path, whole: bytes, kind: str) -> None:
+    path, said = tmp_path / "a.mcap", list[str]()
+    start, end = chunks(whole)[5]
+    if kind == "lost":
+        with Recorder(path, settings=CELL, skill=SKILL) as recorder:
+            for tick, frame, timing in ticks(40):
+                if not 10 <= tick.index < 15:
+                    lost = 5 * (tick.index == 15)
+                    recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, lost=lost)
+    else:
+        path.write_bytes(flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2])
+    shown = convert(path, tmp_path / "a.rrd", say=said.append)
+    recording = Recording.open(path)
+    steps = [step for step in recording.steps() if step.frame is not None]
+    assert shown == len(steps) > 0
+    assert said[-1] == f"{shown} ticks are there and shown"
+    gaps = [step for step in steps if step.lost or step.damage]
+    assert len(said) == len(gaps) + 1 + (kind == "cut")
+    expected = {
+        "damaged": f"before tick {gaps[0].tick if gaps else ''}: damage at byte {start}",
+        "cut": f"cut at byte {start}: the end is missing",
+        "lost": "gap after tick 9, before tick 15: 5 ticks not recorded",
+    }[kind]
+    assert expected in said[0]
+    if kind != "lost":  # the same words; nothing here replays, for its frames are made up
+        faults = [str(fault) for fault in recording.faults]
+        assert all(any(fault in line for line in said) for fault in faults)
+    logged = [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"] if row.get("TextLog:text")]
+    assert set(said[:-1]) <= set(logged)

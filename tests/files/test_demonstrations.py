@@ -1,0 +1,150 @@
+"""Demonstrations and hands read from MCAP files, ours and other recorders': found by their topics'
+ends, brought to common stamps.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from service.contract import cdr, channels, messages
+from service.contract.ros2msg import schema
+from service.files.demonstration_reader import iter_hands, read_demonstration, write_demonstration
+from service.files.mcap_file import RecordingError
+from service.learning.demonstration import Demonstration
+from support.recorded import START_NS, at_ns, write
+
+
+def _swaying(count: int) -> np.ndarray:
+    """Poses (3, T, 7) of hands and tool that move and turn as people do, 100 a second."""
+    random, t = np.random.default_rng(1), 0.01 * np.arange(count)
+    phases = random.uniform(0.0, 6.0, (3, 6, 1))
+    waves = np.sin(3.0 * t + phases)
+    turns = Rotation.from_rotvec((0.3 * waves[:, 3:]).transpose(0, 2, 1).reshape(-1, 3)).as_quat()
+    return np.concatenate([0.2 * waves[:, :3].transpose(0, 2, 1), turns.reshape(3, count, 4)], axis=2)
+
+
+def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path: Path) -> None:
+    stamps = START_NS + np.arange(200) * 10_000_000
+    poses = _swaying(200)
+    write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses), cell="north/3")
+    write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, *poses), cell="north/3")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    got = read_demonstration(tmp_path / "a.mcap")
+    assert got.frame == "base"
+    for a, b in zip(got[:4], (stamps, *poses), strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert not a.flags.writeable
+
+
+def test_a_gripper_comes_back_with_its_demonstration_at_the_tools_stamps(tmp_path: Path) -> None:
+    stamps = START_NS + np.arange(50) * 10_000_000
+    poses, closure = _swaying(50), np.linspace(0.0, 1.0, 50)
+    write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses, gripper=closure))
+    np.testing.assert_array_equal(read_demonstration(tmp_path / "a.mcap").gripper, closure)
+    with pytest.raises(ValueError, match=r"gripper/state: shape \(7,\) given"):
+        write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, *poses, gripper=closure[:7]))
+
+
+def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, frame: str = "base") -> None:
+    """Writes poses as any ROS 2 recorder would: each topic at its own stamps."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type).encode())
+        other = writer.register_channel("/chatter", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(other, 0, b"{}", 0)
+        for topic, (stamps, poses) in streams.items():
+            channel = writer.register_channel(topic, "cdr", pose)
+            for stamp, row in zip(stamps.tolist(), poses.tolist(), strict=True):
+                frame_id = frame if "hands" in topic else "base"
+                writer.add_message(
+                    channel,
+                    stamp + 5,
+                    cdr.encode_pose(messages.PoseStamped(stamp, frame_id, tuple(row[:3]), tuple(row[3:]))),
+                    stamp,
+                )
+        writer.finish()
+
+
+def _line(stamps: np.ndarray, slope: float) -> np.ndarray:
+    poses = np.zeros((len(stamps), 7))
+    poses[:, 0], poses[:, 6] = slope * stamps / 1e9, np.where(np.arange(len(stamps)) % 2, -1.0, 1.0)
+    return poses
+
+
+def test_streams_with_stamps_of_their_own_are_brought_to_those_of_the_tool(tmp_path: Path) -> None:
+    left, right, tool = (
+        np.arange(0, 1000, 7) * 1_000_000,
+        np.arange(30, 900, 11) * 1_000_000,
+        np.arange(0, 1000, 5) * 1_000_000,
+    )
+    _streams(
+        tmp_path / "a.mcap",
+        {
+            "/x/hands/left": (left, _line(left, 1)),
+            "/x/hands/right": (right, _line(right, 2)),
+            "/x/tool/pose": (tool, _line(tool, 3)),
+        },
+    )
+    got = read_demonstration(tmp_path / "a.mcap")
+    assert (got.stamps_ns[0], got.stamps_ns[-1]) == (30_000_000, 895_000_000)
+    for poses, slope in zip(got[1:4], (1, 2, 3), strict=True):
+        np.testing.assert_allclose(poses[:, 0], slope * got.stamps_ns / 1e9, atol=1e-12)
+        np.testing.assert_allclose(np.abs(poses[:, 6]), 1.0, atol=1e-12)
+
+
+def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
+    stamps = np.arange(5) * 1_000_000
+    good = (stamps, _line(stamps, 1))
+    _streams(tmp_path / "a.mcap", {"/x/tool/pose": good})
+    with pytest.raises(RecordingError, match=r"no topic ending in hands/left .* its topics: /chatter, /x/tool/pose"):
+        read_demonstration(tmp_path / "a.mcap")
+    _streams(tmp_path / "a.mcap", {"/x/hands/left": good, "/y/hands/left": good})
+    with pytest.raises(RecordingError, match=r"two streams of hands/left: /x/hands/left and /y/hands/left"):
+        read_demonstration(tmp_path / "a.mcap")
+    all_three = {"/x/hands/left": good, "/x/hands/right": good, "/x/tool/pose": good}
+    _streams(tmp_path / "a.mcap", all_three, frame="tracker")
+    with pytest.raises(RecordingError, match=r"hands/left is in frame 'tracker': 'base' needed, or"):
+        read_demonstration(tmp_path / "a.mcap")
+    late = (stamps + 10**12, good[1])
+    _streams(tmp_path / "a.mcap", all_three | {"/x/tool/pose": late})
+    with pytest.raises(RecordingError, match="by which clocks"):
+        read_demonstration(tmp_path / "a.mcap")
+    still = (stamps * 0, good[1])
+    _streams(tmp_path / "a.mcap", all_three | {"/x/tool/pose": still})
+    with pytest.raises(RecordingError, match="5 poses on tool/pose with 1 different stamps, 2 needed"):
+        read_demonstration(tmp_path / "a.mcap")
+    with pytest.raises(ValueError, match=r"hands/right: shape \(4, 7\) given"):
+        write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, good[1], good[1][:4], good[1]))
+
+
+def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap", 60)
+    wanted = [
+        (at_ns(tick.index), event.kind[6:], event.payload)
+        for tick, *_ in told
+        for event in tick.inbox
+        if event.kind[:5] == "hands"
+    ]
+    assert list(iter_hands(tmp_path / "a.mcap")) == wanted
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[:-1])
+    assert sorted(iter_hands(tmp_path / "cut.mcap")) == wanted
+    stamps = np.arange(5) * 1_000_000
+    good = (stamps, _line(stamps, 1))
+    _streams(tmp_path / "b.mcap", {"/t/hands/right": good, "/t/hands/left": (stamps + 1, good[1])})
+    hands = sorted(iter_hands(tmp_path / "b.mcap"), key=lambda sample: sample[0])
+    assert [(time, side) for time, side, _ in hands[:4]] == [
+        (5, "right"),
+        (6, "left"),
+        (1_000_005, "right"),
+        (1_000_006, "left"),
+    ]
+    _streams(tmp_path / "c.mcap", {"/t/tool/pose": good})
+    with pytest.raises(RecordingError, match=r"c.mcap has no topic ending in hands/left or hands/right"):
+        list(iter_hands(tmp_path / "c.mcap"))

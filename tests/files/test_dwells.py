@@ -1,0 +1,102 @@
+"""What a take tells of places that it never reached, of rests elsewhere, and of hands not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.contract.requests import ViaPoint
+from service.files.demonstration_files import Summary, summary, table
+from service.files.demonstration_reader import write_demonstration
+from service.files.dwells import dwells, remarks_on_places
+from service.learning.demonstration import Demonstration
+from sim.scene import Scene
+from sim.teach import demonstrations
+
+SCENE = Scene()
+START = ViaPoint("start", SCENE.left_start, SCENE.right_start, SCENE.robot_start)
+
+
+@pytest.fixture(scope="module")
+def taken() -> Demonstration:
+    """A demonstration of the scene, with its places named."""
+    return demonstrations(SCENE, count=1, seed=1)[0]._replace(places=(START, *SCENE.via_points()))
+
+
+def listed(taken: Demonstration, path: Path) -> Summary:
+    """The take as `thirdhand record` shows it."""
+    write_demonstration(path, taken)
+    return summary(path)
+
+
+def test_a_take_at_all_its_places_is_not_remarked_on(taken: Demonstration, tmp_path: Path) -> None:
+    assert listed(taken, tmp_path / "a.mcap").remarks == ()
+
+
+def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
+    taken: Demonstration, tmp_path: Path
+) -> None:
+    vise = msgspec.structs.replace(taken.places[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none")
+    found = listed(taken._replace(places=(*taken.places, vise)), tmp_path / "a.mcap")
+    least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
+    (remark,) = found.remarks
+    assert remark == (
+        f"place 'vise' was never reached: the tool came no nearer to it than {1000 * least:.0f} mm (100 needed)"
+    )
+    assert remark in table(found)
+
+
+def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstration) -> None:
+    middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))  # on the way to the glass, as fast as it goes
+    period_ns = round(1e9 * taken.period_s)
+    lasts = round(0.8 / taken.period_s)
+    rows = np.concatenate([np.arange(middle), np.full(lasts, middle), np.arange(middle, len(taken.stamps_ns))])
+    rested = taken._replace(
+        stamps_ns=taken.stamps_ns[0] + period_ns * np.arange(len(rows)),
+        **{side: getattr(taken, side)[rows] for side in ("left", "right", "tool")},
+    )
+    begin_s, end_s = middle * taken.period_s, (middle + lasts) * taken.period_s
+    assert any(abs(a - begin_s) < 0.2 and abs(b - end_s) < 0.2 for a, b in dwells(rested))
+    assert remarks_on_places(taken) == []
+    (remark,) = remarks_on_places(rested)
+    assert remark.startswith("hands and tool rest from ")
+    assert remark.endswith("is this a place that is not named?")
+    (first, _) = remarks_on_places(rested._replace(places=rested.places[1:]))
+    assert first.startswith("hands and tool rest from 0.0 to ")  # as its start has no name
+    assert remarks_on_places(rested._replace(places=())) == []  # who names none is not asked for one
+
+
+def test_a_rate_is_counted_only_while_the_hand_is_seen(taken: Demonstration, tmp_path: Path) -> None:
+    away = slice(200, 500)  # three of some ten seconds
+    seen = taken._replace(
+        stamps_ns=np.delete(taken.stamps_ns, away),
+        **{side: np.delete(getattr(taken, side), away, axis=0) for side in ("left", "right", "tool")},
+    )
+    for stream in listed(seen, tmp_path / "a.mcap").streams:
+        assert stream.rate_hz == pytest.approx(1 / taken.period_s, rel=0.02)
+        assert stream.gap_s == pytest.approx(3.0, abs=0.05)
+
+
+def test_what_is_left_out_is_no_rest(taken: Demonstration) -> None:
+    """Hands and tool that come back to where they were, after nobody saw them."""
+    seen = np.r_[0:3, 60 : len(taken.stamps_ns)]
+    same = {side: getattr(taken, side)[seen] for side in ("left", "right", "tool")}
+    for side in same:
+        same[side] = np.concatenate([same[side][:3], same[side][:1].repeat(3, axis=0), same[side][3:]])
+    stamps_ns = np.concatenate([taken.stamps_ns[:3], taken.stamps_ns[57:]])
+    one = taken._replace(stamps_ns=stamps_ns, **same)
+    assert any(begin_s < 0.1 for begin_s, _ in dwells(one))
+    assert not any(begin_s < 0.1 for begin_s, _ in dwells(one._replace(begins=(3,))))
+
+
+@pytest.mark.parametrize("end", ["begins", "ends"])
+def test_a_take_that_begins_or_ends_in_motion_is_warned_of(end: str, taken: Demonstration, tmp_path: Path) -> None:
+    at = int(np.argmax(np.linalg.norm(np.gradient(taken.right[:, :3], axis=0), axis=1)))
+    rows = slice(at, None) if end == "begins" else slice(None, at)
+    cut = Demonstration._make(part[rows] if isinstance(part, np.ndarray) else part for part in taken)
+    (remark,) = [line for line in listed(cut, tmp_path / "a.mcap").remarks if "in motion" in line]
+    assert remark.startswith(f"it {end} in motion: ")
+    assert "right 0." in remark

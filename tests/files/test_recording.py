@@ -1,0 +1,277 @@
+"""Recordings: what was written comes back bit for bit, cut files are read up to the cut, other ROS
+2 tools read all of it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from service.contract import cdr, channels
+from service.contract.channels import EVENT_NUMBERS
+from service.contract.ros2msg import schema
+from service.core.frame import Event, Tick, blank, definitions, encode
+from service.files.demonstration_reader import write_demonstration
+from service.files.mcap_file import McapFile, RecordingError
+from service.files.recording import Recorder, Recording
+from service.files.shipped import cell_of
+from service.files.urdf_markers import with_markers
+from service.learning.demonstration import Demonstration
+from service.settings.config import robot_description
+from service.settings.urdf import Urdf
+from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
+from support.wam import FRAME
+
+
+def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap")
+    recording = Recording.open(tmp_path / "a.mcap")
+    first, *steps = recording.steps()
+    assert (recording.settings, recording.skill, recording.truncated) == (CELL, SKILL, False)
+    assert first.frame is None
+    assert encode(first.state) == encode(state_after(-1))
+    assert len(steps) == len(told)
+    for step, (tick, frame, timing) in zip(steps, told, strict=True):
+        assert step.tick == tick.index
+        assert step.events == tuple((event.kind, event.payload) for event in tick.inbox)
+        assert encode(step.frame) == encode(frame)
+        assert encode(step.timing) == encode(timing)
+        assert (step.state is None) == (tick.index % 100 != 99)
+        assert (step.time_ns, step.lost, step.skill) == (at_ns(tick.index), 0, None)
+    assert {kind for step in steps for kind, _ in step.events} == set(EVENT_NUMBERS)
+    assert list(recording.notes("status"))[:2] == [("status", "tick 0", at_ns(0)), ("status", "tick 50", at_ns(50))]
+
+
+def test_a_recording_names_the_machine_it_was_made_on(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 1)
+    metadata = Recording.open(tmp_path / "a.mcap").metadata
+    assert metadata["numpy"] == np.__version__
+    assert all(metadata[name] for name in ("python", "cpu", "blas", "cell"))
+
+
+def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_and_skill(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
+        for tick, frame, _ in ticks(10):
+            recorder.write(tick, frame, time_ns=at_ns(tick.index))
+        for count, skill in ((4, b"other"), (2, b"other"), (1, SKILL)):
+            (tick, frame, _), *_ = ticks(1, first=20 + count)
+            recorder.write(
+                tick, frame, time_ns=at_ns(tick.index), state=state_after(tick.index), skill=skill, lost=count
+            )
+    steps = list(Recording.open(tmp_path / "a.mcap").steps())
+    assert [(step.tick, step.lost, step.skill) for step in steps[10:]] == [
+        (24, 4, b"other"),
+        (22, 2, None),
+        (21, 1, SKILL),
+    ]
+    assert all(step.state is not None for step in steps[10:])
+
+
+def test_a_skill_adopted_in_a_tick_is_not_written_again_after_a_gap(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
+        recorder.write(Tick(0, (Event("skill", b"new", None),)), blank(FRAME), time_ns=0)
+        recorder.write(Tick(5), blank(FRAME), time_ns=10, state=state_after(5), skill=b"new", lost=4)
+    assert [step.skill for step in Recording.open(tmp_path / "a.mcap").steps()] == [None, None]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_a_cut_recording_is_read_up_to_the_cut_and_says_so(tmp_path: Path, share: float) -> None:
+    told = write(tmp_path / "a.mcap", 600)
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * share)])
+    recording = Recording.open(tmp_path / "cut.mcap")
+    assert recording.truncated
+    steps = list(recording.steps())[1:]
+    assert share * 600 * 0.5 < len(steps) < 600
+    assert all(encode(step.frame) == encode(frame) for step, (_, frame, _) in zip(steps, told, strict=False))
+
+
+def test_what_was_flushed_survives_when_nothing_is_closed(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL)
+    for tick, frame, _ in ticks(40):
+        recorder.write(tick, frame, time_ns=at_ns(tick.index))
+    recorder.flush()
+    assert [step.tick for step in Recording.open(tmp_path / "a.mcap").steps()] == list(range(40))
+    recorder.close()
+    recorder.close()
+
+
+def test_a_recording_of_nothing_but_a_state_opens(tmp_path: Path) -> None:
+    Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL, state=state_after(41)).close()
+    (step,) = Recording.open(tmp_path / "a.mcap").steps()
+    assert (step.tick, step.events, step.frame) == (41, (), None)
+
+
+def test_errors_name_the_file_what_is_wrong_and_what_there_is(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=re.escape(f"no recording {tmp_path}/a.mcap.")):
+        Recording.open(tmp_path / "a.mcap")
+    write_demonstration(tmp_path / "demo.mcap", Demonstration(np.arange(3) * 10, *np.ones((3, 3, 7))))
+    (tmp_path / "notes.mcap").write_text("not an MCAP file at all", encoding="utf-8")
+    with pytest.raises(RecordingError, match=r"There are: demo.mcap, notes.mcap\."):
+        Recording.open(tmp_path / "a.mcap")
+    with pytest.raises(RecordingError, match=r"notes.mcap is not an MCAP file"):
+        Recording.open(tmp_path / "notes.mcap")
+    with pytest.raises(RecordingError, match="not a recording of thirdhand"):
+        Recording.open(tmp_path / "demo.mcap")
+    write(tmp_path / "b.mcap", 1)
+    (tmp_path / "b.mcap").write_bytes((tmp_path / "b.mcap").read_bytes()[:600])
+    with pytest.raises(RecordingError, match="cut before its first message"):
+        Recording.open(tmp_path / "b.mcap")
+
+
+def test_a_note_may_not_pose_as_what_a_replay_needs(tmp_path: Path) -> None:
+    with (
+        Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder,
+        pytest.raises(ValueError, match="'frame'"),
+    ):
+        recorder.note("frame", "x", 0)
+
+
+def test_an_event_of_a_kind_that_nobody_knows_is_refused_with_its_tick(tmp_path: Path) -> None:
+    file = McapFile(tmp_path / "a.mcap", joints=7)
+    with Recorder(tmp_path / "b.mcap", settings=CELL, skill=SKILL) as recorder:
+        recorder.close()
+    recording = Recording.open(tmp_path / "b.mcap")
+    file.put("hall/bench-1/tick", channels.TICK.type, cdr.encode_tick(3, b"\xff", 0), 0, 0)
+    file.put("hall/bench-1/frame", channels.FRAME.type, encode(blank(FRAME)), 0, 0)
+    file.close()
+    recording.path = tmp_path / "a.mcap"
+    with pytest.raises(RecordingError, match="after tick 3: a Tick with an event of kind 255"):
+        list(recording.steps())
+
+
+def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap", 120)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        decoded = [
+            (channel.topic, message)
+            for _, channel, _, message in make_reader(
+                stream, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        ]
+    topics = {topic for topic, _ in decoded}
+    assert {"/tf", "/robot_description"} < topics
+    now_and_then = {"skill_in_force", "requests", "log", "objects", "gripper/command"}
+    always = [channel.key for channel in channels.CHANNELS if channel.recorded and channel.key not in now_and_then]
+    assert {channels.topic("hall/bench-1", key) for key in always} == topics
+    frames = [message for topic, message in decoded if topic == "/hall/bench-1/frame"]
+    assert list(frames[-1].joints) == told[-1][1]["joints"].tolist()
+    assert frames[-1].mode == 1
+    with warnings.catch_warnings(), AnyReader([tmp_path / "a.mcap"]) as reader:
+        read = [
+            (connection.topic, reader.deserialize(data, connection.msgtype))
+            for connection, _, data in reader.messages()
+        ]
+    assert len(read) == len(decoded)
+    assert (
+        next(message.position.tolist() for topic, message in reversed(read) if topic.endswith("joints/command"))
+        == told[-1][1]["joints"].tolist()
+    )
+
+
+def test_the_links_of_the_arm_and_what_matters_around_it_are_one_tree_of_frames(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 120)
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        connections = [connection for connection in reader.connections if connection.topic == "/tf"]
+        *_, (_, _, data) = reader.messages(connections)
+        message = reader.deserialize(data, "tf2_msgs/msg/TFMessage")
+    parents = {item.child_frame_id: item.header.frame_id for item in message.transforms}
+    assert {
+        "turret",
+        "forearm",
+        "tool_plate",
+        "tool",
+        "setpoint",
+        "target",
+        "left_hand",
+        "right_hand",
+    } <= parents.keys()
+
+    def root(frame: str) -> str:
+        return root(parents[frame]) if frame in parents else frame
+
+    assert {root(frame) for frame in parents} == {"base"}
+
+
+@pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
+def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
+    text = schema(kind, definitions(7))
+    told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
+    needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
+    assert needed == told
+
+
+def test_rerun_by_itself_draws_hands_and_target_as_balls_in_frames_that_move(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 120)
+    balls: dict[str, set[str]] = {}
+    frames: set[str] = set()
+    for chunk in rr.chunk.McapReader(tmp_path / "a.mcap").stream():
+        columns = chunk.to_record_batch().to_pydict()
+        for name in ("left_hand", "right_hand", "target", "setpoint"):
+            if f"/visual_geometries/{name}/" in chunk.entity_path:
+                told = [frame for found in columns.get("CoordinateFrame:frame", ()) for frame in found or ()]
+                balls.setdefault(name, set()).update(told)
+        for found in columns.get("Transform3D:child_frame", ()) if chunk.entity_path == "/tf" else ():
+            frames |= set(found or ())
+    assert balls.keys() == {"left_hand", "right_hand", "target", "setpoint"}
+    assert all(frame == {name} for name, frame in balls.items())
+    assert balls.keys() <= frames
+
+
+def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
+    text = '<robot name="a"><link name="base"/><link name="target"/></robot>'
+    assert with_markers(text) == text
+    assert with_markers("no robot") == "no robot"
+    for arm, root in (("wam", "base"), ("ur5", "base_link")):
+        assert Urdf(with_markers(robot_description(cell_of(arm)))).chain("left_hand")[0].parent == root
+
+
+def test_recordings_with_topics_as_earlier_versions_wrote_them_are_read(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap", 40)
+    with (tmp_path / "a.mcap").open("rb") as source, (tmp_path / "b.mcap").open("wb") as stream:
+        reader, writer = make_reader(source), Writer(stream)
+        writer.start(profile="ros2", library="thirdhand")
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        for found in reader.iter_attachments():
+            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+        known: dict[str, int] = {}
+        for about, channel, message in reader.iter_messages(log_time_order=False):
+            name = channel.topic if channel.topic in ("/tf", "/robot_description") else channel.topic[1:]
+            if name not in known:
+                number = writer.register_schema(about.name, about.encoding, about.data) if about else 0
+                known[name] = writer.register_channel(name, channel.message_encoding, number)
+            writer.add_message(known[name], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    steps = [step for step in Recording.open(tmp_path / "b.mcap").steps() if step.frame is not None]
+    assert [step.tick for step in steps] == [tick.index for tick, *_ in told]
+    assert "hall/bench-1/frame" in known
+
+
+def test_the_summary_of_every_file_tells_only_of_groups_that_are_there(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", 40)
+    poses = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (5, 1))
+    write_demonstration(tmp_path / "b.mcap", Demonstration(np.arange(5) * 10_000_000, poses, poses, poses))
+    for name in ("a.mcap", "b.mcap"):
+        data = (tmp_path / name).read_bytes()
+        start, at = struct.unpack_from("<QQ", data, len(data) - 28)
+        groups = []
+        while data[at] == Opcode.SUMMARY_OFFSET:
+            kind, first, length = struct.unpack_from("<BQQ", data, at + 9)
+            groups.append(kind)
+            assert length > 0
+            assert data[first] == kind
+            assert start <= first
+            at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        assert len(groups) == (6 if name == "a.mcap" else 4)

@@ -1,0 +1,197 @@
+"""Demonstrations read from what other recorders wrote: bags with poses in arrays, trees of frames
+and joint states, in a tracker's axes and unit, by clocks that differ.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from service.files.demonstration_reader import read_demonstration
+from service.files.mcap_file import RecordingError
+from service.files.pose_streams import PoseTopic
+from service.settings.config import HandSettings, Settings
+from support.paths import RECORDINGS
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STAMPS = np.arange(40) * 10_000_000 + 1_000_000_000
+WAY = np.linspace(0.0, 0.2, len(STAMPS))
+
+
+def made(kind: str, **fields: Any) -> Any:
+    return STORE.types[kind](**fields)
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    stamp = made("builtin_interfaces/msg/Time", sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))
+    return made("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def pose(x: float, y: float, z: float) -> Any:
+    at = made("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    turn = made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    return made("geometry_msgs/msg/Pose", position=at, orientation=turn)
+
+
+def stamped(stamp_ns: int, frame: str, *at: float) -> Any:
+    return made("geometry_msgs/msg/PoseStamped", header=header(stamp_ns, frame), pose=pose(*at))
+
+
+def array(stamp_ns: int, frame: str, *places: tuple[float, float, float]) -> Any:
+    return made("geometry_msgs/msg/PoseArray", header=header(stamp_ns, frame), poses=[pose(*at) for at in places])
+
+
+def tree(stamp_ns: int, frame: str, **places: tuple[float, float, float]) -> Any:
+    found = []
+    for child, at in places.items():
+        x, y, z = at
+        one = made(
+            "geometry_msgs/msg/Transform",
+            translation=made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=pose(*at).orientation,
+        )
+        found.append(
+            made(
+                "geometry_msgs/msg/TransformStamped",
+                header=header(stamp_ns, frame),
+                child_frame_id=child,
+                transform=one,
+            )
+        )
+    return made("tf2_msgs/msg/TFMessage", transforms=found)
+
+
+def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+    """A bag with one message of each topic at each of STAMPS, in the order of time."""
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, messages in topics.items():
+            connections[topic] = writer.add_connection(topic, messages[0].__msgtype__, typestore=STORE)
+        for i, stamp_ns in enumerate(STAMPS.tolist()):
+            for topic, messages in topics.items():
+                data = STORE.serialize_cdr(messages[i], messages[i].__msgtype__)
+                writer.write(connections[topic], stamp_ns + 1_000_000, data)
+    return path
+
+
+def moving(make: Any, *arguments: Any) -> list[Any]:
+    """A message for each of STAMPS, made of its stamp and how far the way has gone."""
+    return [make(stamp, *arguments, way) for stamp, way in zip(STAMPS.tolist(), WAY.tolist(), strict=True)]
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Path, plugin: StoragePlugin) -> None:
+    hands = moving(lambda stamp, way: array(stamp, "base", (way, 0.3, 0.0), (way, -0.3, 0.0)))
+    frames = moving(lambda stamp, way: tree(stamp, "base", elbow=(0.0, 0.0, 1.0), glass=(0.5, way, 0.2)))
+    folder = bag(tmp_path / "bag", {"/mocap/hands": hands, "/tf": frames}, plugin=plugin)
+    sources = {name: PoseTopic.parsed(text) for name, text in
+               (("left", "mocap/hands:1"), ("right", "/mocap/hands:0"), ("tool", "/tf:glass"))}  # fmt: skip
+    (file,) = [path for path in folder.iterdir() if path.suffix != ".yaml"]
+    for path in (folder, file):
+        got = read_demonstration(path, topics=sources)
+        np.testing.assert_array_equal(got.stamps_ns, STAMPS)
+        np.testing.assert_allclose(got.left[:, :2], np.column_stack([WAY, np.full(len(WAY), -0.3)]))
+        np.testing.assert_allclose(got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)]))
+    for given, words in (
+        ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
+        ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
+        (
+            {"left": PoseTopic("/nowhere")},
+            r"--left /nowhere: no topic there; its topics: .*of these hold poses: /mocap",
+        ),
+        ({}, r"no topic ending in hands/left .*; --left TOPIC\[:PART\] names another"),
+    ):
+        with pytest.raises(RecordingError, match=words):
+            read_demonstration(path, topics=given)
+
+
+def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:
+    """Of a motion capture in millimetres, y up, the arm's base 1 m before its origin."""
+    y_up = Rotation.from_euler("x", 90, degrees=True)
+    frames = moving(lambda stamp, way: tree(stamp, "mocap", LeftWrist=(way, 0.0, -300.0), RightWrist=(900.0, 1.0, 0.0)))
+    elbows = moving(lambda stamp, way: tree(stamp, "mocap", LeftElbow=(way, 0.0, 0.0)))
+    tool = moving(lambda stamp, way: stamped(stamp, "base", 0.5, way, 0.2))
+    path = bag(tmp_path / "bag", {"/tf": frames, "/tf_elbows": elbows, "/arm/tcp": tool})
+    hands = HandSettings(frame="mocap", unit="mm", base_from_tracker=(1.0, 0.0, 0.0, *y_up.as_quat().tolist()))
+    said: list[str] = []
+    got = read_demonstration(path, settings=Settings(hands=hands), say=said.append)
+    wanted = y_up.apply(np.column_stack([WAY, np.zeros(40), np.full(40, -300.0)])) / 1000 + [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(got.left[:, :3], wanted, atol=1e-12)
+    np.testing.assert_allclose(got.left[:, 3:], np.tile(y_up.as_quat(), (40, 1)), atol=1e-12)
+    np.testing.assert_allclose(got.tool[:, 1], WAY)
+    assert "left is /tf:LeftWrist; right is /tf:RightWrist; tool is /arm/tcp" in said[0]
+    assert "hands/left, hands/right brought to frame base" in said[0]
+    ours = {"/c/hands/left": moving(stamped, "base", 0.3, 0.0), "/c/hands/right": moving(stamped, "mocap", 300.0, 0.0)}
+    mixed = read_demonstration(bag(tmp_path / "mixed", {**ours, "/arm/tcp": tool}), settings=Settings(hands=hands))
+    np.testing.assert_allclose(mixed.left[:, 2], WAY)
+    np.testing.assert_allclose(mixed.right[:, 0], np.full(40, 1.3))
+    with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
+        read_demonstration(path)
+    other = msgspec.structs.replace(hands, frame="optitrack")
+    with pytest.raises(RecordingError, match=r"'mocap': 'base', or 'optitrack' as \[hands\] frame says, needed"):
+        read_demonstration(path, settings=Settings(hands=other))
+    with pytest.raises(RecordingError, match=r"tool.*; /arm/tcp, /hand/gripper could be it"):
+        read_demonstration(bag(tmp_path / "two", {"/tf": frames, "/arm/tcp": tool, "/hand/gripper": tool}))
+
+
+def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count(tmp_path: Path) -> None:
+    settings, begin_ns = Settings(), STAMPS[0]
+    joints = np.array(settings.arm.posture) + np.outer(WAY, np.ones(7))
+
+    def state(stamp: int, way: float) -> Any:
+        i = int(np.argmin(np.abs(WAY - way)))
+        return made(
+            "sensor_msgs/msg/JointState",
+            header=header(stamp - begin_ns, ""),  # the arm's clock began with it
+            name=list(settings.joints.names[::-1]),
+            position=joints[i, ::-1].copy(),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+
+    topics = {
+        "/cell/hands/left": moving(stamped, "", 0.3, 0.0),
+        "/cell/hands/right": moving(stamped, "", -0.3, 0.0),
+        "/joint_states": moving(state),
+    }
+    said: list[str] = []
+    got = read_demonstration(bag(tmp_path / "bag", topics), say=said.append)
+    assert "tool found from /joint_states by the arm's URDF" in said[0]
+    assert "stamps are of different clocks" in said[1]
+    assert "tool/pose by -1.001 s" in said[1]
+    np.testing.assert_array_equal(got.stamps_ns, STAMPS + 1_000_000)
+    np.testing.assert_allclose(got.left[:, 2], WAY)
+    assert np.ptp(got.tool[:, :3], axis=0).max() > 0.05
+    assert np.abs(got.tool[0, :3] - [0.45, 0.0, 0.3]).max() < 0.5
+    foreign = [dataclasses.replace(one, name=["a", *one.name[1:]]) for one in topics["/joint_states"]]
+    with pytest.raises(RecordingError, match=r"no topic ending in tool/pose .* or joints/state of the arm's joints"):
+        read_demonstration(bag(tmp_path / "foreign", {**topics, "/joint_states": foreign}))
+
+
+def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.db3").write_bytes(b"nothing")
+    for path in (tmp_path, tmp_path / "a.db3", tmp_path / "b.bag"):
+        with pytest.raises(RecordingError, match=r"is not a bag that can be read: "):
+            read_demonstration(path)
+
+
+def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None:
+    """The golden session: with a dropout, spoilt samples, and no `tool/pose`."""
+    said: list[str] = []
+    got = read_demonstration(RECORDINGS / "golden.mcap", say=said.append)
+    assert re.search(
+        r"tool found from .*joints/state by the arm's URDF; \d+ of \d+ poses are none, or farther", said[0]
+    )
+    assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in said)
+    assert got.seconds[got.begins[0]] - got.seconds[got.begins[0] - 1] == pytest.approx(0.51)
+    assert len(got.stamps_ns) > 1800
+    assert np.abs(got.tool[:, :3]).max() < 1.0

@@ -1,0 +1,268 @@
+"""Replay: the golden session and what was recorded are decided alike, bit for bit, from any state
+and with any number of BLAS threads.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.contract.records import Mode, Reason
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick
+from service.core.skill.skill import Skill
+from service.files.mcap_file import RecordingError
+from service.files.recording import Recorder, Recording
+from service.files.replay import replay, ticks
+from service.learning.via_points import adapted
+from sim.closed_loop import joints_event
+from sim.golden import ENCODED, ENCODED_SPEED, refresh
+from sim.scene import Scene
+from sim.script import HandScript
+from support.cell import told
+from support.in_process import ASSUMED, ticks_of
+from support.paths import RECORDINGS
+from support.wam import URDF
+
+GOLDEN = RECORDINGS / "golden.mcap"
+
+
+def command(*arguments: str, timeout_s: float = 110, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "service", "replay", *arguments],
+        capture_output=True, text=True, timeout=timeout_s, check=False,
+        env=os.environ | environment, cwd=RECORDINGS.parent,
+    )  # fmt: skip
+
+
+def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked_for() -> None:
+    done = command(str(GOLDEN), OPENBLAS_NUM_THREADS="2", OMP_NUM_THREADS="2", MKL_NUM_THREADS="2")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
+
+
+@pytest.mark.timeout(500)  # it compiles all anew
+def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units() -> None:
+    done = command(str(GOLDEN), "--exact", NUMBA_CPU_NAME="generic", timeout_s=480)
+    assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
+    native = command(str(GOLDEN), "--exact")
+    assert done.stdout.splitlines()[-1] == native.stdout.splitlines()[-1]
+
+
+def test_the_golden_session_replays_from_a_state_in_its_middle(golden: Path) -> None:
+    result = replay(golden, after=6000)
+    assert result.within_tolerance
+    assert 3000 < result.ticks < 5000
+
+
+def test_the_golden_session_holds_what_it_is_meant_to(golden: Path) -> None:
+    seen = np.array([step.frame for step in Recording.open(golden).steps() if step.frame is not None])
+    reasons = {Reason(r) for r in np.unique(seen["reason"])}
+    assert {Reason.NONE, Reason.STALE_HAND, Reason.OPERATOR, Reason.FAR_FROM_DEMONSTRATIONS} <= reasons
+    assert (seen["mode"] != Mode.FAULT).all()
+    assert (seen["rejected"][-1] > 0).sum() >= 4
+    assert (np.diff(seen["tick"]) > 1).any()
+    assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 5e6
+
+
+def packed_bytes(folder: Path) -> int:
+    """The size of a git history with the folder as it is now, once it is packed."""
+    as_somebody = ["-c", "user.name=a", "-c", "user.email=b"]
+    for one in (["add", "."], [*as_somebody, "commit", "--quiet", "--message", "c"], ["gc", "--quiet"]):
+        subprocess.run(["git", *one], cwd=folder, check=True, timeout=60)
+    return sum(path.stat().st_size for path in folder.glob(".git/objects/pack/*"))
+
+
+def test_another_golden_session_adds_little_to_a_history(tmp_path: Path) -> None:
+    """With other joint states, and other frames at every tick."""
+    subprocess.run(["git", "init", "--quiet", "."], cwd=tmp_path, check=True, timeout=60)
+    path = tmp_path / "golden.mcap"
+    shutil.copy(GOLDEN, path)
+    before, old, noise = packed_bytes(tmp_path), Recording.open(GOLDEN), np.random.default_rng(0)
+    start, *steps = old.steps(whole=False)
+
+    def moved(event: Event) -> Event:
+        if event.kind != "joints/state":
+            return event
+        position = event.value.position + ENCODED * noise.integers(-16, 16, 7)
+        velocity = event.value.velocity + ENCODED_SPEED * noise.integers(-16, 16, 7)
+        return joints_event(event.value.names, tuple(position), tuple(velocity), event.value.stamp_ns)
+
+    checksums = noise.integers(0, 1 << 32, len(old.checksums), dtype="<u4").tobytes()
+    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state, checksums=checksums) as recorder:
+        for tick, step in zip(ticks(old), steps, strict=True):
+            if step.frame is not None:
+                step.frame["joints"] += noise.standard_normal(7)
+            other = Tick(tick.index, tuple(moved(event) for event in tick.inbox))
+            recorder.write(other, step.frame, time_ns=step.time_ns)
+    assert len(Recording.open(path).checksums) == len(old.checksums) > 10_000
+    added = packed_bytes(tmp_path) - before
+
+    assert 40_000 < added < 200_000
+
+
+@pytest.fixture(scope="module")
+def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short session, with states, recorded in process."""
+    path = tmp_path_factory.mktemp("recorded") / "short.mcap"
+    taught = adapted(skill, Scene().via_points(), tolerance=0.05)
+    controller = Controller(ASSUMED, taught, urdf=URDF)
+    with Recorder(path, settings=ASSUMED, skill=taught.file, state=controller.state) as recorder:
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            recorder.write(
+                tick, frame, time_ns=tick.index * 2_000_000, state=controller.state if tick.index % 250 == 0 else None
+            )
+
+        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:1000], [keep])
+    return path
+
+
+def test_what_was_recorded_replays_identically(recorded: Path) -> None:
+    result = replay(recorded)
+    assert result.exact
+    assert result.text() == "1000 ticks, 1000 frames identical"
+
+
+def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:
+    recording = Recording.open(recorded)
+    steps = list(recording.steps())
+    path = tmp_path / "changed.mcap"
+    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
+        for tick, step in zip(list(ticks_of(HandScript(Scene(), seed=4)))[:1000], steps[1:], strict=True):
+            frame = step.frame.copy()
+            if step.tick == 600:
+                frame["joints"][2] += 1e-9
+            recorder.write(tick, frame, time_ns=step.tick * 2_000_000)
+    result = replay(path)
+    assert not result.exact
+    assert result.within_tolerance
+    assert "first difference at tick 600: joints by 1e-09" in result.text()
+    assert told("replay", str(path)).returncode == 0
+    exact = told("replay", str(path), "--exact")
+    assert exact.returncode == 1
+    assert "first difference at tick 600" in exact.stdout
+
+
+def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Path) -> None:
+    recording = Recording.open(recorded)
+    steps = list(recording.steps())
+    taken = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
+    path = tmp_path / "gap.mcap"
+    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
+        for tick, step in zip(taken, steps[1:], strict=True):
+            if not 400 <= tick.index < 500:
+                recorder.write(
+                    tick,
+                    step.frame,
+                    time_ns=step.tick * 2_000_000,
+                    state=step.state,
+                    lost=100 if tick.index == 500 else 0,
+                )
+    result = replay(path)
+    assert not result.exact
+    assert result.within_tolerance
+    assert len(result.missing) == 1
+    assert result.ticks == result.identical == 899
+    assert "gap after tick 399, before tick 500: 100 ticks not recorded; goes on after tick 500" in result.text()
+
+
+def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: Path) -> None:
+    data = bytearray(recorded.read_bytes())
+    path = tmp_path / "damaged.mcap"
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    result = replay(path)
+    assert len(result.missing) == 1
+    assert not result.truncated
+    assert result.identical == result.ticks > 500
+    (gap,) = result.missing
+    assert gap.resumed in (250, 500, 750, 1000)
+    assert f"gap after tick {gap.after}, before tick {gap.before}: damage at byte" in result.text()
+    exact = told("replay", str(path), "--exact")
+    assert (exact.returncode, "checksum" in exact.stdout or "damage" in exact.stdout) == (1, True)
+
+
+def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
+    data = recorded.read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[: len(data) * 2 // 3])
+    result = replay(path)
+    assert result.truncated
+    assert not result.exact
+    assert result.within_tolerance
+    assert "cut at byte" in result.text()
+    assert f"the last tick read is {result.ticks - 1}" in result.text()
+
+
+def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "again.mcap"
+    path.write_bytes(recorded.read_bytes())
+    assert refresh(path) == {}
+    assert replay(path).exact
+    assert refresh(path) == {}
+
+
+@pytest.fixture
+def checked(recorded: Path, tmp_path: Path) -> Path:
+    """The short session, as the golden one is kept."""
+    path = tmp_path / "checked.mcap"
+    path.write_bytes(recorded.read_bytes())
+    refresh(path)
+    return path
+
+
+def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
+    recorded: Path, checked: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "whole.mcap"
+    done = told("replay", str(checked), "--exact", "--output", str(output))
+    assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
+    assert replay(output).exact
+    kept, whole, were = (
+        [step.frame for step in Recording.open(path).steps(whole=False)][1:] for path in (checked, output, recorded)
+    )
+    assert [frame.tobytes() for frame in whole] == [frame.tobytes() for frame in were]
+    assert [tick for tick, frame in enumerate(kept) if frame is not None] == [0, 500]
+    same = told("replay", str(output), "--output", str(output))
+    assert (same.returncode, "nor itself" in same.stderr) == (1, True)
+    assert replay(output).exact
+
+
+def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(checked: Path, tmp_path: Path) -> None:
+    recording = Recording.open(checked)
+    steps, path = list(recording.steps(whole=False)), tmp_path / "changed.mcap"
+    table = np.array([*recording.checksums.values()], "<u4")
+    table[601] ^= 1
+    with Recorder(
+        path, settings=recording.settings, skill=recording.skill, state=steps[0].state, checksums=table.tobytes()
+    ) as recorder:
+        for tick, step in zip(ticks(recording), steps[1:], strict=True):
+            recorder.write(tick, step.frame, time_ns=step.time_ns)
+    result = replay(path)
+    assert (result.ticks, result.identical, result.exact) == (1000, 999, False)
+    assert "first difference at tick 601: its checksum\nlargest differences: none in a frame" in result.text()
+
+
+def test_what_is_decided_behind_a_gap_is_not_written_as_if_there_were_none(recorded: Path, tmp_path: Path) -> None:
+    data = bytearray(recorded.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"whole\.mcap cannot be written: gap after tick \d+"):
+        replay(damaged, output=tmp_path / "whole.mcap")
+
+
+def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
+    done = told("replay", str(RECORDINGS / "demonstration-1.mcap"))
+    assert done.returncode == 1
+    assert "not a recording of thirdhand" in done.stderr
+    done = told("replay", str(tmp_path / "missing.mcap"))
+    assert done.returncode == 1
+    assert "missing.mcap" in done.stderr

@@ -1,0 +1,162 @@
+"""How much each constant by which takes are judged matters: it is halved and doubled, over takes
+that are spoilt in every kind, and over takes that are clean.
+
+Beside each constant stand the shares that were measured so, with recorded hands among the takes: of
+bad samples that were missed, and of clean samples that were removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from service.files import track_check, track_offsets
+from service.files.demonstration_reader import read_demonstration
+from service.files.track import Track
+from service.learning.demonstration import Demonstration
+from service.settings.config import Settings
+from sim.scene import Scene
+from sim.teach import demonstrate
+from support import spoiled
+from support.circling import circling
+from support.paths import RECORDINGS
+from support.spoiled import Spoil, Streams, streams_of
+
+NAMES = ("left", "right", "tool")
+OFF_M = 0.005  # what is farther than this from the truth is bad
+SEEDS = 2
+CHECK = ("MAX_HAND_MPS2",)
+OFFSETS = ("HALF_WINDOW", "STEP_M", "UNUSUAL", "USUAL_PERCENTILE", "USUAL_S", "ALIKE", "BESIDE", "LONGEST_S")
+AROUND = {"USUAL_PERCENTILE": (60, 90), "HALF_WINDOW": (2, 8)}
+INTAKE = "_intake_verdicts"  # what takes longest, and is the same whatever these constants are
+SETTINGS = Settings()
+
+
+class Shares(NamedTuple):
+    """Of bad samples those that were missed, and of clean samples those that were removed."""
+
+    missed: float
+    removed: float
+
+
+def tracked(take: Demonstration, noise_m: float, seed: int) -> Demonstration:
+    """The take with a tracker's white noise on hands and tool."""
+    random = np.random.default_rng(seed)
+    noise = [np.pad(noise_m * random.normal(size=(len(take.tool), 3)), ((0, 0), (0, 4))) for _ in NAMES]
+    left, right, tool = (getattr(take, name) + one for name, one in zip(NAMES, noise, strict=True))
+    return take._replace(left=left, right=right, tool=tool)
+
+
+def clean_takes() -> list[Demonstration]:
+    """Takes at 25 to 240 Hz: of hands that circle, by a script, and of modelled people."""
+    made = [tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed) for seed, hz in ((1, 30), (2, 240))]
+    shipped = [f"demonstration-{i}" for i in (1,)] + [f"people/demonstration-{i}" for i in (3, 6, 9)]
+    return [
+        circling(1, apart_m=0.03),
+        *made,
+        *(tracked(read_demonstration(RECORDINGS / f"{name}.mcap"), 3e-4, 7) for name in shipped),
+    ]
+
+
+def checked(streams: Streams) -> Iterator[tuple[str, np.ndarray]]:
+    """Each stream, and which of its samples (N,) are retained."""
+    tracks = [
+        track_check.sound(Track(spoiled.KEYS[name], name, *streams[name], "base"))  # type: ignore[arg-type]
+        for name in NAMES
+    ]
+    for group in (tracks[:2], tracks[2:]):
+        for track, found in zip(group, track_check.checked(group, SETTINGS, longest_s=0.5), strict=True):
+            yield track.source, np.isin(track.stamps_ns, found.track.stamps_ns)
+
+
+def spoilt(take: Demonstration, spoil: Spoil, seed: int) -> tuple[Streams, str]:
+    random = np.random.default_rng(seed)
+    lasts_s = random.uniform(0.7, min(4.0, 0.4 * take.seconds[-1]))
+    begin_s = random.uniform(0.2, take.seconds[-1] - lasts_s - 0.2)
+    mask = (take.seconds >= begin_s) & (take.seconds < begin_s + lasts_s)
+    name = NAMES[random.integers(2 if spoil is spoiled.swap else 3)]
+    streams = streams_of(take)
+    spoil(streams, name, mask, random)
+    return streams, name
+
+
+def is_bad(take: Demonstration, streams: Streams, name: str) -> np.ndarray:
+    stream, base = streams[name], spoiled.START_NS + take.stamps_ns - take.stamps_ns[0]
+    truth = getattr(take, name)[np.searchsorted(base, stream.stamps_ns), :3]
+    return ~(np.linalg.norm(stream.poses[:, :3] - truth, axis=1) <= OFF_M) | ~np.isfinite(stream.poses).all(axis=1)
+
+
+Case = tuple[Demonstration, Streams]
+
+
+def shares(cases: list[Case], clean: list[Demonstration]) -> Shares:
+    missed = bad = removed = good = 0
+    for take, streams in cases:
+        for name, retained in checked(streams):
+            wrong = is_bad(take, streams, name)
+            missed, bad = missed + int((wrong & retained).sum()), bad + int(wrong.sum())
+    for take in clean:
+        for _, retained in checked(streams_of(take)):
+            removed, good = removed + int((~retained).sum()), good + len(retained)
+    return Shares(missed / max(bad, 1), removed / good)
+
+
+@pytest.fixture(scope="module")
+def clean() -> list[Demonstration]:
+    return clean_takes()
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 240])
+def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
+    take = tracked(demonstrate(Scene(), seed=3, rate_hz=rate_hz), 5e-4, rate_hz)
+    assert all(retained.all() for _, retained in checked(streams_of(take)))
+    found = []
+    for seed in range(20):
+        streams, name = spoilt(take, spoiled.slight_jump, seed)
+        retained = dict(checked(streams))
+        wrong = is_bad(take, streams, name)
+        found.append(not retained[name][wrong].any())
+        assert not found[-1] or all(retained[one][~is_bad(take, streams, one)].all() for one in NAMES)
+    assert np.mean(found) >= 0.9
+
+
+@pytest.mark.timeout(600)
+def test_each_constant_matters_and_none_is_better_halved_or_doubled(
+    clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cases = [
+        (take, spoilt(take, spoil, 100 * number + seed)[0])
+        for spoil in (*spoiled.SPOILS, *spoiled.SUBTLE)
+        for number, take in enumerate(clean)
+        for seed in range(SEEDS)
+    ]
+    whole, known = getattr(track_check, INTAKE), {}
+
+    def remembered(tracks: list[Track], settings: Settings) -> object:
+        key = tuple((track.stamps_ns.tobytes(), track.poses.tobytes()) for track in tracks)
+        if key not in known:
+            known[key] = whole(tracks, settings)
+        return known[key]
+
+    monkeypatch.setattr(track_check, INTAKE, remembered)
+    now = shares(cases, clean)
+    lines, idle, better = [f"as it is: {now}"], [], []
+    for module, names in ((track_check, CHECK), (track_offsets, OFFSETS)):
+        for name in names:
+            value = getattr(module, name)
+            others = []
+            for other in AROUND.get(name, (0.5 * value, 2.0 * value)):
+                with monkeypatch.context() as patch:
+                    patch.setattr(module, name, other)
+                    others.append(shares(cases, clean))
+                lines.append(f"{module.__name__}.{name} = {other:g}: {others[-1]}")
+            if all(np.abs(np.subtract(one, now)).max() < 2e-4 for one in others):
+                idle.append(name)
+            better += [name for one in others if one.removed <= now.removed and one.missed < now.missed - 0.01]
+    print("\n".join(lines))
+    assert (idle, better) == ([], [])
+    assert now.missed < 0.02
+    assert now.removed == 0.0

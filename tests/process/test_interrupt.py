@@ -1,0 +1,174 @@
+"""Ctrl-C at many moments of real processes: one line, exit 130, no traceback, nothing left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from support.paths import RECORDINGS, ROOT
+
+SAID = "thirdhand: interrupted"
+DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts
+OTHERS = ("demo", "replay", "learn", "status", "play")
+GOLDEN = str(RECORDINGS / "golden.mcap")
+DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in range(1, 6)]
+CLEAN_UP_SLOWLY = """
+import time
+from service.process import interrupt
+interrupt.watch()
+with interrupt.clean_up_first():
+    try:
+        print("begun", flush=True)
+        time.sleep(60)
+    finally:
+        print("putting away", flush=True)
+        time.sleep(60)
+"""
+
+
+def wait_for(what: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def nobody() -> Iterator[str]:
+    """An endpoint that takes connections in and never says a word: who connects there waits."""
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
+    """A command that runs and looks after interrupts: by a thread of its own, its second."""
+    with said.open("wb") as errors:
+        command = [sys.executable, "-m", "service", *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, cwd=ROOT)
+    wait_for(lambda: process.poll() is not None or len(os.listdir(f"/proc/{process.pid}/task")) > 1)
+    return process
+
+
+INTERRUPTED_AT_AN_IMPORT = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "MODULE":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from service.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "module", ["service.process.interrupt", "contextlib", "service.cli", "service.client", "service.cli.status"]
+)
+def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: str) -> None:
+    """At imports from the first line of the program on; Python's own come before that."""
+    code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace("MODULE", module)
+    command = [sys.executable, "-S", "-c", code, "status", "--connect", "tcp/127.0.0.1:1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT)
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (130, -signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("name", "delay_s"),
+    [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],
+)
+def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
+    (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
+    arguments = {
+        "serve": ["--config", str(tmp_path / "cell.toml"), "--connect", nobody],
+        "demo": ["--output", str(tmp_path / "demo")],
+        "replay": [GOLDEN],
+        "learn": [*DEMONSTRATIONS, "--output", str(tmp_path / "skill.npz")],
+        "status": ["--connect", nobody],
+        "play": [GOLDEN, "--connect", nobody],
+    }[name]
+    said = tmp_path / "said"
+    process = begun([name, *arguments], said)
+    time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
+    text = said.read_text()
+    assert text.splitlines()[-1] == SAID
+    assert text.count(SAID) == 1
+    assert "Traceback" not in text
+
+
+def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
+    said, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
+    wait_for(lambda: "choosing parameters" in said.read_text())
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
+    assert said.read_text().splitlines()[-1] == SAID
+    assert not skill.exists()
+
+
+def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
+    said, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
+    wait_for(skill.exists)
+    while process.poll() is None:  # also while the interpreter takes itself down
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.001)
+    assert process.returncode in (0, 130)
+    assert "Traceback" not in said.read_text()
+
+
+def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
+    said = tmp_path / "said"
+    process = begun(["demo", "--output", str(tmp_path / "demo")], said)
+    wait_for(lambda: "service at" in said.read_text(), 100)
+
+    def services() -> list[bytes]:
+        lines = subprocess.run(["ps", "-ewwo", "args"], capture_output=True, check=True).stdout.splitlines()
+        return [line for line in lines if str(tmp_path).encode() in line and b"defunct" not in line]
+
+    assert len(services()) == 2  # the demo and its daemon
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130
+    assert services() == []
+    assert said.read_text().splitlines()[-1] == SAID
+    assert "Traceback" not in said.read_text()
+
+
+def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLEAN_UP_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "putting away\n"
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=10)
+    assert (process.returncode, said) == (130, f"{SAID}\n")
+
+
+def test_an_interrupt_that_is_ignored_stays_so() -> None:
+    """As a shell starts what runs in its background."""
+    code = (
+        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom service.process import interrupt\n"
+        "interrupt.watch()\nsignal.raise_signal(signal.SIGINT)\nprint('goes on')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30, check=True
+    )
+    assert done.stdout == "goes on\n"

@@ -1,0 +1,167 @@
+"""A recording as a data set of LeRobot: what its loader reads, read back by its rules."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from service.cli.main import main
+from service.contract import cdr
+from service.core.controller import Controller, run
+from service.core.frame import Tick
+from service.files.recording import Recorder, Recording
+from service.files.replay import ticks
+from service.learning.skill_file import StoredSkill
+from sim.scene import Scene
+from sim.script import HandScript
+from support.in_process import ASSUMED, resting, ticks_of
+from support.wam import JOINT_NAMES, URDF
+
+FIRST = "chunk-000/file-000.parquet"
+LOST = range(3000, 3100)
+
+
+@pytest.fixture(scope="module")
+def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten seconds of the golden session, in which 0.2 s are missing."""
+    path, old = tmp_path_factory.mktemp("gapped") / "gapped.mcap", Recording.open(golden)
+    start, *steps = old.steps()
+    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
+        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 5000):
+            if tick.index not in LOST:
+                lost = len(LOST) * (tick.index == LOST.stop)
+                recorder.write(tick, step.frame, time_ns=step.time_ns, lost=lost)
+    return path
+
+
+@pytest.fixture(scope="module")
+def data_set(gapped: Path, golden: Path) -> Path:
+    folder = gapped.parent / "data"
+    files = [str(gapped), str(golden)]
+    assert main(["report", *files, "--lerobot", str(folder), "--fps", "30", "--task", "Hold the board."]) == 0
+    return folder
+
+
+def test_rows_are_what_was_seen_and_commanded_at_their_times(data_set: Path, golden: Path) -> None:
+    table = parquet.read_table(data_set / "data" / FIRST)
+    episode = table["episode_index"].to_numpy()
+    last = table.filter(episode == 2).to_pydict()
+    steps = [step for step in Recording.open(golden).steps() if step.frame is not None]
+    ready = [step for step in steps if step.frame["commanded"] and (step.frame["hand_ages"] >= 0).all()]
+    told, frames = None, {}
+    for step in steps:
+        for kind, payload in step.events:
+            told = cdr.decode_joints(payload).position if kind == "joints/state" else told
+        frames[step.tick] = (told, step.frame["hands"].ravel(), step.frame["joints"])
+    assert len(last["index"]) == (steps[-1].tick - ready[0].tick) * 30 // 500 + 1 > 590
+    for row in (0, 1, 7, 200, 400, len(last["index"]) - 1):
+        newest = max(step.tick for step in ready if (step.tick - ready[0].tick) / 500 <= row / 30 + 1e-9)
+        names = ("observation.state", "observation.environment_state", "action")
+        for name, value in zip(names, frames[newest], strict=True):
+            np.testing.assert_array_equal(last[name][row], np.float32(value))
+    np.testing.assert_array_equal(last["timestamp"], (np.arange(len(last["index"])) / 30).astype(np.float32))
+
+
+def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
+    table, about = (parquet.read_table(data_set / part / FIRST) for part in ("data", "meta/episodes"))
+    assert table["index"].to_pylist() == list(range(len(table)))
+    assert set(table["task_index"].to_pylist()) == {0}
+    rows = about.to_pylist()
+    assert [one["episode_index"] for one in rows] == [0, 1, 2]
+    assert [one["dataset_from_index"] for one in rows[1:]] == [one["dataset_to_index"] for one in rows[:-1]]
+    assert 170 < rows[0]["length"] < 180  # from when both hands had been seen
+    for one in rows:
+        part = table.slice(one["dataset_from_index"], one["length"])
+        assert set(part["episode_index"].to_pylist()) == {one["episode_index"]}
+        assert part["frame_index"].to_pylist() == list(range(one["length"]))
+        assert one["tasks"] == ["Hold the board."]
+        assert {one[f"{of}/{kind}_index"] for of in ("data", "meta/episodes") for kind in ("chunk", "file")} == {0}
+        assert one["stats/action/count"] == [one["length"]]
+    assert parquet.ParquetFile(data_set / "data" / FIRST).num_row_groups == 3
+
+
+def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
+    info, stats = (json.loads((data_set / "meta" / f"{name}.json").read_text()) for name in ("info", "stats"))
+    table = parquet.read_table(data_set / "data" / FIRST)
+    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 30, "wam")
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (3, len(table), {"train": "0:3"})
+    assert (data_set / info["data_path"].format(chunk_index=0, file_index=0)).is_file()
+    assert [*info["features"]] == [*stats] == table.column_names
+    for name, feature in info["features"].items():
+        values = np.array(table[name].to_pylist())
+        assert "/" not in name
+        assert feature["shape"] == ([values.shape[1]] if values.ndim == 2 else [1])
+        stored = table.schema.field(name).type
+        assert {"float": "float32"}.get(str(getattr(stored, "value_type", stored)), "int64") == feature["dtype"]
+        np.testing.assert_allclose(stats[name]["mean"], np.atleast_1d(values.mean(0)), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(stats[name]["q90"], np.atleast_1d(np.quantile(values, 0.9, axis=0)), rtol=1e-5)
+        assert all(len(stats[name][kind]) == feature["shape"][0] for kind in ("min", "max", "std", "q01", "q99"))
+    assert info["features"]["action"]["names"] == list(JOINT_NAMES)
+    tasks = parquet.read_table(data_set / "meta" / "tasks.parquet")
+    assert tasks.to_pylist() == [{"task_index": 0, "task": "Hold the board."}]
+    assert tasks.schema.pandas_metadata["index_columns"] == ["task"]
+
+
+def test_lerobot_itself_loads_it(data_set: Path) -> None:
+    loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot brings PyTorch: not installed")
+    found = loader.LeRobotDataset("local/thirdhand", root=data_set, delta_timestamps={"action": [0.0, 1 / 30]})
+    assert (found.num_episodes, found.fps) == (3, 30)
+    item = found[found.meta.episodes["dataset_to_index"][0]]
+    assert item["task"] == "Hold the board."
+    assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (1, 0, (2, 7))
+
+
+def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
+    """A recording of an arm that tells nothing of its joints."""
+    controller = Controller(ASSUMED, skill, urdf=URDF)
+    with Recorder(path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf) as recorder:
+        run(controller, inputs, [lambda tick, frame: recorder.write(tick, frame, time_ns=tick.index * 2_000_000)])
+    return path
+
+
+def test_an_arm_that_tells_nothing_is_where_it_was_last_told_to_be(skill: StoredSkill, tmp_path: Path) -> None:
+    path = recorded(tmp_path / "a.mcap", skill, list(ticks_of(HandScript(Scene(), seed=4)))[:1500])
+    assert main(["report", str(path), "--lerobot", str(tmp_path / "data"), "--fps", "500"]) == 0
+    rows = parquet.read_table(tmp_path / "data" / "data" / FIRST).to_pydict()
+    assert rows["observation.state"][1:] == rows["action"][:-1]
+    assert np.ptp(rows["action"], axis=0).max() > 0.1
+    tasks = parquet.read_table(tmp_path / "data" / "meta" / "tasks.parquet").to_pydict()
+    assert tasks["task"] == [skill.name]
+
+
+def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
+    skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    followed = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    of_another = recorded(tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1))
+    alone = recorded(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
+    for files, why in (
+        ([followed, of_another], "one arm is needed"),
+        ([alone], "nothing was commanded after both hands had been seen"),
+    ):
+        assert main(["report", *map(str, files), "--lerobot", str(tmp_path / "data")]) == 1
+        assert why in capsys.readouterr().err
+        assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
+        (["--lerobot", "."], 2, "--lerobot . is there already, a new folder needed"),
+        (["--lerobot", "{}", "--fps", "0"], 2, "--fps"),
+    ],
+)
+def test_what_makes_no_data_set_is_said(
+    options: list[str], code: int, says: str, gapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "data"
+    try:
+        done = main(["report", str(gapped), *(one.format(folder) for one in options)])
+    except SystemExit as end:
+        done = int(str(end.code))
+    assert (done, says in capsys.readouterr().err, folder.exists()) == (code, True, False)

@@ -1,0 +1,385 @@
+"""What a recording tells: modes and reasons over the time, what led to holds and faults, places,
+limits, promptness; against sessions of which that is known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.cli.main import main
+from service.contract.records import Flag, Mode, Reason
+from service.contract.requests import Percentiles, Status, ViaPoint, encode_json
+from service.core.controller import Controller
+from service.core.frame import STAGES, Event, Tick, order, timed
+from service.core.skill.skill import Skill
+from service.daemon.input_monitor import InputMonitor
+from service.daemon.status import CellStatus
+from service.files.recording import Recorder, Recording
+from service.learning.skill_file import decoded, with_file
+from service.learning.via_points import adapted
+from service.report.columns import read, runs
+from service.report.report import Report, Span, differing_settings, reported, why_missed
+from service.report.stages import LEAST_S
+from service.report.tables import tables, verdict
+from service.settings.config import Settings
+from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
+from support.in_process import LEFT, RIGHT, arm, hand
+from support.wam import URDF
+from support.wicked import wicked_skill
+
+SETTINGS = Settings()
+PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
+START_NS = 1_700_000_000_000_000_000
+FAULT_AT = 600  # ticks
+FIELDS: dict[str, Any] = {  # of a status, that the core knows nothing of
+    "rate_hz": 500.0,
+    "missed": 0,
+    "realtime": True,
+    "memory_locked": True,
+    "scribe": {},
+    "endpoints": (),
+    "version": "",
+    **dict.fromkeys(("lateness_us", "work_us", "latency_ms"), Percentiles()),
+}
+HERE = ViaPoint("here", LEFT, RIGHT, (0.5, 0.0, 0.35), std=0.001, radius=0.03)
+
+
+def stamp(tick: int) -> int:
+    return START_NS + tick * PERIOD_NS
+
+
+class Told:
+    """A session with resting hands and an arm that goes where it is told, until something happens
+    to it from tick `FAULT_AT` on; recorded as it goes, with a status ten times a second or without.
+    """
+
+    def __init__(
+        self, skill: Skill, path: Path, what: str = "", *, lost_at: int | None = None, statuses: bool = True
+    ) -> None:
+        self.what, self.joints = what, SETTINGS.arm.posture
+        self.said: list[Status] = []
+        controller, monitor = Controller(SETTINGS, skill, urdf=URDF), InputMonitor(SETTINGS)
+        with Recorder(path, settings=SETTINGS, skill=skill.file, state=controller.state) as recorder:
+            for k in range(1200):
+                tick = Tick(k, tuple(self.inbox(k)))
+                frame = controller.step(tick)
+                if frame["commanded"]:
+                    self.joints = tuple(frame["joints"].tolist())
+                if lost_at is not None and lost_at <= k < lost_at + 100:
+                    continue
+                lost = 100 if lost_at is not None and k == lost_at + 100 else 0
+                timing = timed(
+                    k, stamp(k), k // 300, 50.0 + k % 7, 200.0, 1500.0 if k % 5 == 0 else 0.0, (0.0,) * len(STAGES)
+                )
+                state = controller.state if lost else None
+                recorder.write(tick, frame, time_ns=stamp(k), timing=timing, state=state, lost=lost)
+                sources = monitor.update(controller, controller.state, k * PERIOD_S)
+                if statuses and k % 50 == 0:
+                    failure = "the request thread failed: out of paper" if what == "failed" else ""
+                    cell = CellStatus(frame, controller, controller.state, sources, SETTINGS, failure)
+                    self.said.append(cell.status(**FIELDS))
+                    recorder.note("status", encode_json(self.said[-1]).decode(), stamp(k))
+
+    def first(self, reason: str, *, after: int = 0) -> Status:
+        """The first status of a reason from a tick on."""
+        return next(one for one in self.said if one.reason == reason and one.tick >= after)
+
+    def inbox(self, k: int) -> Iterable[Event]:
+        late = k >= FAULT_AT
+        if k % 5 == 0 and not (late and self.what == "left alone"):
+            stamp_ns = k + 1 + (10**10 if k >= FAULT_AT - 20 and self.what == "stepped" else 0)
+            yield hand("left", LEFT, stamp_ns)
+            yield hand("right", RIGHT, stamp_ns)
+        if k % 2 == 0 and not (
+            (self.what in ("silent", "stepped") and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+        ):
+            q, dq = list(self.joints), [0.0] * 7
+            if late and self.what == "pushed":
+                q[3] += min(0.15, 0.003 * (k - FAULT_AT))
+            if late and self.what == "fast":
+                dq[0] = 5.0
+            yield arm(tuple(q), stamp(k), tuple(dq))
+        if late and self.what == "failed" and k == FAULT_AT:
+            yield order("fault", "the request thread failed: out of paper")
+        if k == 1000:
+            yield order("reset")
+
+
+@pytest.fixture(scope="module")
+def session(golden: Path) -> Report:
+    return reported(golden)
+
+
+@pytest.mark.parametrize(("far_ticks", "arrives"), [(0, True), (900, True), (None, False)])
+def test_the_initial_approach_of_the_tool_is_no_error_of_following(
+    golden: Path, far_ticks: int | None, arrives: bool
+) -> None:
+    columns = read(Recording.open(golden))
+    follows = np.flatnonzero(columns.frames["mode"] == Mode.FOLLOW)
+    before = Report(columns)
+    columns.frames["tool"][follows[:far_ticks]] += (0.473, 0.0, 0.0)
+    found = Report(columns)
+    stops = [span for span in found.spans if span.mode is not Mode.FOLLOW]
+    found.spans = tuple(span for span in found.spans if span not in stops)  # else a stop is the worst
+    prompt = next(one for one in tables(found) if one.title == "Promptness")
+    if far_ticks == 0:
+        assert found.initial_mm is None
+        assert found.lag_mm == before.lag_mm
+        assert "initial approach" not in verdict(found)
+        return
+    assert found.initial_mm is not None
+    (row,) = (row for row in prompt.rows if row[0] == "tool from its target, initial approach")
+    assert row[3] == f"{found.initial_mm.largest:.1f}"
+    assert found.initial_mm.largest > 400.0
+    if arrives:
+        assert found.initial_mm.samples == far_ticks
+        assert found.initial_s == pytest.approx(900 * columns.period_s)
+        assert found.lag_mm is not None
+        assert found.lag_mm.largest < 200.0
+        assert re.search(
+            r"the worst was \d+ mm from the tool to its target, after an initial approach of", verdict(found)
+        )
+    else:
+        assert found.lag_mm is None
+        assert "did not reach the target" in verdict(found)
+
+
+def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:
+    ends = [span.start_s + span.lasts_s for span in session.spans]
+    assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
+    assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SECONDS, abs=0.05)
+    held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
+    for reason, (begin_s, end_s) in {
+        Reason.STALE_HAND: (DROPOUT_S[0] + 0.25, DROPOUT_S[1]),  # so long the tool could do without that hand
+        Reason.OPERATOR: HOLD_S,
+        Reason.FAR_FROM_DEMONSTRATIONS: AWAY_S,
+    }.items():
+        assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
+        assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
+    # made in process, without a status: what the first frame of each holds
+    assert re.fullmatch(r"the left hand was last seen [23]\d\d ms ago", held[Reason.STALE_HAND].why)
+    asked = held[Reason.OPERATOR]
+    assert (asked.why, asked.remedy) == ("a hold was requested, or the daemon was stopped", "thirdhand resume")
+    far = re.fullmatch(
+        r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
+        held[Reason.FAR_FROM_DEMONSTRATIONS].why,
+    )
+    assert far is not None
+    assert float(far[1]) > 11.0
+    assert session.seconds(Mode.FOLLOW) + session.seconds(Mode.HOLD) == pytest.approx(session.lasts_s)
+    assert (session.faults, session.lacks) == ((), ())
+
+
+def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
+    frames = np.array([step.frame for step in Recording.open(session.path).steps() if step.frame is not None])
+    assert sum(one.samples for one in session.rejections) == int(frames[-1]["rejected"].sum())
+    assert all(BAD_S[0] <= one.first_s <= AWAY_S[1] + 0.1 for one in session.rejections)
+    for limit in session.limits:
+        raised = (frames["flags"] & Flag[limit.name.upper()]) > 0
+        assert limit.lasts_s == pytest.approx(raised.sum() * PERIOD_S)
+        assert limit.times == sum(1 for begin, _ in runs(raised) if raised[begin])
+    assert {limit.name for limit in session.limits} == {
+        str(flag.name).lower() for flag in Flag if (frames["flags"] & flag).any()
+    }
+    assert session.approach is not None
+    known = (frames["hand_ages"] >= 0).any(axis=1)
+    assert session.approach.distance_m == frames["hand_distance"][known].min()
+
+
+def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
+    by_name = [(place.name, place.start_s) for place in session.places]
+    assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
+    first, again = [place for place in session.places if place.name == "handover"]
+    assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
+    assert first.end_s == pytest.approx(again.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
+    assert first.best_m is not None
+    assert first.best_m < 0.02
+    assert (again.visits, again.best_m) == ((), None)
+    assert again.hands_m > 0.03
+
+
+def test_the_stages_of_a_task_are_told_in_their_order(session: Report) -> None:
+    assert session.stages[0].start_s < 0.5
+    assert [one.name for one in session.stages][:3] == ["start to handover", "handover to glass", "glass to soldering"]
+    for one, after in itertools.pairwise(session.stages):
+        assert one.name != after.name
+        assert one.start_s + one.lasts_s <= after.start_s + 1e-9
+    frames = session.columns.frames
+    for one in session.stages:
+        assert one.lasts_s > LEAST_S
+        at = int((one.start_s + one.lasts_s / 2) / PERIOD_S)
+        assert one.probable == pytest.approx(frames["stage_belief"][at], abs=0.5)
+
+
+def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:
+    """Hands that rest where it was taught, and a tool that goes there."""
+    Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
+    [place] = reported(tmp_path / "a.mcap").places
+    frames = np.array([step.frame for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None])
+    [visit] = place.visits
+    assert visit.nearest_m == pytest.approx(np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min())
+    assert visit.settled_m == pytest.approx(np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4)
+    assert place.hands_m < 1e-3
+
+
+@pytest.mark.parametrize("other", [(), RIGHT, (0.5, -1.4, 0.3)])
+def test_a_place_of_one_hand_is_met_by_it_wherever_the_other_is(
+    skill: Skill, tmp_path: Path, other: tuple[float, float, float] | tuple[()]
+) -> None:
+    alone = with_file(
+        replace(skill, conductor=0, via_points=(msgspec.structs.replace(HERE, right=LEFT, follow="right"),))
+    )
+    controller = Controller(SETTINGS, alone, urdf=URDF)
+    with Recorder(tmp_path / "a.mcap", settings=SETTINGS, skill=alone.file, state=controller.state) as recorder:
+        for k in range(300):
+            came = [hand("left", LEFT, k + 1), *([hand("right", other, k + 1)] if other else [])]
+            tick = Tick(k, tuple(came if k % 5 == 0 else ()))
+            recorder.write(tick, controller.step(tick), time_ns=stamp(k))
+    frames = np.array([step.frame for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None])
+    [place] = reported(tmp_path / "a.mcap").places
+    [visit] = place.visits
+    assert place.hands_m < 1e-3
+    assert visit.lasts_s == pytest.approx(len(frames) * PERIOD_S)
+    off = np.linalg.norm(frames["tool"] - HERE.tool - (frames["hands"][:, 0] - LEFT), axis=1)
+    assert visit.nearest_m == pytest.approx(off.min())
+
+
+@pytest.mark.parametrize("statuses", [True, False])
+@pytest.mark.parametrize(
+    ("what", "reason", "why", "about"),
+    [
+        ("silent", Reason.ARM_SILENT, "no joint states for 1", "the arm told nothing for 100 ms"),
+        ("pushed", Reason.ARM_ERROR, "now wam/elbow_pitch_joint is off by 0.1", "the arm was measured farther from"),
+        ("fast", Reason.TOOL_SPEED, " m/s, 1 accepted", "the tool was measured faster than [tool] fault_speed"),
+        ("failed", Reason.SERVICE, "the request thread failed: out of paper", "the request thread failed: out of"),
+    ],
+)
+def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_how_it_ended(
+    skill: Skill, tmp_path: Path, what: str, reason: Reason, why: str, about: str, statuses: bool
+) -> None:
+    session = Told(skill, tmp_path / "a.mcap", what, statuses=statuses)
+    found = reported(tmp_path / "a.mcap")
+    fault = found.faults[0]
+    assert fault.reason is reason
+    assert FAULT_AT * PERIOD_S <= fault.start_s <= FAULT_AT * PERIOD_S + 0.2
+    if statuses:
+        told = session.first(str(reason.name).lower())
+        assert (fault.why, fault.remedy) == (told.because, told.remedy)
+        assert why in fault.why
+    else:
+        assert fault.why.startswith(about)
+    assert re.search(rf"and {len(found.faults)} faults?; the worst was fault: \w+, for ", verdict(found))
+    assert any(line.startswith("before it: it followed for 1.") for line in fault.before)
+    assert fault.ended.startswith("ended by a `reset` after 0.")
+    missed = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
+    assert str(reason.name).lower() in missed
+    assert fault.why in missed
+
+
+def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path: Path) -> None:
+    Told(skill, tmp_path / "a.mcap", "stepped")
+    said = reported(tmp_path / "a.mcap").faults[0].before
+    words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
+    assert words in said
+
+
+def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
+    def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
+        found, at_s = [], 0.0
+        for lasts_s, mode, reason in parts:
+            found.append(Span(at_s, lasts_s, mode, reason))
+            at_s += lasts_s
+        return tuple(found)
+
+    hold, follow, fault = Mode.HOLD, Mode.FOLLOW, Mode.FAULT
+    waits, ends = (6.0, hold, Reason.NO_HANDS), [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
+    moves, stops = (4.0, follow, Reason.NONE), (1.0, hold, Reason.STALE_HAND)
+    said = {
+        "a bench": (waits, moves, *ends),
+        "a stop": (waits, moves, stops, moves, *ends),
+        "a fault at the end": (moves, (1.0, fault, Reason.SERVICE)),
+        "a hold before it": (moves, (0.1, hold, Reason.STALE_HAND), (1.0, fault, Reason.ARM_SILENT)),
+        "never": (waits,),
+        "on": (waits, moves),
+    }
+    found, one = {}, reported(golden)
+    for name, parts in said.items():
+        one.spans, one.lasts_s = spans(*parts), sum(part[0] for part in parts)
+        found[name] = verdict(one)
+    assert found["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
+    assert found["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
+    assert found["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
+    assert "with no holds and 1 fault; the worst was fault: service" in found["a fault at the end"]
+    assert "with 1 hold and 1 fault; the worst was fault: arm_silent" in found["a hold before it"]
+    assert "It ended with" not in found["a hold before it"]
+    assert "It followed 0 % of 6.0 s, with 1 hold and no faults; the worst was hold: no_hands" in found["never"]
+    assert "It followed 40 % of 10.0 s, from 6.0 s on, with no holds and no faults" in found["on"]
+
+
+def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: Path) -> None:
+    session = Told(skill, tmp_path / "a.mcap", "left alone")
+    first, *_, alone, last = reported(tmp_path / "a.mcap").spans
+    held = {Reason.ARM_NOT_READY: first, Reason.STALE_HAND: alone}
+    for reason, span in held.items():
+        assert span.reason is reason
+        assert (span.why, span.remedy) == (session.first(str(reason.name).lower()).because, span.remedy)
+    assert "hand was last seen" in alone.why
+    assert last.reason is Reason.ARM_NOT_READY
+    assert last.why == session.first("arm_not_ready", after=850).because
+    assert last.why.startswith("no joint states for ")
+
+
+def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_no_mode(
+    skill: Skill, tmp_path: Path
+) -> None:
+    Told(skill, tmp_path / "a.mcap", lost_at=700)
+    found = reported(tmp_path / "a.mcap")
+    assert found.missed == 3
+    assert found.latency_ms is not None
+    assert found.latency_ms[:3] == pytest.approx((1.5, 1.5, 1.5))
+    assert found.latency_ms.samples == 220
+    assert found.lateness_us is not None
+    assert found.lateness_us.largest == 56.0
+    assert len(found.lacks) == 1
+    assert "100 ticks not recorded" in found.lacks[0]
+    assert sum(span.lasts_s for span in found.spans) == pytest.approx(1100 * PERIOD_S)
+    assert found.lasts_s == pytest.approx(1200 * PERIOD_S)
+
+
+def test_two_recordings_differ_in_the_settings_that_do(session: Report, skill: Skill, tmp_path: Path) -> None:
+    Told(skill, tmp_path / "a.mcap")
+    names = {name for name, *_ in differing_settings(session, reported(tmp_path / "a.mcap"))}
+    assert not {name for name in names if not name.startswith("made with ")}
+
+
+def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Report) -> None:
+    told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
+    best_m = session.best_m("glass")
+    assert best_m is not None
+    assert told.startswith("with the hands where 'glass' was taught, the tool came only within")
+    assert told.endswith(f" {1000 * best_m:.0f} mm of it")
+    assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
+
+
+def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "$\\frac$ <b>\x1b[31m.mcap"
+    Told(decoded(wicked_skill(), origin="wicked"), path)
+    html_path = tmp_path / "page.html"
+    assert main(["report", str(path), "--html", str(html_path)]) == 0
+    shown, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
+    for text in (shown, page):
+        assert all(line.isprintable() for line in text.splitlines())
+    assert r"skill a\nb\x1b[31mred" in shown
+    assert "<b>" not in page
+    assert r"$\frac$ &lt;b&gt;\x1b[31m" in page

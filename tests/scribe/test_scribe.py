@@ -1,0 +1,358 @@
+"""The scribe: what the loop tells is recorded whatever happens to the process, and whatever happens
+to it the loop does not notice.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from service.core.frame import Event, Tick, encode
+from service.files.recording import Recording
+from service.process import child
+from service.process.child import Child, Progress
+from service.scribe.protocol import pack, unpack
+from service.scribe.scribe import Scribe
+from service.settings.config import Files, Settings
+from support.recorded import SKILL, at_ns, state_after, tell, ticks
+
+SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False))
+
+
+@contextmanager
+def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
+    """A started scribe that is ended in any case."""
+    one = Scribe(settings, **where)
+    try:
+        one.start(skill=SKILL, state=state_after(-1))
+        assert one.ready(60.0) == bool(where)
+        yield one
+    finally:
+        one.close(10)
+
+
+def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
+    """Returns once `done` holds."""
+    deadline = time.monotonic() + timeout_s
+    while not done():
+        assert time.monotonic() < deadline, "waited too long"
+
+
+@pytest.mark.parametrize("every", [{"state": None, "with_skill": False}, {"state": state_after(3), "with_skill": True}])
+def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
+    for tick, frame, timing in ticks(60):
+        skills = [event.payload for event in tick.inbox if event.kind == "skill"] + [SKILL] * every["with_skill"]
+        told = unpack(pack(tick, frame, timing, lost=7, **every), skills, joints=7)
+        assert told.tick == Tick(tick.index, tuple(Event(event.kind, event.payload, None) for event in tick.inbox))
+        assert (encode(told.frame), encode(told.timing), told.lost) == (encode(frame), encode(timing), 7)
+        assert (told.state is None) == (every["state"] is None)
+        assert told.skill == (SKILL if every["with_skill"] else None)
+
+
+def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
+    settings = Settings(cell="hall/bench-1", rate_hz=50)
+    with scribe(settings, folder=tmp_path) as one:
+        told = tell(one, 200)
+        one.note("requests", "via_points add handover", at_ns(20))
+        status = one.status()
+        assert (status["alive"], status["sent"], status["lost"], status["errors"]) == (True, 200, 0, [])
+        assert status["free_mb"] == pytest.approx(shutil.disk_usage(tmp_path).free / 1e6, rel=0.2)
+    recording = Recording.open(status["recording"])
+    first, *steps = recording.steps()
+    assert Path(status["recording"]).name.startswith("hall-bench-1-2")
+    assert (recording.settings, recording.skill, recording.truncated, first.tick) == (settings, SKILL, False, -1)
+    assert [step.events for step in steps] == [
+        tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in told
+    ]
+    assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in told]
+    assert [step.tick for step in steps if step.state is not None] == [49, 99, 149, 199]
+    assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
+    assert Path(status["rrd"]).stat().st_size > 20_000
+
+
+def test_a_cell_may_record_without_a_drawing(tmp_path: Path) -> None:
+    with scribe(folder=tmp_path) as one:
+        tell(one, 20)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mcap"]
+
+
+def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(tmp_path: Path) -> None:
+    with scribe(recording=tmp_path / "a.mcap") as one:
+        pid = one.status()["pid"]
+        os.kill(pid, signal.SIGSTOP)
+        durations = []
+        told = list(ticks(40))
+        for i in range(6000):
+            tick, frame, timing = told[i % 40]
+            began = time.perf_counter()
+            one.send(Tick(i, tick.inbox), frame, timing, state=lambda i=i: state_after(i), skill=b"another skill")
+            durations.append(time.perf_counter() - began)
+        lost = one.status()["lost"]
+        assert lost > 100
+        assert statistics.median(durations) < 5e-4
+        os.kill(pid, signal.SIGCONT)
+        index = 6000
+
+        def told_again() -> bool:
+            nonlocal index
+            lost = one.status()["lost"]
+            tell(one, 1, first=index, skill=b"another skill")
+            index += 1
+            return one.status()["lost"] == lost
+
+        until(told_again)
+        lost = one.status()["lost"]
+    _, *steps = Recording.open(tmp_path / "a.mcap").steps()
+    assert [(step.lost, step.skill) for step in steps if step.lost] == [(lost, b"another skill")]
+    assert next(step for step in steps if step.lost).state is not None
+    assert next(Recording.open(tmp_path / "a.mcap").notes("log"))[1].startswith(f"{lost} ticks before tick ")
+
+
+def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp_path: Path) -> None:
+    with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as one:
+        tell(one, 20)
+        killed = one.status()["pid"]
+        os.kill(killed, signal.SIGKILL)
+        until(lambda: not one.status()["alive"])
+        one.supervise()
+        tell(one, 35, first=20, skill=b"another skill")
+        assert one.ready(60)
+        status = one.status()
+        assert status["pid"] != killed
+        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)  # those not yet on disk
+        assert status["errors"] == ["the scribe ended with code -9"]
+    recording = Recording.open(tmp_path / "a-2.mcap")
+    steps = list(recording.steps())
+    assert recording.skill == b"another skill"
+    assert [step.tick for step in steps] == list(range(20, 55))
+    assert steps[0].lost == 20
+    assert encode(steps[0].state) == encode(state_after(20))
+
+
+def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> None:
+    """Also where the process that it is forked from has to import all again."""
+    for process in psutil.Process().children():
+        if "service.process.child" in process.cmdline():
+            process.kill()
+            process.wait(10)
+    one = Scribe(SETTINGS, folder=tmp_path)
+    began = time.perf_counter()
+    one.start(skill=SKILL, state=state_after(-1))
+    tell(one, 400)
+    assert time.perf_counter() - began < 0.5
+    assert not one.ready(0.0)
+    assert one.close(60) == ""
+    (path,) = tmp_path.glob("*.mcap")
+    assert [step.tick for step in Recording.open(path).steps()] == list(range(-1, 400))
+
+
+def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Path) -> None:
+    with scribe(recording=tmp_path / "a.mcap") as one:
+        tell(one, 300)
+        pid = one.status()["pid"]
+        os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGTERM)
+        assert one.close(10) == ""
+        assert one.status()["errors"] == []
+        tell(one, 1, first=300)
+        assert one.status()["lost"] == 1
+    recording = Recording.open(tmp_path / "a.mcap")
+    assert len(list(recording.steps())) == 301
+    assert not recording.truncated
+
+
+def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_path: Path) -> None:
+    with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as one:
+        tell(one, 100)
+        time.sleep(1.2)  # two flushes
+        stopped = one.status()["pid"]
+        os.kill(stopped, signal.SIGSTOP)
+        told = 100
+
+        def replaced() -> bool:
+            nonlocal told
+            tell(one, 2, first=told)
+            told += 2
+            one.supervise()
+            time.sleep(0.01)
+            status = one.status()
+            return status["pid"] != stopped and status["sent"] > 300 and status["state"] == "recording"
+
+        until(replaced)
+        status = one.status()
+        assert "the scribe made no progress for 1 s and is replaced" in status["errors"]
+        assert status["restarts"] == 1
+        with pytest.raises(ProcessLookupError):
+            os.kill(stopped, 0)
+    first, second = (Recording.open(path) for path in sorted(tmp_path.glob("*.mcap")))
+    kept = [step.tick for step in first.steps() if step.frame is not None]
+    start, *rest = second.steps()
+    assert kept == list(range(100))
+    assert start.lost == start.tick - 100 == status["lost"]
+    assert [step.tick for step in rest] == list(range(start.tick + 1, told))
+
+
+SLOW = """
+import socket, time
+def run(channel):
+    channel.recv(1)
+    end = time.process_time() + {busy}
+    while time.process_time() < end:
+        pass
+    {then}
+"""
+
+
+@pytest.fixture
+def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Child]]:
+    """Children that compute for so long, and then do something, with a fork server of their own."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    started: list[Child] = []
+
+    def begun(busy: float, then: str) -> Child:
+        name = f"slow_{len(started)}"
+        (tmp_path / f"{name}.py").write_text(SLOW.format(busy=busy, then=then))
+        started.append(child.start("slow", name, socket.SOCK_STREAM))
+        assert started[-1].has_begun(60.0)
+        return started[-1]
+
+    yield begun
+    for one in started:
+        one.kill()
+        one.wait()
+        one.socket.close()
+    server.close()
+
+
+def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(slow_child: Callable[..., Child]) -> None:
+    """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
+
+    def seconds_until_hung(one: Child, limit_s: float, most_s: float) -> float:
+        progress, began = Progress(one), time.monotonic()
+        one.socket.send(b"0")
+        while not progress.is_hung(limit_s) and time.monotonic() - began < most_s and one.poll() is None:
+            time.sleep(0.02)
+        return time.monotonic() - began
+
+    slow = slow_child(0.4, "channel.recv(1)")
+    assert slow.pid is not None
+    os.sched_setaffinity(slow.pid, {min(os.sched_getaffinity(0))})
+    busy = f"import os\nos.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\nwhile True: pass"
+    hogs = [subprocess.Popen([sys.executable, "-c", busy], start_new_session=True) for _ in range(25)]
+    try:
+        assert seconds_until_hung(slow, 1.0, 4.0) > 3.9
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
+    assert 1.0 < seconds_until_hung(slow_child(0.1, "channel.recv(1)"), 1.0, 20.0) < 15.0
+    assert 1.0 < seconds_until_hung(slow_child(1e9, "pass"), 1.0, 60.0) < 50.0
+    stopped = slow_child(1e9, "pass")
+    stopped.send_signal(signal.SIGSTOP)
+    assert 1.0 < seconds_until_hung(stopped, 1.0, 20.0) < 15.0
+
+
+def test_exit_codes_of_children_are_those_of_the_operating_system(slow_child: Callable[..., Child]) -> None:
+    killed, ended, failed = slow_child(1e9, "pass"), slow_child(0.0, "pass"), slow_child(0.0, "raise SystemExit(3)")
+    killed.kill()
+    for one in (ended, failed):
+        one.socket.send(b"0")
+    assert [one.wait(20) for one in (killed, ended, failed)] == [True] * 3
+    assert [one.returncode for one in (killed, ended, failed)] == [-signal.SIGKILL, 0, 1]
+    assert Path(f"/proc/{os.getpid()}").exists()
+
+
+def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    one = child.start("none", "no_such_module_anywhere", socket.SOCK_STREAM)
+    assert one.wait(60)
+    assert (one.pid, one.returncode) == (None, child.NOT_STARTED)
+    one.socket.close()
+    server.close()
+
+
+DAEMON = """
+import os, signal, sys, time
+from pathlib import Path
+from service.settings.config import Files, Settings
+from service.scribe.scribe import Scribe
+from support.recorded import SKILL, state_after, tell
+one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))
+one.start(skill=SKILL, state=state_after(-1))
+assert one.ready(60)
+pid = one.status()["pid"]
+if sys.argv[2] == "stopped":
+    os.kill(pid, signal.SIGSTOP)
+tell(one, 300)
+print(pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("how", ["running", "stopped"])
+def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(tmp_path: Path, how: str) -> None:
+    command, path = [sys.executable, "-c", DAEMON, str(tmp_path), how], os.pathsep.join(sys.path)
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=False, env=environment)
+    assert done.returncode == -signal.SIGKILL
+    until(lambda: not Path(f"/proc/{int(done.stdout)}").exists() or _is_dead(int(done.stdout)))
+    (path,) = tmp_path.glob("*.mcap")
+    recording = Recording.open(path)
+    assert len(list(recording.steps())) == 301
+    assert not recording.truncated
+
+
+def _is_dead(pid: int) -> bool:
+    with suppress(FileNotFoundError):
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(") ", 1)[1][0] == "Z"
+    return True
+
+
+@pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
+def test_a_recording_that_cannot_be_written_is_told_and_spares_the_drawing(tmp_path: Path, place: str) -> None:
+    with scribe(recording=Path(place), rrd=tmp_path / "a.rrd") as one:
+        tell(one, 100)
+        one.close(10)
+        status = one.status()
+    assert any(place in error and ("No space left" in error or "File exists" in error) for error in status["errors"])
+    assert (status["recording"], status["rrd"]) == (None, str(tmp_path / "a.rrd"))
+    assert (tmp_path / "a.rrd").stat().st_size > 20_000
+
+
+def test_without_anything_to_write_there_is_no_process_and_nothing_is_lost() -> None:
+    with scribe() as one:
+        tell(one, 5)
+        one.note("requests", "x", 0)
+        one.supervise()
+        status = one.status()
+    assert (status["pid"], status["alive"], status["lost"], status["errors"]) == (None, False, 0, [])
+
+
+def test_a_skill_larger_than_a_message_is_told_and_recorded(tmp_path: Path) -> None:
+    large = bytes(range(256)) * 20_000
+    with scribe(recording=tmp_path / "a.mcap") as one:
+        (_, frame, timing), *_ = ticks(1)
+        one.keep(large)
+        for i in range(8):
+            one.send(
+                Tick(i, (Event("skill", large[i:], None),)), frame, timing, state=lambda: state_after(0), skill=large
+            )
+        assert one.status()["lost"] == 0
+    _, *steps = Recording.open(tmp_path / "a.mcap").steps()
+    assert [payload for step in steps for _, payload in step.events] == [large[i:] for i in range(8)]

@@ -1,0 +1,270 @@
+"""One recording after another: they join without a gap, the oldest make room, and what goes wrong
+with a disk or a folder is counted and ends by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from service.cli.main import main
+from service.core.controller import Controller, run
+from service.core.frame import TIMING, Frame, Tick, blank
+from service.core.skill.skill import Skill
+from service.files.recording import Recording
+from service.files.replay import replay
+from service.scribe import segments
+from service.scribe.paths import RecordingPaths
+from service.scribe.protocol import TickMessage
+from service.scribe.scribe import Scribe
+from service.scribe.segments import Segments
+from service.settings.config import Files, Settings
+from sim.scene import Scene
+from sim.script import HandScript
+from support.in_process import ASSUMED, ticks_of
+from support.recorded import SKILL, state_after, ticks, write
+from support.wam import URDF
+
+COUNT = 2100
+SMALL = Files(segment_mb=0.1, rerun=True)
+CELL = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False))
+
+
+@pytest.fixture(scope="module")
+def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The recordings of one session, which went through the scribe's process."""
+    folder = tmp_path_factory.mktemp("rotated")
+    settings = msgspec.structs.replace(ASSUMED, files=SMALL)
+    controller = Controller(settings, skill, urdf=URDF)
+    one = Scribe(settings, folder=folder)
+
+    def tell(tick: Tick, frame: Frame) -> None:
+        timing = blank(TIMING)
+        timing["tick"], timing["time_ns"] = tick.index, tick.index * 2_000_000
+        one.send(tick, frame, timing, state=lambda: controller.state, skill=skill.file)
+        if tick.index % 100 == 0:
+            time.sleep(0.02)
+
+    try:
+        one.start(skill=skill.file, state=controller.state)
+        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:COUNT], [tell])
+    finally:
+        assert one.close(20) == ""
+    return sorted(folder.glob("*.mcap"))
+
+
+def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rotated: list[Path]) -> None:
+    assert len(rotated) >= 3
+    assert [path.with_suffix(".rrd").stat().st_size > 10_000 for path in rotated] == [True] * len(rotated)
+    steps = [step.tick for path in rotated for step in Recording.open(path).steps() if step.frame is not None]
+    assert steps == list(range(COUNT))
+    for path in rotated:
+        alone = replay(path)
+        assert alone.exact, alone.text()
+
+
+def test_recordings_in_a_row_are_said_to_join(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", *map(str, rotated), "--exact"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{COUNT} ticks, {COUNT} frames identical",
+        f"{len(rotated)} recordings join without a gap",
+    ]
+
+
+def test_a_recording_missing_in_a_row_is_a_gap(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(rotated[0]), str(rotated[2]), "--exact"]) == 1
+    said = capsys.readouterr().out
+    assert "gap after tick " in said
+    assert f"{rotated[2].name} begins anew" in said
+    assert main(["replay", str(rotated[0]), str(rotated[2])]) == 0
+
+
+def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp_path: Path) -> None:
+    settings = msgspec.structs.replace(CELL, files=Files(keep_mb=0.32))
+    places = RecordingPaths(settings, str(tmp_path), None, None)
+    current, rrd = places.next()
+    assert current is not None
+    assert rrd is not None
+    old = [tmp_path / f"hall-bench-1-2026010{day}T000000Z.mcap" for day in (1, 2, 3)]
+    for path in old:
+        write(path, 3, settings=settings)
+        path.with_suffix(".rrd").write_bytes(bytes(80_000))
+    other = msgspec.structs.replace(CELL, cell="hall-bench/1")
+    spared = [tmp_path / name for name in ("hall-bench-1-20260101T000001Z.mcap", "north-20200101T000000Z.mcap")]
+    write(spared[0], 3, settings=other)  # a name like ours, of another cell
+    spared += [tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.txt")]
+    for path in spared[1:]:
+        path.write_bytes(bytes(80_000))
+    write(current, 3, settings=settings)
+    rrd.write_bytes(bytes(100_000))
+    removed = places.prune(current)
+    assert old[0] in removed
+    assert old[0].with_suffix(".rrd") in removed
+    assert old[2] not in removed
+    assert all(path.exists() for path in [*spared, current, rrd, old[2]])
+    assert places.prune(current) == []
+    os.utime(old[2], (0, 0))
+    os.utime(old[2].with_suffix(".rrd"), (0, 0))
+    aged = RecordingPaths(msgspec.structs.replace(CELL, files=Files(keep_hours=1)), str(tmp_path), None, None)
+    assert sorted(aged.prune(current)) == sorted([old[2], old[2].with_suffix(".rrd")])
+    assert aged.keep_mb_left == pytest.approx(50_000, rel=0.01)
+    assert places.keep_mb_left is not None
+    assert 0.0 < places.keep_mb_left < 0.32
+
+
+class Session:
+    """A scribe that is told ticks at 50 Hz or so, and supervised as the daemon does it."""
+
+    def __init__(self, settings: Settings, **where: Any) -> None:
+        self.scribe = Scribe(settings, restart_s=0.1, **where)
+        self.told = 0
+        self._ticks = list(ticks(40))
+        self.missing = ""
+
+    def tell(self, count: int) -> None:
+        for _ in range(count):
+            tick, frame, timing = self._ticks[self.told % 40]
+            at = self.told
+            self.scribe.send(Tick(at, tick.inbox), frame, timing, state=lambda at=at: state_after(at), skill=SKILL)
+            self.told += 1
+        self.scribe.supervise()
+
+    def until(self, what: Callable[[dict[str, Any]], bool], *, timeout_s: float = 20.0) -> dict[str, Any]:
+        """Tells ticks until something is true of the status."""
+        deadline = time.monotonic() + timeout_s
+        while not what(status := self.scribe.status()):
+            assert time.monotonic() < deadline, status
+            self.tell(5)
+            time.sleep(0.02)
+        return status
+
+
+@contextlib.contextmanager
+def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
+    one = Session(settings, **where)
+    try:
+        one.scribe.start(skill=SKILL, state=state_after(-1))
+        assert one.scribe.ready(60)
+        yield one
+    finally:
+        one.missing = one.scribe.close(10)
+
+
+def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segments, "LEAST_GROWTH_S", 0.5)
+    settings = msgspec.structs.replace(CELL, files=Files(rerun=False, segment_mb=0.3))
+    paths = RecordingPaths(settings, str(tmp_path), None, None)
+    one = Segments(settings, paths, say=print, draw=print)
+    one.begin(SKILL, state_after(-1))
+    one.flush()
+    assert one.mb_per_hour() is None
+    begin_s, before, told = time.monotonic(), sum(path.stat().st_size for path in tmp_path.iterdir()), list(ticks(40))
+    for i in range(2000):
+        tick, frame, timing = told[i % 40]
+        state = state_after(i) if i % 50 == 49 else None
+        one.write(TickMessage(Tick(i, tick.inbox), frame, timing, state, None, 0))
+        if i % 20 == 0:
+            time.sleep(0.01)
+            one.flush()
+    one.flush()
+    grown_mb = (sum(path.stat().st_size for path in tmp_path.iterdir()) - before) / 1e6
+    assert len(list(tmp_path.iterdir())) > 2
+    assert one.mb_per_hour() == pytest.approx(grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1)
+    assert one.keep_mb_left is not None
+    one.close()
+
+
+def accounted(paths: list[Path], told: int) -> tuple[int, int]:
+    """The number of ticks in recordings, and of those that they say are missing."""
+    steps = [step for path in paths for step in Recording.open(path).steps() if step.frame is not None]
+    indices = [step.tick for step in steps]
+    assert indices == sorted(set(indices))
+    assert indices[-1] == told - 1
+    assert all(step.state is not None for step in steps if step.lost)
+    return len(steps), sum(step.lost for step in steps)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 6 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], capture_output=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True, timeout=10)
+
+
+def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> None:
+    ballast = small_disk / "ballast"
+    with session(msgspec.structs.replace(CELL, files=Files(rerun=True)), folder=small_disk) as one:
+        one.until(lambda status: status["sent"] > 200)
+        with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
+            while file.write(bytes(4096)):
+                pass
+        status = one.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
+        assert status["recording"] is None
+        full = [error for error in status["errors"] if error.startswith("recording to ")]
+        assert len(full) == 1
+        assert "No space left on device" in full[0]
+        ballast.unlink()
+        one.until(lambda status: status["state"] == "recording")
+        sent = one.told
+        one.until(lambda status: status["sent"] > sent + 200)
+    recordings = sorted(small_disk.glob("*.mcap"))
+    kept, lost = accounted(recordings, one.told)
+    assert kept + lost == one.told
+    assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+    result = [Recording.open(path) for path in recordings]
+    assert [len(list(r.steps())) > 50 for r in result] == [True, True]
+    assert [r.truncated for r in result] == [True, False]
+    assert recordings[1].with_suffix(".rrd").stat().st_size > 10_000
+
+
+@pytest.mark.timed
+def test_a_limit_on_files_interrupts_a_recording_until_it_is_lifted(tmp_path: Path) -> None:
+    with session(folder=tmp_path) as one:
+        one.until(lambda status: status["sent"] > 200)
+        pid = one.scribe.status()["pid"]
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
+        one.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        one.until(lambda status: status["state"] == "recording")
+    kept, lost = accounted(sorted(tmp_path.glob("*.mcap")), one.told)
+    assert kept + lost == one.told
+
+
+def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(tmp_path: Path) -> None:
+    folder = tmp_path / "records"
+    with session(folder=folder) as one:
+        one.until(lambda status: status["sent"] > 200)
+        shutil.rmtree(folder)
+        status = one.until(lambda status: status["lost"] > 0 and status["state"] == "recording" and folder.exists())
+        assert any("was removed while it was written" in error for error in status["errors"])
+    kept, lost = accounted(sorted(folder.glob("*.mcap")), one.told)
+    assert kept + lost == one.told
+    assert lost > 200
+    assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+
+
+def test_a_recording_that_is_moved_is_ended_where_it_is_and_nothing_is_lost(tmp_path: Path) -> None:
+    with session(folder=tmp_path) as one:
+        status = one.until(lambda status: status["sent"] > 200)
+        first = Path(status["recording"])
+        first.rename(tmp_path / "elsewhere.mcap")
+        status = one.until(lambda status: status["recording"] != str(first))
+    assert one.missing == ""
+    assert accounted([tmp_path / "elsewhere.mcap", Path(status["recording"])], one.told) == (one.told, 0)

@@ -1,0 +1,335 @@
+"""Settings: safe defaults, and errors that name the field and what is accepted."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from service.daemon.launch import described
+from service.files.shipped import cell_of
+from service.settings.config import WAM, Files, Settings, SettingsError, load, parse, robot_description
+from service.settings.network import Network, is_local
+from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
+
+
+def refusal(text: str) -> str:
+    """The words in which a configuration is refused."""
+    with pytest.raises(SettingsError) as caught:
+        parse(text, origin="cell.toml")
+    return str(caught.value)
+
+
+def test_an_empty_file_gives_the_defaults() -> None:
+    assert parse("", origin="cell.toml") == Settings()
+
+
+def test_the_defaults_pass_their_own_validation() -> None:
+    assert msgspec.convert(msgspec.to_builtins(Settings()), Settings) == Settings()
+
+
+def test_the_period_is_the_inverse_of_the_rate() -> None:
+    assert Settings().period_s == pytest.approx(0.002)
+    assert parse("rate_hz = 1000", origin="cell.toml").period_s == pytest.approx(0.001)
+
+
+def test_limits_may_be_lowered() -> None:
+    given = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
+    assert given.joints.velocity[6] == 0.5
+    assert given.tool.max_speed == 0.3
+
+
+@pytest.mark.parametrize("text", ['"a - at `$.x`" = 1', '[tool]\n"a - at `$.tool.max_speed[1]`" = 1'])
+def test_a_name_that_looks_like_a_path_is_refused_in_words(text: str) -> None:
+    assert "unknown field" in refusal(text)
+
+
+@pytest.mark.parametrize("name", ["a", "bench", "lab/bench2", "a/b/c", "Wärmebank", "cell-1_x.y"])
+def test_a_cell_may_hold_slashes(name: str) -> None:
+    assert parse(f'cell = "{name}"', origin="cell.toml").cell == name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "/",
+        "a/",
+        "/a",
+        "*",
+        "a/*/b",
+        "a/**",
+        "a$*",
+        "a?",
+        "a#",
+        "a b",
+        r"a\nb",
+        "a//b",
+        r"a\n",
+        r"a\u0000b",
+        "..",
+        "a/../b",
+        "x" * 201,
+        "ä" * 101,
+        "/".join(["x" * 40] * 5),
+    ],
+)
+def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
+    assert refusal(f'cell = "{name}"').startswith("cell.toml: cell: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "accepted"),
+    [
+        ("rate_hz = 1001", "rate_hz", "from 50 to 1000"),
+        ("rate_hz = 49", "rate_hz", "from 50 to 1000"),
+        ("rate_hz = 100.5", "rate_hz", "whole number"),
+        ("rats = 1", "rats", "rate_hz"),
+        ("[hands]\nunits = 'mm'", "hands", "stale_ms"),
+        ("[hands]\nunit = 'inch'", "[hands] unit", "mm"),
+        ("[hands]\nstale_ms = 0", "[hands] stale_ms", "above 0"),
+        ("[hands]\nstale_ms = nan", "[hands] stale_ms", "accepted"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0]", "[hands] base_from_tracker", "7"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "[hands] base_from_tracker", "1 needed (x y z w)"),
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "[hands] base_from_tracker", "1 needed (x y z w)"),
+        ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "[tool] plate_from_tool", "1 needed (x y z w)"),
+        ("[tool]\nmax_speed = -1", "[tool] max_speed", "above 0"),
+        ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "1.5"),
+        ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "finite"),
+        ("[joints]\njerk = [1, 1, 0, 1, 1, 1, 1]", "[joints] jerk, entry 3", "500"),
+        ("[joints]\nlower = [-3, -1, -1, 0, -1, -1, -1]", "[joints] lower, entry 1", "-2.6"),
+        ("[joints]\nupper = [1, 1, 1, 3.2, 1, 1, 1]", "[joints] upper, entry 4", "3.1"),
+        (
+            "[joints]\nupper = [-2.6, 1, 1, 3, 1, 1, 1]",
+            "[joints] lower, entry 1",
+            "less than [joints] upper, entry 1 =",
+        ),
+        ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "[arm] posture, entry 6", "-1.5707 to 1.5707 accepted"),
+        ("[arm]\nsource = 'guess'", "[arm] source", "assumed"),
+        ("[network]\nlisten = 'tcp/0.0.0.0:1'", "[network] listen", "'tcp/0.0.0.0:1' given; a list needed"),
+        ("[network]\nallow_insecure = 3", "[network] allow_insecure", "3 given; true or false needed"),
+        ("[hand]\nunit = 'mm'", "unknown field 'hand'", "did you mean hands?"),
+        ("[obstacles]\nclearence = 1", "unknown field 'clearence'", "did you mean clearance?"),
+        ("[files]\nrecord = 3", "[files] record", "a text needed"),
+        ("[files]\nstate = '~nobody-of-this-name/x'", "[files] state", "no such user's folder"),
+        ('[network]\ncertificate = "a\\u0000b"', "[network] certificate", "no zero bytes"),
+        (
+            "[network]\nlisten = ['tcp/0.0.0.0:7447']",
+            "[network] listen, entry 1",
+            "else allow_insecure = true needed",
+        ),
+        (
+            "[network]\nlisten = ['tcp/127.0.0.1:1', 'udp/[::]:1']",
+            "[network] listen, entry 2",
+            "or else allow_insecure",
+        ),
+        ("[network]\nlisten = ['tls/127.0.0.1:1']", "[network] certificate", "the folder of one needed"),
+        ("[network]\ncertificate = 'x'\nlisten = ['tcp/127.0.0.1:1']", "[network] listen, entry 1", "tls/... needed"),
+        (
+            "[network]\nconnect = ['tcp/127.0.0.1:1', 'tcp/10.0.0.1:1']",
+            "[network] connect, entry 2",
+            "or else allow_insecure",
+        ),
+        ("[network]\nconnect = ['tls/10.0.0.1:1']", "[network] certificate", "the folder of one needed"),
+        (
+            "[network]\ncertificate = 'x'\nlisten = []\nconnect = ['tcp/127.0.0.1:1']",
+            "[network] connect, entry 1",
+            "tls/... needed",
+        ),
+        ("[network]\nrevoked = ['tracker']", "[network] revoked", "nobody is told apart"),
+        (
+            "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', 'tracer']",
+            "[network] revoked, entry 2",
+            "with a number, like tracker-2",
+        ),
+    ],
+)
+def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, accepted: str) -> None:
+    message = refusal(text)
+    assert message.startswith("cell.toml: ")
+    assert path in message
+    assert accepted in message.split(path, 1)[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, nan]", "[hands] base_from_tracker"),
+        ("[hands]\nbase_from_tracker = [nan, 0, 0, 0, 0, 0, 1]", "[hands] base_from_tracker"),
+        ("[tool]\nplate_from_tool = [inf, 0, 0, 0, 0, 0, 1]", "[tool] plate_from_tool"),
+        ("[hands]\nstale_ms = inf", "[hands] stale_ms"),
+        ("[arm]\nsilent_ms = inf", "[arm] silent_ms"),
+        ("[tool]\nmax_speed = inf", "[tool] max_speed"),
+        ("[reach]\nmin_z = nan", "[reach] min_z"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused(text: str, path: str) -> None:
+    assert path in refusal(text)
+
+
+def test_a_reach_without_room_is_refused() -> None:
+    assert "[reach] inner" in refusal("[reach]\ninner = 0.9\nouter = 0.5")
+
+
+def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
+    text = """
+    rate_hz = 7
+    a-b = 1
+    [tool]
+    max_speed = -1
+    colour = 'red'
+    [hands]
+    unit = 'ft'
+    [network]
+    listen = ['tcp/0.0.0.0:1']
+    [reach]
+    inner = 3
+    outer = 2
+    [joints]
+    jerk = [1, 1, 0, 1, 1, 1, 1]
+    velocity = [9, 1, 1, 1, 1, 1, 8]
+    """
+    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
+    assert sorted(re.split("[:;]", line)[0] for line in lines) == [
+        "[hands] unit",
+        "[joints] jerk, entry 3",
+        "[joints] velocity, entry 1",
+        "[joints] velocity, entry 7",
+        "[network] listen, entry 1",
+        "[reach] inner",
+        "[tool] max_speed",
+        "rate_hz",
+        "tool",
+        "unknown field 'a-b'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arm", "told"),
+    [
+        ("urdf = 'nowhere.urdf'", ["[arm] urdf"]),
+        (f"urdf = '{WAM}'", ["[arm] plate"]),
+        (f"urdf = '{WAM}'\nplate = 'tool_plate'", ["[joints] acceleration", "[joints] jerk", "[arm] posture"]),
+    ],
+)
+def test_what_else_is_wrong_is_told_beside_a_urdf_that_cannot_be_used(arm: str, told: list[str]) -> None:
+    text = f"[arm]\n{arm}\n[hands]\nunit = 'ft'\n[tool]\ncolour = 'red'\nmax_speed = -1"
+    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
+    assert [line.split(":")[0] for line in lines] == [*told, "[hands] unit", "tool", "[tool] max_speed"]
+
+
+def test_what_follows_from_another_error_is_not_told() -> None:
+    assert "posture" not in refusal("[joints]\nnames = 3\n[arm]\nposture = [0, 0, 0]")
+
+
+def test_a_toml_error_is_told_with_its_place() -> None:
+    assert refusal("rate_hz = 500\nhands = [").startswith("cell.toml: ")
+    assert "line 2" in refusal("rate_hz = 500\nhands = = 3\n")
+
+
+def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    file = tmp_path / "cell.toml"
+    file.write_text('cell = "lab/bench2"\n[hands]\nunit = "mm"\n', encoding="utf-8")
+    assert (load(file).cell, load(file).hands.unit) == ("lab/bench2", "mm")
+    file.write_bytes(b'cell = "\xff"')
+    with pytest.raises(SettingsError, match="cannot read configuration"):
+        load(file)
+    with pytest.raises(SettingsError, match=r"nowhere\.toml"):
+        load(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.3.2.1:0?x=1", True),
+        ("tcp/[::1]:7447#iface=lo", True),
+        ("udp/localhost:1", True),
+        ("unixsock-stream/tmp/socket", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/192.168.1.5:7447", False),
+        ("ws/bench.local:80", False),
+        ("tcp/127.0.0.1.evil.example:7447", False),
+        ("serial//dev/ttyUSB0", False),
+        ("nothing", False),
+    ],
+)
+def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, local: bool) -> None:
+    assert is_local(endpoint) == local
+
+
+def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
+    network = Settings().network
+    assert [is_local(endpoint) for endpoint in network.listen] == [True]
+    assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
+    insecure = parse("[network]\nlisten = ['tcp/0.0.0.0:1']\nallow_insecure = true", origin="cell.toml")
+    assert insecure.network.listen == ("tcp/0.0.0.0:1",)
+    routed = parse("[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml")
+    assert routed.network.connect == ("tcp/10.0.0.1:1",)
+
+
+def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my" / "share").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "my" / "arm.urdf").write_bytes(WAM.with_name("ur5.urdf").read_bytes())
+    cell = WAM.with_name("ur5.toml").read_text().replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
+    network = '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = "../zenoh.json5"'
+    files = '[files]\nrecord = "records"\nskills = ""\nstate = "~/state"'
+    (tmp_path / "my" / "cell.toml").write_text(f"{cell}\n{network}\n{files}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    read = cell_of("my/cell.toml", rate_hz=250)
+    assert read.arm.urdf == str(tmp_path / "my/arm.urdf")
+    assert read.arm.packages == (str(tmp_path / "my/share"),)
+    assert read.network.certificate == str(tmp_path / "my/secrets")
+    assert read.network.zenoh_config == str(tmp_path / "my/../zenoh.json5")
+    assert (read.files.record, read.files.skills, read.files.state) == (str(tmp_path / "records"), "", "/home/me/state")
+    again = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert again == msgspec.structs.replace(read, network=Network(), files=Files())
+    assert robot_description(again) == robot_description(read)
+
+
+def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:
+    text = "[network]\nlisten = ['tls/0.0.0.0:1']\ncertificate = 'secrets/daemon'"
+    assert parse(text, origin="cell.toml", folder=tmp_path).network.certificate == str(tmp_path / "secrets/daemon")
+
+
+def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
+    bare = re.sub(r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>', r"\1", continuous_urdf())
+    assert bare.count("<limit") == continuous_urdf().count("<limit") - 1
+    posture = (NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0)
+    cell = cell_in(tmp_path, bare, posture=posture)
+    assert cell.joints.velocity[5] == 2.0
+    assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
+    with pytest.raises(SettingsError, match=r"\[joints\] velocity: missing; a URDF does not say it, 6 numbers needed"):
+        load(tmp_path / "cell.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('kinds = ["revolute"]', "[joints] kinds: 1 kinds, 6 needed"),
+        (
+            f"kinds = {['revolute'] * 6}",
+            "[joints] kinds: ['revolute', 'revolute', 'revolute', 'revolute', 'revolute', 're",
+        ),
+        ('kinds = ["floating"]', "[joints] kinds, entry 1"),
+        (
+            f"lower = {[-7000.0, *[-3.0] * 5]}",
+            "[joints] lower, entry 1: -7000.0 given; -6000.0 or more accepted",
+        ),
+    ],
+)
+def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    continuous_cell(tmp_path)
+    text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(text.replace("[joints]", f"[joints]\n{line}"), encoding="utf-8")
+    with pytest.raises(SettingsError) as caught:
+        load(tmp_path / "cell.toml")
+    assert message in str(caught.value)

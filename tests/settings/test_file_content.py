@@ -1,0 +1,124 @@
+"""Files that people name are read whole, or refused at once with the cause, whatever lies there."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.contract.explain import in_words
+from service.daemon.skill_worker import skill_of
+from service.learning.skill_file import SkillError
+from service.settings.file_content import UnusableError, content
+from support.cell import told
+
+LARGEST = 1000
+COMMANDS = {
+    "configuration": ("serve", "--arm", "assumed", "--config"),
+    "via-points": ("via-points", "add", "--file"),
+    "Zenoh configuration": ("status", "--zenoh-config"),
+    "recording": ("view",),
+}
+
+
+@pytest.fixture(autouse=True)
+def at_once() -> Iterator[None]:
+    """Whoever waits for a pipe or reads on and on fails."""
+
+    def fail(*_: object) -> None:
+        raise AssertionError("it waits for what no file holds")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def odd(folder: Path, kind: str) -> Path:
+    """A path at which there is something that no file's content can be read from."""
+    path = folder / "odd"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    elif kind == "a folder":
+        path.mkdir()
+    return {"a device without end": Path("/dev/zero"), "a full device": Path("/dev/full")}.get(kind, path)
+
+
+KINDS = ("a device without end", "a full device", "a pipe", "a folder", "nothing")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_file_is_refused_with_the_cause(tmp_path: Path, kind: str) -> None:
+    with pytest.raises((OSError, UnusableError)) as refused:
+        content(odd(tmp_path, kind), LARGEST)
+    reasons = {
+        "a folder": "Is a directory; a file needed, and that is a folder",
+        "nothing": "No such file or directory",
+    }
+    assert in_words(refused.value, named=False) == reasons.get(kind, "it is not a file")
+
+
+@pytest.mark.parametrize("size", [0, 1, LARGEST - 1, LARGEST, LARGEST + 1, 50 * LARGEST])
+@pytest.mark.parametrize("is_pipe", [True, False])
+def test_a_file_or_pipe_is_read_whole_up_to_what_is_accepted(tmp_path: Path, size: int, is_pipe: bool) -> None:
+    path, given = tmp_path / "file", os.urandom(size)
+    if is_pipe:
+        ends = os.pipe()
+        path = Path(f"/dev/fd/{ends[0]}")
+        writer = threading.Thread(target=lambda: (os.write(ends[1], given), os.close(ends[1])))
+        writer.start()
+    else:
+        path.write_bytes(given)
+    try:
+        if size > LARGEST:
+            with pytest.raises(UnusableError, match=f"{LARGEST}"):
+                content(path, LARGEST, accepts_pipes=True)
+        else:
+            assert content(path, LARGEST, accepts_pipes=True) == given
+    finally:
+        if is_pipe:
+            writer.join()
+            os.close(ends[0])
+
+
+@pytest.mark.parametrize(
+    ("what", "kind"),
+    [
+        (what, kind)
+        for what in COMMANDS
+        for kind in KINDS
+        if kind != "a pipe" or what not in ("configuration", "via-points")
+    ],
+)
+def test_commands_refuse_it_in_one_line_that_names_it(tmp_path: Path, what: str, kind: str) -> None:
+    """A configuration or via-points may come from a pipe, which is waited for."""
+    path = odd(tmp_path, kind)
+    done = told(*COMMANDS[what], str(path))
+    assert done.returncode in (1, 2)
+    last = done.stderr.splitlines()[-1]
+    assert re.search(rf"{path}\b", last), done.stderr
+    assert "Errno" not in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_skill_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
+    path = odd(tmp_path, kind)
+    with pytest.raises(SkillError, match=rf"cannot read skill {path}: \w"):
+        skill_of(path)
+
+
+@pytest.mark.parametrize("kind", ["a file", "a pipe", "a full device"])
+def test_a_folder_of_recordings_that_is_none_is_refused(tmp_path: Path, kind: str) -> None:
+    path = odd(tmp_path, kind)
+    if kind == "a file":
+        path.write_bytes(b"")
+    done = told("serve", "--arm", "assumed", "--record", str(path))
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"nothing can be recorded in {path}: it is not a folder\n")

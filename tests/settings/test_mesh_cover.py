@@ -1,0 +1,332 @@
+"""Collision meshes are covered by capsules: what is inside, where files are looked for, and what
+is said of those that are not found.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import time
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from service.core.geometry import rotation
+from service.core.separation.body import body_of
+from service.settings.arm_description import description
+from service.settings.config import Settings, SettingsError, converted, parse, robot_description, urdf_path
+from service.settings.mesh_cover import capsule_around, covered, unfound
+from service.settings.urdf import Shape, Urdf, UrdfError
+from support import arms
+from support.paths import ROOT
+
+WAM = (ROOT / "service" / "arms" / "wam.urdf").read_text(encoding="utf-8")
+Points = NDArray[np.float64]
+
+
+def outside(points: Points, ends: Points, radius: float) -> float:
+    """How far the farthest of points (N, 3) is out of a capsule [m]."""
+    start, way = ends[0], ends[1] - ends[0]
+    share = np.clip((points - start) @ way / max(way @ way, 1e-18), 0.0, 1.0)
+    return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max() - radius)
+
+
+def volume(ends: Points, radius: float) -> float:
+    return float(np.pi * radius**2 * (np.linalg.norm(ends[1] - ends[0]) + 4.0 / 3.0 * radius))
+
+
+def stl(points: Points) -> bytes:
+    """A binary STL file of the triangles around points."""
+    triangles = np.asarray(points, "<f4")[ConvexHull(points).simplices]
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *one.ravel(), 0) for one in triangles)
+    return bytes(80) + struct.pack("<I", len(triangles)) + body
+
+
+def box(x: float, y: float, z: float) -> Points:
+    return np.array([(a * x, b * y, c * z) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+
+
+@settings(deadline=None, max_examples=40, derandomize=True)
+@given(arrays(float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)))
+def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(points: Points) -> None:
+    """Flat ones, and one alone, too."""
+    found = np.array(capsule_around(points))
+    ends, radius = found[:6].reshape(2, 3), float(found[6])
+    assert outside(points, ends, radius) <= 1e-9
+    widest = np.linalg.norm(points - points.mean(axis=0), axis=1).max() + 0.001
+    assert volume(ends, radius) <= 1.05 * volume(np.zeros((2, 3)), widest)
+
+
+def plain(points: Points) -> float:
+    """The volume of the capsule of the box around points, along its longest edge."""
+    *short, longest = sorted(np.ptp(points, axis=0))
+    return volume(np.array(((0, 0, 0), (0, 0, longest))), float(np.hypot(*short)) / 2)
+
+
+@pytest.mark.parametrize("edges", [(0.1, 0.1, 0.5), (0.2, 0.2, 0.2), (0.4, 0.3, 0.02)])
+def test_a_capsule_is_about_as_small_as_the_plain_one_however_a_mesh_lies(edges: tuple[float, float, float]) -> None:
+    points = box(*edges)
+    for turn in ((0.0, 0.0, 0.0, 1.0), (0.2, -0.4, 0.4, 0.8)):
+        found = np.array(capsule_around(points @ rotation(turn).T + np.array((0.3, -0.2, 0.1))))
+        assert volume(found[:6].reshape(2, 3), found[6]) < 1.05 * plain(points)
+
+
+def described(name: str, scale: str = "") -> str:
+    """The WAM, whose forearm has this mesh alone as its collision shape, turned and moved."""
+    begin = WAM.index('<link name="forearm">')
+    end = WAM.index("</link>", begin)
+    shape = f'<collision><origin xyz="0.01 0 0.1" rpy="0 0.5 0"/><geometry><mesh filename="{name}"{scale}/></geometry>'
+    return f'{WAM[:begin]}<link name="forearm">{shape}</collision>{WAM[end:]}'
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "packages"),
+    [
+        ("meshes/arm.stl", "cell/meshes/arm.stl", ""),
+        ("file://{folder}/arm.stl", "arm.stl", ""),
+        ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),  # the folder above the URDF is the package
+        ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
+        ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
+    ],
+)
+def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: str, packages: str) -> None:
+    folder = tmp_path / "my_arm"
+    (folder / "cell").mkdir(parents=True)
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    points = box(60.0, 50.0, 300.0) + np.array((0.0, 0.0, 40.0))  # in millimetres
+    (folder / file).write_bytes(stl(points))
+    (folder / "cell" / "arm.urdf").write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
+    own = Settings()
+    lines = f"""
+        [arm]
+        urdf = "arm.urdf"
+        plate = "{own.arm.plate}"
+        posture = {list(own.arm.posture)}
+        link_radius = 1.0
+        packages = ["/nowhere", "{folder / packages}"]
+        [joints]
+        acceleration = {list(own.joints.acceleration)}
+        jerk = {list(own.joints.jerk)}
+    """
+    cell = parse(lines, origin="cell.toml", folder=folder / "cell")
+    text = robot_description(cell)
+    assert "covered_by" not in description(urdf_path(cell), cover=False)
+    (folder / file).unlink()
+    assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording has all that it needs
+    shape = next(one for one in Urdf(text).shapes if one.link == "forearm")
+    at = points * 0.001 @ rotation(shape.rotation).T + shape.translation
+    capsules = body_of(cell, text).capsules
+    mine = [one for one in capsules if outside(at, one["ends"], one["radius"]) <= 1e-9]
+    assert [round(float(one["radius"]), 2) for one in mine] == [0.04]
+    assert capsules["radius"].max() < 0.2  # none by `link_radius`
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        (
+            "package://no_arm/link.stl",
+            "package 'no_arm' with this file is in none of {folder}/, ",
+        ),
+        (
+            "meshes/link.stl",
+            "there is no {folder}/meshes/link.stl; put it there. Links with a box, cylinder or sphere instead",
+        ),
+        ("broken.stl", "cannot be read"),
+    ],
+)
+def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / "broken.stl").write_bytes(b"no mesh")
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(described(name))
+    with pytest.raises(UrdfError) as error:
+        covered(urdf.read_text(), urdf)
+    assert f"{urdf}: the collision mesh {name} of link 'forearm'" in str(error.value)
+    assert told.format(folder=tmp_path) in str(error.value)
+    with pytest.raises(SettingsError, match=r"\[arm\] urdf: .*the collision mesh"):
+        robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
+
+
+def test_all_meshes_that_are_not_found_are_named_once(tmp_path: Path) -> None:
+    urdf = tmp_path / "arm.urdf"
+    lost = '<collision><geometry><mesh filename="package://no_arm/plate.stl"/></geometry></collision>'
+    text = described("package://no_arm/link.stl")
+    shapes = lost + lost.replace("collision", "visual")
+    urdf.write_text(text.replace("</robot>", f'<link name="plate">{shapes}</link></robot>'))
+    robot = ElementTree.fromstring(urdf.read_text())
+    for kind, words in (("collision", "2 collision meshes of links forearm, plate are"), ("visual", "the visual mesh")):
+        said = unfound(robot, urdf, ("/opt/share",), kind)
+        assert said.startswith(words)
+        assert "/opt/share/" in said
+        assert "--packages" in said
+    with pytest.raises(UrdfError, match="2 collision meshes of links forearm, plate are not found, the first is"):
+        covered(urdf.read_text(), urdf)
+
+
+def collada(points: Points, unit: str, node: str = "", up: str = "Z_UP") -> str:
+    """A Collada file of the triangles around points, in a node that may be turned."""
+    numbers = " ".join(f"{value:.9g}" for value in points.ravel())
+    corners = " ".join(map(str, ConvexHull(points).simplices.ravel().tolist()))
+    count = len(ConvexHull(points).simplices)
+    return f"""<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="unit" meter="{unit}"/><up_axis>{up}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="s"><float_array id="a" count="{points.size}">{numbers}</float_array><technique_common>
+<accessor source="#a" count="{len(points)}" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+<triangles count="{count}"><input semantic="VERTEX" source="#v" offset="0"/><p>{corners}</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node id="n">{node}<instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#scene"/></scene></COLLADA>"""
+
+
+def around(shape: Shape, points: Points) -> float:
+    """How far the farthest of points in a link's frame is out of the capsule of a mesh [m]."""
+    ends = np.reshape(shape.size[:6], (2, 3)) @ rotation(shape.rotation).T + shape.translation
+    return outside(points, ends, shape.size[6])
+
+
+LEG = box(0.05, 0.06, 0.3) + np.array((0.02, 0.03, 0.15))
+QUARTER = "<matrix>0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1</matrix>"  # about z
+TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "scale", "expected"),
+    [
+        ("a.stl", stl(LEG), "", LEG),
+        ("a.STL", stl(1000 * LEG), ' scale="0.001 0.001 0.001"', LEG),
+        ("a.stl", stl(LEG), ' scale="1 -1 1"', LEG * (1, -1, 1)),
+        ("a.stl", stl(LEG), ' scale="-1 2 0.5"', LEG * (-1, 2, 0.5)),
+        ("a.dae", collada(LEG, "1"), "", LEG),
+        ("a.dae", collada(1000 * LEG, "0.001"), "", LEG),
+        ("a.dae", collada(100 * LEG, "0.01"), ' scale="1 -1 1"', LEG * (1, -1, 1)),
+        ("a.dae", collada(LEG, "1", QUARTER), "", TURNED),
+        ("a.dae", collada(1000 * LEG, "0.001", QUARTER, "Y_UP"), "", TURNED),  # as RViz and MoveIt have it
+        ("a.obj", "".join(f"v {x} {y} {z}\n" for x, y, z in LEG) + "f 1 2 3\nf 4 5 6\nf 6 7 8\n", "", LEG),
+    ],
+)
+def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
+    name: str, data: bytes | str, scale: str, expected: Points, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+    (tmp_path / "arm.urdf").write_text(described(name, scale))
+    shape = next(one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm")
+    at = expected @ rotation(shape.rotation).T + shape.translation
+    assert around(shape, at) <= 1e-5
+    ends = np.reshape(shape.size[:6], (2, 3))
+    assert volume(ends, shape.size[6]) < 1.1 * plain(expected)
+
+
+def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Path) -> None:
+    for name, points in (("a.stl", LEG), ("b.stl", LEG + np.array((0.2, 0.0, 0.0)))):
+        (tmp_path / name).write_bytes(stl(points))
+    second = '</collision><collision><geometry><mesh filename="b.stl"/></geometry></collision>'
+    text = described("a.stl").replace('<mesh filename="a.stl"/></geometry></collision>',
+                                      f'<mesh filename="a.stl"/></geometry>{second}')  # fmt: skip
+    (tmp_path / "arm.urdf").write_text(text)
+    shapes = [one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm"]
+    assert [round(one.size[6], 2) for one in shapes] == [0.04, 0.04]
+    assert around(shapes[1], LEG + np.array((0.2, 0.0, 0.0))) <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("data", "scale", "said"),
+    [
+        (stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.nan)), "", "finite numbers"),
+        (stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.inf)), "", "finite numbers"),
+        (bytes(80) + struct.pack("<I", 0), "", "vertices with finite numbers needed"),
+        (b"", "", "cannot be read"),
+        (stl(LEG)[:-20], "", "cannot be read"),
+        (stl(LEG), ' scale="nan 1 1"', "finite numbers up to 1e+06 needed"),
+        (stl(LEG), ' scale="1 1"', "scale '1 1' given; three finite numbers"),
+        (stl(LEG), ' scale="0 1 1"', "scale '0 1 1' given; three finite numbers"),
+        (stl(1000 * LEG), "", "the mesh of link 'forearm' is 378 m long"),
+    ],
+)
+def test_what_is_no_mesh_of_an_arm_is_refused(data: bytes, scale: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(data)
+    (tmp_path / "arm.urdf").write_text(described("a.stl", scale))
+    own = Settings()
+    with pytest.raises(SettingsError, match=re.escape(said)) as error:
+        converted(
+            {
+                "arm": {"urdf": "arm.urdf", "plate": own.arm.plate, "posture": list(own.arm.posture)},
+                "joints": {"acceleration": list(own.joints.acceleration), "jerk": list(own.joints.jerk)},
+            },
+            origin="cell.toml",
+            folder=tmp_path,
+        )
+    assert "forearm" in str(error.value)
+
+
+def test_capsules_are_kept_and_found_anew_where_they_are_spoilt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "a.stl").write_bytes(stl(LEG))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(described("a.stl"))
+
+    def found() -> str:
+        covered.cache_clear()
+        return description(urdf)
+
+    first = found()
+    (kept,) = (tmp_path / "home" / ".cache" / "thirdhand" / "capsules").iterdir()
+    right = kept.read_text()
+    kept.write_text(right.replace(right.split()[6], "0.5"))
+    assert found() != first  # it is what is taken
+    for spoilt in ("", "nan " * 7, "1 2 3", "1 2 3 4 5 6 -7", "\udcff"):
+        kept.write_bytes(spoilt.encode(errors="surrogateescape"))
+        assert found() == first
+        assert kept.read_text() == right
+    (tmp_path / "a.stl").write_bytes(stl(LEG * 0.5))
+    assert found() != first
+    monkeypatch.setenv("HOME", "/dev/null")
+    assert found() != first
+
+
+@pytest.mark.timed
+def test_so_101_with_its_13_meshes_is_covered_in_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    urdf = arms.urdf_of(arms.Model("so101.urdf", "gripper_frame_link", ()))
+    capsule_around(LEG)  # what it needs is imported
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for bound_s in (1.0, 0.3):
+        covered.cache_clear()
+        start = time.process_time()
+        description(urdf)
+        assert time.process_time() - start < bound_s
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_meshes_that_others_publish_are_inside_capsules_that_are_not_much_larger(name: str) -> None:
+    try:
+        files("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data, whose meshes these are, is not installed")
+    import coal
+
+    cell = arms.cell_of(name)
+    text, folder = robot_description(cell), arms.urdf_of(arms.MODELS[name]).parents[2]
+    meshes = [shape for shape in Urdf(text).shapes if shape.kind == "mesh"]
+    names = [one.split('"')[0] for one in text.split('filename="package://example-robot-data/robots/')[1:]]
+    stls = [one for one in names if one.endswith(".stl") and "/collision/" in one]
+    assert len(stls) == len(meshes) >= 7
+    for shape, file in zip(meshes, stls, strict=True):
+        points = np.array(coal.MeshLoader().load(str(folder / file), np.ones(3)).vertices())
+        ends, radius = np.reshape(shape.size[:6], (2, 3)), shape.size[6]
+        assert outside(points, ends, radius) <= 0.0, shape.link
+        assert volume(ends, radius) < plain(points), shape.link
+    known = {int(one) for one in body_of(cell, text).capsules["link"]}
+    assert known == set(range(len(cell.joints.names) + 1))

@@ -1,0 +1,40 @@
+"""Colours: what is read or followed with the eye stands out from what is behind it."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.contract.records import Mode
+from service.report.page import MODE_COLOURS, TINT
+from service.settings import palette
+from service.settings.palette import BACKGROUND, LEAST_CONTRAST, MODES, PAPER, contrast, written
+
+LINES = {name: getattr(palette, name) for name in ("LEFT", "RIGHT", "TOOL", "TARGET", "MEASURED", "NEAREST", "PLACE")}
+LINES |= {name: getattr(palette, name) for name in ("OFF", "GATE", "LATENCY", "WORK", "LATENESS", "ARM")}
+LINES |= {f"joint {number}": colour for number, colour in enumerate(palette.JOINTS)}
+
+
+def channels(colour: str) -> palette.Colour:
+    """A colour from how it is written."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
+
+
+def test_contrast_is_that_of_wcag() -> None:
+    assert contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21.0)
+    assert contrast((119, 119, 119), (255, 255, 255)) == pytest.approx(4.48, abs=0.005)  # known: just too light
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_lines_stand_out_from_the_dark_and_on_paper(name: str) -> None:
+    assert contrast(LINES[name], BACKGROUND) >= LEAST_CONTRAST
+    assert contrast(channels(written(LINES[name])), PAPER) >= LEAST_CONTRAST
+
+
+def test_words_on_a_mode_are_read_in_the_banner_and_on_a_page() -> None:
+    for mode, colour in MODES.items():
+        assert contrast((0, 0, 0), colour) >= LEAST_CONTRAST
+        assert contrast((255, 255, 255), channels(MODE_COLOURS[mode])) >= LEAST_CONTRAST
+        if mode is not Mode.FOLLOW:  # only then a plot is tinted
+            tinted = [round(255 - TINT * (255 - value)) for value in channels(MODE_COLOURS[mode])]
+            assert all(value >= paper for value, paper in zip(tinted, PAPER, strict=True))

@@ -1,0 +1,149 @@
+"""The reach follows from the kinematics, however the arm is mounted; and what is configured beyond
+it is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.core.arm.stage import Arm
+from service.files.shipped import ARMS, cell_of
+from service.settings.config import Settings, SettingsError, load, parse, robot_description
+from service.settings.reachable import Shell, workspace_of
+from service.settings.urdf import Urdf
+from support.paths import ROOT
+from support.turning import sliding_cell
+
+UR5 = (ROOT / "service" / "arms" / "ur5.urdf").read_text(encoding="utf-8")
+CELL = """
+[arm]
+urdf = "arm.urdf"
+plate = "tool0"
+posture = [-0.407, -1.676, 2.118, -2.755, -1.287, 0.0]
+[joints]
+acceleration = [10.0, 10.0, 10.0, 10.0, 10.0, 10.0]
+jerk = [500.0, 500.0, 500.0, 500.0, 500.0, 500.0]
+"""
+MOUNTS = {
+    "as it is": None,
+    "0.6 m to the right": ("0 -0.6 0", "0 0 0"),
+    "on a stand": ("-0.3 0.4 0.4", "0 0 0.7"),
+    "from the ceiling": ("0.5 0 1.2", "3.14159265 0 0"),
+    "from a wall": ("0 0.7 0.6", "1.57079633 0 0"),
+}
+
+
+def mounted(text: str, xyz: str, rpy: str) -> str:
+    return text.replace(
+        "</robot>",
+        f'<link name="world"/><joint name="mount" type="fixed"><parent link="world"/><child link="base_link"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>',
+    )
+
+
+def cell_in(folder: Path, text: str, more: str = "") -> Settings:
+    (folder / "arm.urdf").write_text(text)
+    (folder / "cell.toml").write_text(CELL + more)
+    return load(folder / "cell.toml")
+
+
+def reached(cell: Settings, points: NDArray[np.float64]) -> float:
+    """The share of points (N, 3) [m] that the arm's inverse kinematics reach within 1 cm, by damped
+    least squares from several postures.
+    """
+    arm = Arm(cell, robot_description(cell))
+    lower, upper = np.maximum(cell.joints.lower, -math.pi), np.minimum(cell.joints.upper, math.pi)
+    random, found = np.random.default_rng(3), 0
+    for point in points:
+        for _ in range(25):
+            q, damping = random.uniform(lower, upper), 1e-3
+            for _ in range(60):
+                here = arm.at(q)
+                error = point - here.position
+                if (distance := float(np.linalg.norm(error))) < 0.01:
+                    break
+                jacobian = here.jacobian[:3]
+                step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(3), error)
+                q = np.clip(q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-9)), lower, upper)
+            if distance < 0.01:
+                found += 1
+                break
+    return found / len(points)
+
+
+def targets(cell: Settings, count: int) -> NDArray[np.float64]:
+    """Places (N, 3) at which targets may be [m]."""
+    reach, random = cell.reach, np.random.default_rng(1)
+    points = np.array(reach.centre) + reach.outer * random.uniform(-1.0, 1.0, (50 * count, 3))
+    away = np.linalg.norm(points - reach.centre, axis=1)
+    kept = (away >= reach.inner) & (away <= reach.outer) & (points[:, 0] >= reach.min_x) & (points[:, 2] >= reach.min_z)
+    return points[kept][:count]
+
+
+@pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
+def test_all_targets_of_a_default_reach_are_reached_by_inverse_kinematics(
+    mount: tuple[str, str] | None, tmp_path: Path
+) -> None:
+    cell = cell_in(tmp_path, mounted(UR5, *mount) if mount else UR5)
+    assert cell.reach.outer > 0.85
+    assert reached(cell, targets(cell, 60)) >= 0.95
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_the_shipped_cells_have_a_reach_about_as_their_kinematics_give(arm: str) -> None:
+    cell = cell_of(arm)
+    joints, reach = cell.joints, cell.reach
+    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
+    workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
+    found = workspace.shell(reach.min_x, reach.min_z)
+    assert found.centre == pytest.approx(reach.centre, abs=0.001)
+    assert found.outer == pytest.approx(reach.outer, abs=0.07)
+    assert workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z) > 0.99
+
+
+def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
+    cell = sliding_cell(tmp_path)
+    joints = cell.joints
+    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
+    workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
+    assert workspace.shoulder == pytest.approx((0.0, 0.0, 0.089), abs=1e-3)
+    assert 1.15 < workspace.extent < 0.95 + 0.31  # the rail is 0.3 m long each way
+    ends = np.array([(0.5, y, 0.2) for y in (-1.05, 1.05, -1.3, 1.3)])
+    assert workspace.reaches(ends).tolist() == [True, True, False, False]
+    assert reached(cell, targets(cell, 40)) >= 0.95
+
+
+def test_the_tool_belongs_to_the_reach(tmp_path: Path) -> None:
+    plain = cell_in(tmp_path, UR5)
+    longer = cell_in(tmp_path, UR5, "[tool]\nplate_from_tool = [0, 0, 0.2, 0, 0, 0, 1]\n")
+    assert longer.reach.outer == pytest.approx(plain.reach.outer + 0.19, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("mount", "reach", "share"),
+    [
+        (("0 -0.6 0", "0 0 0"), "centre = [0.0, 0.0, 0.089]\ninner = 0.3\nouter = 0.85", r"[56]\d %"),
+        (("0 0 0", "0 0 0"), "outer = 2.0", r"[12]?\d %"),
+        (("-2.5 0 0", "0 0 0"), "", "0 %"),
+        (("0 0 0", "0 0 0"), "min_x = 1.0", "0 %"),
+    ],
+)
+def test_a_reach_that_the_arm_has_not_is_refused_with_what_it_has(
+    mount: tuple[str, str], reach: str, share: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingsError, match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics"):
+        cell_in(tmp_path, mounted(UR5, *mount), f"[reach]\n{reach}\n")
+
+
+def test_what_is_said_of_a_reach_stays(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path, UR5, "[reach]\nouter = 0.7\nmin_z = 0.1\n")
+    assert (cell.reach.outer, cell.reach.min_z) == (0.7, 0.1)
+    assert cell.reach.inner < 0.7
+    assert cell.reach.centre == pytest.approx((0.0, 0.0, 0.0892), abs=1e-3)
+    with pytest.raises(SettingsError, match=r"\[reach\] inner: 0\.8 given; less than \[reach\] outer"):
+        parse(CELL.replace("arm.urdf", str(tmp_path / "arm.urdf")) + "[reach]\ninner = 0.8\nouter = 0.7\n", origin="c")

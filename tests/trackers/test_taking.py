@@ -1,0 +1,369 @@
+"""Demonstrations taken over Zenoh: what came is what is written, the tool is found from the joints,
+rest ends a take and is left out, and what was taken is shown, trimmed and deleted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from service.cli.main import main
+from service.cli.record_options import add_options
+from service.client import endpoints, open_session
+from service.contract import cdr, channels
+from service.contract.messages import JointState, PoseStamped
+from service.contract.requests import Add, encode_json
+from service.core.arm.stage import Arm
+from service.daemon.launch import free_port
+from service.files.demonstration_files import demonstration_paths, summary, table, trim, uncut
+from service.files.demonstration_reader import iter_hands, read_demonstration
+from service.files.dwells import REST_M
+from service.files.mcap_file import RecordingError
+from service.files.pose_streams import PoseTopic, Recorded
+from service.settings.config import HandSettings, Settings, ToolSettings, robot_description
+from service.trackers.capture import JOINT_STATES, KEPT_S, MOVED, REST_RAD, Capture, CaptureError, Sample, capture
+from sim.scene import Scene
+from sim.teach import perform
+from support.paths import ROOT
+
+SETTINGS = Settings(
+    hands=HandSettings(unit="mm", frame="tracker", base_from_tracker=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+)
+NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s": 9.0}
+
+
+@pytest.fixture(scope="module")
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """One that hears, and one that is connected to it and publishes."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as hearing, open_session(connect=endpoints(hearing)) as told:
+        yield hearing, told
+
+
+def heard(taken: Capture, count: int) -> None:
+    """Waits until so many messages came."""
+    end = time.monotonic() + 10
+    while sum(map(len, taken.samples.values())) + sum(taken.malformed.values()) < count:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+        taken.collect()
+
+
+def test_a_take_holds_what_came_and_the_tool_by_the_joints(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
+    hearing, told = sessions
+    taken, joints = Capture(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
+    publishers = {key: told.declare_publisher(f"bench/{key}") for key in taken.samples}
+    end, sent = time.monotonic() + 10, []
+    while not all(publisher.matching_status.matching for publisher in publishers.values()):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    for i in range(30):
+        stamp = 10**18 + i * 10_000_000
+        for side, y in (("left", -300.0), ("right", 300.0)):
+            sent.append(cdr.encode_pose(PoseStamped(stamp, "tracker", (10.0 * i, y, 0.0), (0.0, 0.0, 0.0, 1.0))))
+            publishers[f"hands/{side}"].put(sent[-1])
+        state = JointState(stamp, SETTINGS.joints.names, tuple((joints + 0.01 * i).tolist()), ())
+        publishers[JOINT_STATES].put(cdr.encode_joints(state))
+        heard(taken, 3 * (i + 1))
+    publishers["hands/left"].put(b"no pose")
+    publishers["hands/left"].put(cdr.encode_pose(PoseStamped(0, "", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
+    heard(taken, 92)
+    taken.close()
+    assert taken.malformed == {"hands/left": 2}
+    path = tmp_path / "a.mcap"
+    taken.write(path)
+    assert list(tmp_path.iterdir()) == [path]
+    assert sorted(payload for *_, payload in iter_hands(path)) == sorted(sent)
+    got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
+    assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
+    np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
+    assert Recorded(path).settings == SETTINGS
+    longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
+    of_joints = {"tool": PoseTopic("bench/joints/state")}
+    np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
+    moved = read_demonstration(path, settings=longer, topics=of_joints).tool - got.tool
+    np.testing.assert_allclose(np.linalg.norm(moved[:, :3], axis=1), 0.1)
+
+
+def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
+    with pytest.raises(
+        CaptureError, match=r"not heard: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
+    ):
+        capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
+    empty = Capture(sessions[0], "bench", SETTINGS)
+    empty.close()
+    with pytest.raises(CaptureError, match=r"nothing of hands/left, .* came in this time"):
+        empty.write(tmp_path / "a.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event) -> None:
+    """Publishes positions by key, ever again."""
+    publishers = {key: told.declare_publisher(key) for key in poses}
+    for i in range(2000):
+        for key, at in poses.items():
+            publishers[key].put(cdr.encode_pose(PoseStamped(i + 1, "base", at, (0.0, 0.0, 0.0, 1.0))))
+        if over.wait(0.01):
+            break
+
+
+@pytest.mark.parametrize(
+    ("poses", "wait_s", "words"),
+    [
+        (
+            {"bench/hands/left": (980.0, -320.0, 60.0), "bench/hands/right": (0, 0, 1), "bench/tool/pose": (0, 0, 1)},
+            20.0,
+            r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at most 5 m from the "
+            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing is recorded",
+        ),
+        (
+            {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
+            1.0,
+            r"not heard: hands/left, tool.*; heard instead: bench7/hands/left, thirdhand/hands/Left\. Are",
+        ),
+    ],
+)
+def test_what_is_published_otherwise_than_needed_is_said_before_anything_is_recorded(
+    sessions: tuple[zenoh.Session, zenoh.Session], poses: dict[str, Any], wait_s: float, words: str
+) -> None:
+    over = threading.Event()
+    tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
+    tracker.start()
+    try:
+        with pytest.raises(CaptureError, match=words):
+            capture(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
+    finally:
+        over.set()
+        tracker.join(10)
+
+
+def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
+    """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
+    taken, path = (
+        Capture(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker"))),
+        tmp_path / "a.mcap",
+    )
+    taken.close()
+
+    def told(tool: tuple[str, float]) -> None:
+        for key, frame, scale in (("hands/left", "tracker", 1e3), ("hands/right", "", 1e3), ("tool/pose", *tool)):
+            taken.samples[key] = [
+                Sample(
+                    10**18 + i * 10**7,
+                    cdr.encode_pose(PoseStamped(10**18 + i * 10**7, frame, (0.3 * scale, 0.0, 0.0), (0, 0, 0, 1.0))),
+                    np.zeros(3),
+                )
+                for i in range(9)
+            ]
+        taken.write(path)
+
+    told(("tracker", 1e3))
+    taken.check()
+    found = summary(path)
+    assert found.demonstration.tool[0, :3].tolist() == pytest.approx([0.3, 0.0, 0.0])
+    assert [line.split(":")[0] for line in found.remarks if "of motion" in line] == ["hands", "tool"]
+    told(("base", 1e3))
+    words = (
+        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is in metres, whatever \[hands\] unit says"
+    )
+    with pytest.raises(CaptureError, match=f"tool/pose is {words}"):
+        taken.check()
+    with pytest.raises(RecordingError, match=f"all 9 poses on tool/pose are too far, the first {words}"):
+        read_demonstration(path)
+    with pytest.raises(
+        RecordingError, match=r"all 9 poses on hands/left are too far, .* \[hands\] unit is 'm', at most"
+    ):
+        read_demonstration(path, settings=Settings(hands=HandSettings(frame="tracker")))
+
+
+@pytest.mark.parametrize("key", ["hands/right", "tool/pose"])
+def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begins(
+    sessions: tuple[zenoh.Session, zenoh.Session], key: str
+) -> None:
+    for hands, refused in ((HandSettings(), True), (HandSettings(frame="camera"), False)):
+        taken = Capture(sessions[0], "bench", Settings(hands=hands))
+        taken.close()
+        pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
+        taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
+        if refused:
+            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing is recorded"
+            with pytest.raises(CaptureError, match=words):
+                taken.check()
+        else:
+            taken.check()
+
+
+def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
+    """A sample each 10 ms up to now, at places (N,) along one axis [m]."""
+    times = end_ns - np.arange(len(way))[::-1] * 10_000_000
+    return [Sample(int(at_ns), b"", np.array([x, 0.0, 0.0])) for at_ns, x in zip(times, way, strict=True)]
+
+
+def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+    taken, now_ns = Capture(sessions[0], "bench", SETTINGS), time.time_ns()
+    taken.close()
+    noise = 0.002 * np.random.default_rng(0).standard_normal(400)
+    rest, motion = np.zeros(100), np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
+    for way, over in ((np.tile(rest, 4), False), (motion[:300], False), (motion, True)):
+        taken.samples |= {key: samples_of(noise[: len(way)], now_ns) for key in ("hands/left", "hands/right")}
+        taken.samples["tool/pose"] = samples_of(way, now_ns)
+        assert taken.is_over(1.0) is over
+    start_ns, end_ns = taken.span_of_motion()
+    wanted = now_ns - np.array([(400 - 100 - 5 + 30) * 10**7, (150 + 5 - 30) * 10**7])
+    np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, wanted - now_ns, atol=6e7)
+    assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
+    assert 190 < len(taken.samples["tool/pose"]) < 220
+
+
+def test_what_rest_is_is_told_as_it_is() -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    options = " ".join(parser.format_help().split())
+    assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
+    assert f"{KEPT_S:g} s are then retained" in options
+    tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
+    assert MOVED == 5, "the tutorial says five times"
+
+
+def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command, of the bench's teacher, eight times as fast."""
+    at = f"tcp/127.0.0.1:{free_port()}"
+    told = {"connect": [at], "cell": "thirdhand", "speed": 8.0, "wait_s": 20.0}
+    teacher = threading.Thread(target=perform, args=(Scene(),), kwargs=told | {"seed": 1})
+    teacher.start()
+    folder = ["--folder", str(tmp_path / "takes")]
+    ended = ["--until", "rest", "--rest", "0.5"]
+    (tmp_path / "places.json").write_bytes(encode_json(Add(Scene().via_points())))
+    ended += ["--places", str(tmp_path / "places.json"), "--person", "Ada"]
+    assert main(["record", "take-1", "--listen", at, *ended, *folder]) == 0
+    teacher.join(20)
+    path = tmp_path / "takes" / "take-1.mcap"
+    said = capsys.readouterr()
+    assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in said.err
+    assert "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after" in said.err
+    assert "ended by rest: hands and tool stay within 15 mm" in said.err
+    assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s behind it", said.err)
+    found = summary(path)
+    assert said.out.strip() == table(found)
+    assert "  by Ada\n  places handover, glass, soldering\n" in said.out
+    assert 1.0 < found.lasts_s < 2.5
+    assert [one.name for one in found.streams] == ["left", "right", "tool"]
+    assert all(one.poses > 20 and one.frame == "base" for one in found.streams)
+    tool = found.demonstration.tool[:, :3]
+    assert np.linalg.norm(tool[0] - Scene().robot_start) < 0.05
+    assert np.linalg.norm(tool[-1] - Scene().carry) < 0.05
+
+    with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
+        trim(path, 20, 30)
+    assert summary(path).lasts_s == found.lasts_s
+    assert trim(path, 0, 20).startswith("nothing is cut: ")
+    whole = path.read_bytes()
+    assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
+    assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
+    assert re.search(
+        r"\d\.\d s cut to 0\.\d s; the uncut take is kept as .*take-1\.mcap\.uncut", capsys.readouterr().err
+    )
+    assert "the uncut take is still " in trim(path, 0, 0.4)
+    assert uncut(path).read_bytes() == whole
+    assert demonstration_paths(path.parent) == [path]
+    assert main(["replay", str(path)]) == 1
+    assert f"; it is a take: thirdhand record take-1 --folder {path.parent} --show" in capsys.readouterr().err
+    with pytest.raises(RecordingError, match=r"takes is a folder: give its files, .*takes/\*\.mcap"):
+        read_demonstration(path.parent)
+    assert summary(path).demonstration.places == Scene().via_points()
+    assert summary(path).demonstration.person == "Ada"
+    assert Recorded(path).settings == Settings()
+    capsys.readouterr()
+    (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
+    assert main(["record", "--list", *folder]) == 1
+    said = capsys.readouterr()
+    assert "take-0 " in said.out
+    assert "is not an MCAP file" in said.out
+    assert "Hz, right " in said.out
+    assert "2 takes in" in said.err
+    assert main(["record", "take-1", "--delete", *folder]) == 0
+    assert not path.exists()
+    assert not uncut(path).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ([], 2, "a take's name needed, or --list"),
+        (["a", "--list"], 2, "a take's name needed, or --list"),
+        (["--list", "--folder", "nofolder"], 1, "nofolder does not exist: a folder of takes needed (--folder)"),
+        (["../a", "--show"], 2, "accepted as a take's name"),
+        (["a", "--delete"], 1, "no take 'a' in "),
+        (["there"], 1, "is there already: another name needed, or --delete it first"),
+        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
+        (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
+        (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
+        (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
+        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),
+    ],
+)
+def test_what_cannot_be_meant_is_said(
+    tmp_path: Path, arguments: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there.mcap").write_bytes(b"")
+    glass = {"name": "glass", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0]}
+    (tmp_path / "places.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
+    arguments = [str(tmp_path / "places.json") if one == "PLACES" else one for one in arguments]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.cli.record.CONNECT_TIMEOUT_S", 0.2)
+        folder = [] if "--folder" in arguments else ["--folder", str(tmp_path)]
+        assert main(["record", *arguments, *folder]) == code
+    assert words in capsys.readouterr().err
+
+
+def test_hands_are_passed_on_by_a_daemons_session(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+    """Whoever takes a demonstration as a client of a daemon hears what another client publishes."""
+    daemon, tracker = sessions
+    with open_session(connect=endpoints(daemon), more={"mode": "client"}) as client:
+        taken = Capture(client, "bench", SETTINGS)
+        publisher = tracker.declare_publisher(channels.key("bench", "hands/left"))
+        end = time.monotonic() + 10
+        while not taken.samples["hands/left"]:
+            assert time.monotonic() < end
+            publisher.put(cdr.encode_pose(PoseStamped(1, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
+            time.sleep(0.02)
+            taken.collect()
+        taken.close()
+
+
+@pytest.mark.parametrize("who", ["left", "right"])
+def test_a_hand_that_conducts_alone_is_taken_without_the_other(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, who: str
+) -> None:
+    hearing, told = sessions
+    taken = Capture(hearing, "alone", Settings(), who)  # type: ignore[arg-type]
+    assert taken.missing == [f"hands/{who}", "tool/pose or joints/state"]
+    for i in range(20):
+        for key in ("hands/left", "hands/right", "tool/pose"):
+            at = (0.01 * i, 0.0, 0.5)
+            told.put(f"alone/{key}", cdr.encode_pose(PoseStamped(10**18 + i * 10**7, "base", at, (0.0, 0.0, 0.0, 1.0))))
+        heard(taken, 2 * (i + 1))
+    taken.close()
+    taken.write(tmp_path / "a.mcap")
+    got = read_demonstration(tmp_path / "a.mcap")
+    assert got.conducts == who
+    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(Recorded(tmp_path / "a.mcap").topics)
+    np.testing.assert_array_equal(got.left, got.right)
+    lines = table(summary(tmp_path / "a.mcap")).splitlines()
+    assert any(f"the {who} hand conducts alone" in line for line in lines)
+    assert [line.split()[0] for line in lines if line.endswith(" m/s")] == [who, "tool"]

@@ -1,0 +1,191 @@
+"""What a drawing shows: its arrangement, the arm without meshes, labels, a picture's moment."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from service.cli.main import main
+from service.cli.view import RRD_MAGIC, last_followed, screenshot
+from service.contract.messages import SceneObject
+from service.contract.printable import as_markdown, printable
+from service.contract.records import Mode, Reason
+from service.contract.requests import encode_json
+from service.core.separation.body import body_of
+from service.core.skill.skill import Skill
+from service.settings.config import WAM, Settings
+from service.viewer.blueprint import blueprint
+from service.viewer.stream import Viewer
+from support.recorded import TEXT, at_ns, drawn, ticks, values, views
+from support.wicked import WICKED, wicked_skill
+
+
+def viewer(**where: Any) -> Viewer:
+    """A viewer of the shipped arm."""
+    return Viewer(urdf=WAM, settings=Settings(), **where)
+
+
+def test_modes_lie_below_the_curves_and_end_with_them_and_most_of_the_time_axis_is_data() -> None:
+    arranged = blueprint(Settings(), live=False, end_s=20.0)
+    (task, timing, _) = arranged.root_container.contents
+    for tab in (task, timing):
+        *_, below = tab.contents[-1].contents
+        assert below.name == "Mode"
+        ends = [span_s(view, "TimeAxis") for view in views(tab.contents[-1]) if "TimeAxis" in view.properties]
+        assert len(ends) >= 3
+        assert len({end for _, end in ends}) == 1
+        assert 20.0 / ends[0][1] > 0.8
+
+
+def span_s(view: Any, part: str) -> tuple[float, float]:
+    """Begin and end [s] of a view's time axis."""
+    (found,) = view.properties[part].view_range.as_arrow_array().to_pylist()
+    return found["start"] / 1e9, found["end"] / 1e9
+
+
+@pytest.mark.usefixtures("drawing")
+def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(600):
+        if tick.index >= 400:
+            frame["mode"], frame["reason"] = Mode.FAULT, Reason.ARM_SILENT
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert last_followed(tmp_path / "a.rrd", 599 * 2_000_000) == 400 * 2_000_000 - 1
+    screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
+    screenshot(tmp_path / "a.rrd", tmp_path / "b.png", time=0.5)
+    corners = []
+    for name in ("a.png", "b.png"):
+        with Image.open(tmp_path / name) as picture:
+            corners.append(np.asarray(picture.crop((picture.width - 200, 0, picture.width, 28)).convert("L"), int))
+    assert all((corner > 128).sum() > 50 for corner in corners)  # the time stands there
+    assert (corners[0] != corners[1]).any()
+
+
+def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
+    mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
+    (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
+    found = tmp_path / "packages" / "wam_description"
+    (found / "meshes").mkdir(parents=True)
+    (found / "package.xml").write_text("<package><name>wam_description</name></package>", encoding="utf-8")
+    corner = "".join(f"  vertex {x} {y} 0\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+    solid = f"solid a\nfacet normal 0 0 1\n outer loop\n{corner} endloop\nendfacet\nendsolid a\n"
+    (found / "meshes" / "link.stl").write_text(solid, encoding="utf-8")
+    for folder, is_drawn in ((tmp_path / "nowhere", True), (tmp_path / "packages", False)):
+        monkeypatch.setenv("ROS_PACKAGE_PATH", str(folder))
+        one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
+        for tick, frame, timing in ticks(30):
+            one.add(frame, at_ns(tick.index), timing)
+        one.close()
+        assert one.problems == []
+        rows = drawn(tmp_path / "a.rrd")
+        radii = [len(values(rows[path], "Capsules3D:radii")[0]) for path in rows if path.startswith("/arm/capsules/")]
+        assert sum(radii) == (len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0)
+        said = [text for (text,) in values(rows["/log"], TEXT) if "ROS_PACKAGE_PATH" in text]
+        assert len(said) == is_drawn
+        assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
+
+
+def test_capsules_around_collision_meshes_are_drawn_with_the_arm(tmp_path: Path) -> None:
+    shape = re.compile("(<collision>.*?<geometry>).*?(</geometry>)", re.DOTALL)
+    mesh = r'\1<mesh filename="link.stl" covered_by="0 0 0 0 0 0.1 0.05"/>\2'
+    (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    paths = [path for path in drawn(tmp_path / "a.rrd") if "/capsules/" in path]
+    assert len(paths) == len(Settings().joints.names) + 1
+    assert all(path.startswith("/arm/") for path in paths)
+
+
+def test_the_name_of_a_thing_that_a_place_has_too_is_shown_once(tmp_path: Path, skill: Skill) -> None:
+    at, size = (0.5, 0.38, 0.16), (0.1, 0.1, 0.006)
+    found = [SceneObject(name, "cylinder", "base", at, (0, 0, 0, 1), size, (1, 1, 1, 1)) for name in ("glass", "iron")]
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index == 10:
+            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    shown = [values(rows[f"/scene/things/{name}/name"], "Points3D:show_labels")[-1] for name in ("glass", "iron")]
+    assert shown == [[False], [True]]
+    assert "glass" in values(rows["/skill/places/tool"], "Points3D:labels")[-1]
+
+
+def test_demonstrations_are_paler_and_thinner_than_the_ways_of_hands(tmp_path: Path, skill: Skill) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    demonstrated, live = rows["/skill/demonstrations/left"], rows["/scene/left_trail"]
+    assert max(opacity(colour) for colour in values(demonstrated, "LineStrips3D:colors")[-1]) <= 40
+    assert opacity(values(live, "LineStrips3D:colors")[-1][0]) == 255
+    assert -1 < min(values(demonstrated, "LineStrips3D:radii")[-1]) < 0  # in pixels: less than one
+
+
+def opacity(colour: int) -> int:
+    """How opaque a colour is, of 255."""
+    return colour & 0xFF
+
+
+@pytest.mark.usefixtures("drawing")
+def test_of_several_files_the_last_is_pictured_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        one = viewer(rrd=tmp_path / f"{name}.rrd")
+        for tick, frame, timing in ticks(60):
+            one.add(frame, at_ns(tick.index), timing)
+        one.close()
+    files = [str(path) for path in sorted(tmp_path.glob("*.rrd"))]  # as a shell expands thirdhand-demo/*.rrd
+    assert main(["view", *files, "--screenshot", str(tmp_path / "scene.png")]) == 0
+    said = capsys.readouterr()
+    assert said.err == f"the picture is of {files[1]}, the last of 2 files\n"
+    with Image.open(tmp_path / "scene.png") as picture:
+        assert picture.width > 1000
+
+
+def test_without_vulkan_one_line_tells_what_a_picture_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, os.devnull)
+    (tmp_path / "a.rrd").write_bytes(RRD_MAGIC)
+    assert main(["view", str(tmp_path / "a.rrd"), "--screenshot", str(tmp_path / "a.png")]) == 1
+    error = capfd.readouterr().err
+    assert error.startswith("thirdhand view: a picture without a screen needs a Vulkan driver")
+    assert "apt install mesa-vulkan-drivers" in error
+    assert error.count("\n") == 1
+
+
+def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
+    thing = SceneObject(WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1))
+    one = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index == 10:
+            one.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
+            one.note("log", f"rejected: {WICKED}", at_ns(tick.index))
+            one.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))
+    assert values(rows[named], "Points3D:labels")[-1] == [printable(WICKED)]
+    log = [text for (text,) in values(rows["/log"], "TextLog:text")]
+    assert f"rejected: {printable(WICKED)}" in log
+    assert f"Skill {printable(WICKED)} is in force." in log
+    ((about,),) = values(rows["/about/skill"], "TextDocument:text")
+    assert as_markdown(WICKED) in about
+    assert all(line.isprintable() for text in (*log, about) for line in text.split("\n"))

@@ -1,0 +1,104 @@
+"""Viewers that lag: what they do not read is left out, not queued, and who comes later sees what
+is new.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from service.cli.live_page import STREAM
+from service.settings.config import WAM, Settings
+from service.viewer.stream import Viewer, rerun_program
+from support.recorded import at_ns, drawn, ticks, values
+
+TIMES_REAL, SCENE_S = 4, 48  # of 500 ticks
+BOUND_MB = 100.0
+TIMEOUT_S = 60.0
+
+
+def resident_mb() -> float:
+    """What this process holds in memory [MB]."""
+    (line,) = (row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmRSS"))
+    return int(line.split()[1]) / 1000
+
+
+class Fed:
+    """A live view that is fed on and on."""
+
+    def __init__(self) -> None:
+        self.viewer, self.last = Viewer(urdf=WAM, settings=Settings(), live_port=0), 0
+        assert self.viewer.url is not None
+        self.url, self._ticks = self.viewer.url, ticks(1_000_000)
+
+    def feed(self, scene_s: float) -> None:
+        """Adds so much of the scene [s], in a quarter of the time."""
+        began = time.monotonic()
+        for k in range(round(scene_s * 500)):
+            tick, frame, timing = next(self._ticks)
+            self.viewer.add(frame, at_ns(tick.index), timing)
+            self.last = tick.index
+            time.sleep(max(0.0, began + k / 500 / TIMES_REAL - time.monotonic()))
+
+
+@contextlib.contextmanager
+def browser(url: str) -> Iterator[None]:
+    """A page that asked for the stream and reads nothing."""
+    connection = http.client.HTTPConnection(urlsplit(url.removeprefix("rerun+")).netloc, timeout=TIMEOUT_S)
+    kind = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
+    connection.request("POST", STREAM, bytes(5), kind)
+    with contextlib.closing(connection):
+        yield
+
+
+@contextlib.contextmanager
+def program(url: str, file: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Rerun's program, which saves what it receives."""
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen([str(rerun_program()), "--save", str(file), url], stdout=quiet, stderr=quiet) as viewer:
+        try:
+            yield viewer
+        finally:
+            viewer.kill()
+
+
+@contextlib.contextmanager
+def stopped(url: str, file: Path) -> Iterator[None]:
+    """Rerun's program, stopped once it receives."""
+    with program(url, file) as viewer:
+        until = time.monotonic() + TIMEOUT_S
+        while not (file.is_file() and file.stat().st_size > 10_000):
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        viewer.send_signal(signal.SIGSTOP)
+        yield
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still written
+def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_see_what_is_new(tmp_path: Path) -> None:
+    fed = Fed()
+    fed.feed(4.0)
+    with browser(fed.url), stopped(fed.url, tmp_path / "stopped.rrd"):
+        before_mb = resident_mb()
+        fed.feed(SCENE_S)
+        assert resident_mb() - before_mb < BOUND_MB
+    connected = fed.last
+    with program(fed.url, tmp_path / "later.rrd") as viewer:
+        until = time.monotonic() + TIMEOUT_S
+        seen = -1
+        while seen <= connected:
+            assert viewer.poll() is None
+            assert time.monotonic() < until
+            fed.feed(4.0)
+            with contextlib.suppress(OSError, KeyError, RuntimeError):  # before it has anything, or within a message
+                seen = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
+    fed.viewer.close()
+    assert fed.viewer.problems == []

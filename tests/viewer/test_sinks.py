@@ -1,0 +1,475 @@
+"""The viewer's tap: what is drawn is in the file, failures spare the rest, a recording becomes a
+drawing.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.cli.main import main
+from service.cli.usage import UsageError
+from service.cli.view import convert, moment, screenshot
+from service.contract import cdr
+from service.contract.messages import JointState, SceneObject
+from service.contract.records import Mode, Reason
+from service.contract.requests import ViaPoint, encode_json
+from service.core.skill.model import REGION_95
+from service.core.skill.pose import CLOSED
+from service.core.skill.skill import Skill
+from service.files.mcap_file import RecordingError
+from service.files.recording import OBJECTS
+from service.learning.skill_file import with_file
+from service.settings.config import WAM, Settings, parse
+from service.viewer.banner import banner
+from service.viewer.blueprint import blueprint
+from service.viewer.sentences import sentence
+from service.viewer.stream import Viewer, ViewerError
+from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
+from support.turning import sliding_cell
+from support.wam import JOINT_NAMES
+
+
+def viewer(**where: Any) -> Viewer:
+    """A viewer of the shipped arm."""
+    return Viewer(urdf=WAM, settings=Settings(), **where)
+
+
+def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: Path) -> None:
+    told = write(tmp_path / "a.mcap", 1200)
+    assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 1200
+    rows = drawn(tmp_path / "a.rrd")
+    position = [row for row in rows["/joints/position"] if "tick" in row]
+    assert [row["tick"] for row in position] == list(range(1200))
+    assert [row["Scalars:scalars"] for row in position] == [frame["joints"].tolist() for _, frame, _ in told]
+    assert np.datetime64(position[-1]["time"], "ns") == np.datetime64(at_ns(1199), "ns")
+    names = next(row["SeriesLines:names"] for row in rows["/joints/position"] if row.get("SeriesLines:names"))
+    assert len(names) == len(JOINT_NAMES)
+    work = [row["Scalars:scalars"][0] for row in rows["/timing/work"] if "tick" in row]
+    assert work == pytest.approx([timing["work_us"] for *_, timing in told])
+
+
+@pytest.mark.parametrize(("rate_hz", "mb_per_hour"), [(500, 200.0), (1000, 200.0), (500, 100.0)])
+def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
+    tmp_path: Path, rate_hz: int, mb_per_hour: float
+) -> None:
+    """One of 30 s with hands that tremble and objects that move; every tick of it would take more
+    than 1.7 GB an hour.
+    """
+    settings, random = Settings(rate_hz=rate_hz), np.random.default_rng(1)
+    one = Viewer(urdf=WAM, settings=settings, mb_per_hour=mb_per_hour, rrd=tmp_path / "a.rrd")
+    period_ns = 1_000_000_000 // rate_hz
+    (_, frame, timing), *_ = list(ticks(600))[-1:]
+    changes, latest, sizes = [], 0.0, []
+    for i in range(30 * rate_hz):
+        shown, measured = frame.copy(), timing.copy()
+        shown["tick"], measured["tick"] = i, i
+        for name in ("joints", "joint_velocities", "joint_accelerations", "hands", "target", "tool", "setpoint"):
+            shown[name] += random.normal(0, 0.002, shown[name].shape)
+        if i % 7001 == 6000:  # for one tick
+            shown["mode"], shown["reason"] = Mode.HOLD, Reason.OPERATOR
+            changes.append(i)
+        measured["lateness_us"] = latest = 5000.0 if i == 8003 else 40.0
+        if i % (rate_hz // 25) == 0:
+            where, look = (0.5, 0.1, 1e-5 * i), ((0.0, 0.0, 0.0, 1.0), (0.08, 0.05, 0.002), (0.0, 0.5, 0.0, 1.0))
+            things = [SceneObject(name, "box", "base", where, *look) for name in ("board", "glass", "iron")]
+            one.note(OBJECTS, msgspec.json.encode(things).decode(), i * period_ns)
+        one.add(shown, i * period_ns, measured)
+        if i % (10 * rate_hz) == 10 * rate_hz - 1:
+            one.flush()
+            sizes.append((tmp_path / "a.rrd").stat().st_size)
+    one.close()
+    assert latest == 40.0
+    assert one.problems == []
+    begins, grows = sizes[0] / 1e6, (sizes[2] - sizes[1]) / 1e6
+    assert 6 * begins + 360 * grows < mb_per_hour  # an hour of files of ten minutes
+    assert 360 * grows > 0.5 * mb_per_hour  # and it is made use of
+    rows = drawn(tmp_path / "a.rrd")
+    at = [row["tick"] for row in rows["/joints/position"] if "tick" in row]
+    assert {*changes, *(i + 1 for i in changes)} <= set(at)
+    assert sum(tick >= 20 * rate_hz for tick in at) > 10 * 5 * mb_per_hour / 100  # in the last 10 s
+    late = {row["tick"]: row["Scalars:scalars"][0] for row in rows["/timing/lateness"] if "tick" in row}
+    (peak,) = [tick for tick, value in late.items() if value > 4000]
+    assert 8003 <= peak < 8003 + rate_hz
+
+
+def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    told = list(ticks(600))
+    for tick, frame, timing in told:
+        one.add(frame, at_ns(tick.index), timing)
+    one.log("handover taught", "INFO", at_ns(300))
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    at = {path: [row["tick"] for row in found if row.get("tick") is not None] for path, found in rows.items()}
+    every = list(range(0, 600, 5))
+    assert at["/scene/tool"] == at["/arm/joints/3"] == every
+    assert at["/scene/left_hand"] == at["/scene/target"] == [tick for tick in every if tick >= 10]
+    assert len(at["/scene/tool_trail"]) == 600 // 25 - 1
+    assert [row["Points3D:positions"][0] for row in rows["/scene/left_hand"] if "tick" in row][-1] == pytest.approx(
+        told[595][1]["hands"][0]
+    )
+    half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
+    assert sorted(half) == pytest.approx(sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4)
+    assert [row["StateChange:state"] for row in rows["/mode"] if row.get("tick") is not None] == [
+        ["hold"],
+        ["follow"],
+    ]
+    assert Counter(row["TextLog:text"][0] for row in rows["/log"]) == {
+        "hold: no hands: a hand has not been seen since the start": 1,
+        "follow": 1,
+        "handover taught": 1,
+    }
+    links = {path.split("/")[4] for path in rows if path.startswith("/arm/wam/visual_geometries/")}
+    assert {"base", "upper_arm", "palm"} <= links
+    assert not [path for path in rows if "collision" in path]
+
+
+def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(300):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    seconds = [moment.total_seconds() for moment in values(rows["/joints/position"], "seconds")]
+    assert seconds == pytest.approx(np.arange(300) / 500)
+    names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
+    told = [name for found in names.values() for several in found for name in several]
+    assert len(told) > 30
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
+
+
+def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(900):
+        if 300 <= tick.index < 600:  # away, and then back elsewhere
+            frame["hand_ages"][0] = tick.index - 300
+        if tick.index >= 600:
+            frame["hands"][0] += 0.5
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    strips = [found[0] for found in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")]
+    corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
+    assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
+    steps = [np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips]
+    assert max(step.max() for step in steps if len(step)) < 0.1
+    assert any(len(strip) == 0 for strip in strips)
+
+
+@pytest.mark.parametrize("conducts", [0, 1])
+def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(200):
+        frame["hand_ages"][1 - conducts] = -1
+        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
+        frame["tool"] += [0.02, 0.0, 0.0]
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    followed = list(range(10, 200))
+    assert values(rows["/scene/target"], "tick") == followed[::5]
+    for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
+        assert values(rows[path], "tick") == followed
+        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
+    ages = np.array(values(rows["/age"], "Scalars:scalars"))
+    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
+    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
+
+
+def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"] = 1
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told)), ("hold", b"")])
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
+    assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
+
+
+def test_an_arm_that_slides_is_drawn_in_metres_where_it_is(tmp_path: Path) -> None:
+    cell = sliding_cell(tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"], frame["joints"][0] = 1, 0.002 * tick.index
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(frame["joints"] + 0.02), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    (names,) = values(rows["/joints/velocity"], "SeriesLines:names")
+    assert (names[0], names[1]) == ("rail [m/s]", "shoulder pan [rad/s]")
+    places = np.array(values(rows["/arm/joints/0"], "Transform3D:translation"), np.float64).reshape(-1, 3)
+    assert np.ptp(places[:, 1]) == pytest.approx(0.002 * 95, abs=1e-5)
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
+
+
+def test_turns_of_a_continuous_joint_are_no_error(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(WAM.read_text().replace('type="revolute"', 'type="continuous"', 1))
+    posture, limits = list(Settings().arm.posture), f"acceleration = {[5.0] * 7}\njerk = {[200.0] * 7}"
+    text = f'[arm]\nurdf = "arm.urdf"\nplate = "tool_plate"\nposture = {posture}\n[joints]\n{limits}\n'
+    cell = parse(text, origin="cell.toml", folder=tmp_path)
+    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        frame["commanded"] = 1
+        frame["joints"][0] += 20.0
+        position = frame["joints"] + 0.02
+        position[0] = np.remainder(position[0] + np.pi, 2 * np.pi) - np.pi
+        told = JointState(at_ns(tick.index), cell.joints.names, tuple(position), ())
+        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
+    one.close()
+    assert one.problems == []
+    found = values(drawn(tmp_path / "a.rrd")["/joints/error"], "Scalars:scalars")
+    assert np.ravel(found) == pytest.approx(np.full(100, 0.02))
+
+
+def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
+        one.add(
+            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
+        )
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    for number in range(len(JOINT_NAMES)):
+        first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
+        assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
+        assert np.max(first["Transform3D:scale"]) < 1e-3
+        assert not any(row.get("Transform3D:scale") for row in later)
+
+
+def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
+    tmp_path: Path, skill: Skill
+) -> None:
+    place = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    told = list(ticks(40))
+    for tick, frame, timing in told[:20]:
+        one.add(frame, at_ns(tick.index), timing)
+    one.learn(with_file(replace(skill, via_points=(place,))).file)
+    for tick, frame, timing in told[20:]:
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
+    assert len(lines) >= 5
+    assert all(len(line) > 50 for line in lines)
+    before, after = (rows["/skill/places/tool"][at].get("Points3D:labels") or [] for at in (0, -1))
+    assert "vise" not in before
+    assert "vise" in after
+    half = dict(zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True))
+    assert half["vise"] == pytest.approx([0.03] * 3)
+    assert "vise" in values(rows["/about/skill"], "TextDocument:text")[-1][0]
+    (gate,) = set(np.ravel(values(rows["/deviation/gate"], "Scalars:scalars")))
+    assert gate == pytest.approx(1000 * skill.threshold)
+
+
+def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Path, skill: Skill) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    turned = Rotation.from_euler("x", 3, degrees=True)
+    for tick, made, timing in ticks(200):
+        frame = made.copy()
+        if tick.index >= 100:
+            frame["closure"], frame["gripper"] = 0.7, CLOSED
+            frame["orientation_covariance"] = np.radians(2.0) ** 2 * np.eye(3)
+            frame["tool_orientation"] = (Rotation.from_quat(frame["orientation"]) * turned).as_quat()
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    told = {
+        path: np.ravel(values(rows[path], "Scalars:scalars")) for path in rows if path.startswith(("/turn", "/grip"))
+    }
+    assert told["/turn/target"][-50:] == pytest.approx(3.0, abs=1e-6)
+    assert told["/turn/std"] == pytest.approx([2.0] * 100)
+    assert told["/gripper/predicted"][-100:] == pytest.approx([70.0] * 100)
+    assert told["/gripper/commanded"] == pytest.approx([100.0] * 100)
+
+
+def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert one.problems == []
+    rows = drawn(tmp_path / "a.rrd")
+    assert len(values(rows["/joints/position"], "tick")) == 30
+    assert any(text.startswith("a skill of which nothing can be drawn") for (text,) in values(rows["/log"], TEXT))
+
+
+def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
+    board = SceneObject("board", "box", "tool_plate", (0, 0, 0.05), (0, 0, 0, 1), (0.08, 0.05, 0.002), (0, 0.5, 0, 1))
+    glass = SceneObject(
+        "glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1)
+    )
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(60):
+        one.add(frame, at_ns(tick.index), timing)
+        if tick.index in (10, 40):
+            found = (board, glass)[: 1 if tick.index == 40 else 2]
+            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
+    one.note("requests", 'via_points {"op": "clear"}', at_ns(50))
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {"tool_plate"}
+    assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx([0.04, 0.025, 0.001])
+    assert values(rows["/scene/things/glass"], "Cylinders3D:radii")[0] == pytest.approx([0.05])
+    assert values(rows["/scene/things/glass"], "Clear:is_recursive") == [[True]]
+    for name, over in (("board", (0, 0, -0.01)), ("glass", (0.5, 0.38, 0.22))):
+        assert values(rows[f"/scene/things/{name}/name"], "Points3D:labels")[0] == [name]
+        assert values(rows[f"/scene/things/{name}/name"], "Points3D:positions")[0][0] == pytest.approx(over)
+    assert ["All that was taught is forgotten."] in values(rows["/log"], "TextLog:text")
+
+
+@pytest.mark.parametrize(
+    ("note", "said"),
+    [
+        ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
+        ('via_points {"op": "remove", "names": ["a"]}', "Forgotten: a."),
+        ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
+        ('skill {"name": "soldering"}', "Skill soldering is in force."),
+        ("hold {}", "An operator stopped the arm; it stays until resumed."),
+        ("reset failed: OSError()", "A request to reset failed: OSError()"),
+        ("hold what", "hold what"),
+        ("3 ticks before tick 7 are not recorded", "3 ticks before tick 7 are not recorded"),
+    ],
+)
+def test_the_log_speaks_in_sentences(note: str, said: str) -> None:
+    assert sentence(note) == said
+
+
+def test_each_mode_has_a_banner_of_its_own_colour_that_holds_its_words() -> None:
+    assert banner(Mode.HOLD, Reason.FAR_FROM_DEMONSTRATIONS).shape == banner(Mode.FOLLOW, Reason.NONE).shape
+    corners = {tuple(banner(mode, Reason.NONE)[0, 0].tolist()) for mode in Mode}
+    assert len(corners) == len(Mode)
+    for reason in Reason:
+        picture = banner(Mode.FAULT, reason)
+        assert (picture[:, -4:] == picture[0, 0]).all()  # no letter is cut off
+        assert not (picture == picture[0, 0]).all()
+
+
+def test_missed_deadlines_stand_in_the_log(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(20):
+        timing["missed"] = 3 if tick.index > 10 else 0
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert "3 deadlines missed before tick 19" in [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"]]
+
+
+def test_a_destination_that_fails_is_named_and_spares_the_other(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        one = viewer(rrd=tmp_path / "a.rrd", live_port=port)
+        assert one.url is None
+        assert one.problems == [
+            f"the live view ended: port {port} on 127.0.0.1: Address already in use; choose another, or 0 for any"
+        ]
+        for tick, frame, timing in ticks(30):
+            one.add(frame, at_ns(tick.index), timing)
+        one.close()
+    assert len(one.problems) == 1
+    assert len(drawn(tmp_path / "a.rrd")["/joints/position"]) == 31
+
+
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    one = viewer(rrd=Path("/dev/full"))
+    for tick, frame, timing in ticks(30):
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    assert any("/dev/full" in problem and "No space left" in problem for problem in one.problems)
+    write(tmp_path / "a.mcap", 20)
+    with pytest.raises(ViewerError, match="No space left"):
+        convert(tmp_path / "a.mcap", "/dev/full")
+
+
+def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
+    one = viewer(live_port=0)
+    assert one.problems == []
+    assert one.url is not None
+    port = int(one.url.rsplit(":", 1)[1].split("/")[0])
+    for tick, frame, timing in ticks(300):
+        one.add(frame, at_ns(tick.index), timing)
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+        assert connection.getpeername()[0] == "127.0.0.1"
+    with pytest.raises(OSError, match="refused"), socket.create_connection(("127.0.0.2", port), timeout=5):
+        pass
+    one.close()
+    assert one.problems == []
+
+
+@pytest.mark.parametrize(("curves_mm", "is_shown"), [(30.0, True), (200.0, True), (20.0, False)])
+def test_where_it_holds_is_within_the_axis_or_far_off_and_left_out(curves_mm: float, is_shown: bool) -> None:
+    arranged = blueprint(Settings(), live=False, gate_m=0.104, tops={"/deviation": curves_mm}, end_s=14.0)
+    found = [view for view in views(arranged.root_container) if view.origin == "/deviation"]
+    assert len(found) == 2
+    for view in found:
+        (low, high) = view.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
+        assert low == 0
+        assert high == pytest.approx(1.25 * max(curves_mm, 104.0 if is_shown else 0.0))
+        assert ("- $origin/gate" in view.contents) != is_shown
+
+
+def test_a_picture_is_of_a_moment_that_there_is() -> None:
+    extent = (5_000_000_000, 19_258_000_000)
+    assert [moment(extent, time) for time in (None, 0.0, 14.25)] == [extent[1], extent[0], 19_250_000_000]
+    with pytest.raises(UsageError, match=r"--time 99: seconds from 0 to 14\.25 needed"):
+        moment(extent, 99.0)
+
+
+def test_errors_say_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"no recording .*a\.mcap"):
+        convert(tmp_path / "a.mcap", tmp_path / "a.rrd")
+    with pytest.raises(ViewerError, match=r"there is no .*a\.rrd"):
+        screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["a.rrd", "--screenshot", "."], "is a folder, the name of a file needed"),
+        (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
+        (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
+        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
+        (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
+        (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["live", "a.rrd"], "live beside 1 files; either live alone or files needed"),
+        (["press.npz", "a.rrd"], "press.npz is neither"),
+        (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
+        ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
+        (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_in_words(
+    arguments: list[str],
+    error: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("press.npz").write_bytes(b"PK")
+    assert main(["view", *arguments]) in (1, 2)
+    said = capsys.readouterr().err
+    assert re.search(error, said)
+    assert said.startswith("thirdhand view: ")
+    assert len(said.splitlines()) == 1
