@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from service.contract.explain import in_words
 from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
@@ -17,6 +16,7 @@ import msgspec
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
+from service.contract.explain import in_words
 from service.contract.printable import printable_lines
 from service.daemon.launch import ENGINES, LaunchError, engine_of
 from service.files.shipped import ARMS, cell_of

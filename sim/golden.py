@@ -7,7 +7,6 @@ again, for a change of behaviour that is meant.
 
 from __future__ import annotations
 
-from service.contract.explain import in_words
 from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from service.contract import cdr
+from service.contract.explain import in_words
 from service.contract.requests import TOLERANCE_M
 from service.core.controller import Controller, Tap, outgoing, run
 from service.core.frame import Event, Frame, Tick, differences, order

@@ -13,7 +13,6 @@ Each says where it listens, if it does, or else that it began; port 0 takes a fr
 
 from __future__ import annotations
 
-from service.contract.explain import in_words
 from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
@@ -32,6 +31,7 @@ from collections.abc import Iterator
 
 from service.client import endpoints, open_session
 from service.contract import cdr, channels, messages
+from service.contract.explain import in_words
 from service.daemon.clock import Deadlines
 from service.process import child
 from sim.scene import Scene

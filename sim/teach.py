@@ -4,7 +4,6 @@ the same seed), or published live for `thirdhand record`.
 
 from __future__ import annotations
 
-from service.contract.explain import in_words
 from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
@@ -22,6 +21,7 @@ import zenoh
 from service.client import ClientSettings, client_settings
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
+from service.contract.explain import in_words
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
 from service.files.demonstration_reader import write_demonstration
