@@ -19,25 +19,55 @@ html_show_sphinx = False
 html_copy_source = False
 
 LINK = re.compile(r"(!?\[[^]]*\])\(([^)\s]+)\)")
-# The order of the navigation; pages that are named nowhere come last, under "More".
+# The navigation: four parts, each in the order to read it. Pages without a part are under "More".
 GROUPS = {
+    "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm"),
     "How to": (
         "install",
-        "tutorial",
+        "record-takes",
+        "other-recordings",
+        "arrays",
         "places",
         "pose",
-        "recordings",
-        "arrays",
-        "reports",
-        "viewing",
+        "unseen-hands",
         "hardware",
+        "own-arm",
+        "ros2-control",
+        "rate",
+        "look",
+        "viewing",
+        "reports",
+        "recordings",
         "network",
-        "ros2",
         "access",
+        "ros2",
         "coming-from",
+        "CONTRIBUTING",
+        "SECURITY",
     ),
-    "Reference": ("settings", "wire", "incidents", "library", "glossary"),
-    "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments", "evidence"),
+    "Reference": (
+        "command-line",
+        "settings",
+        "tuning",
+        "wire",
+        "client",
+        "library",
+        "incidents",
+        "faults",
+        "glossary",
+    ),
+    "Explanation": (
+        "how-it-works",
+        "frames",
+        "model",
+        "learning",
+        "safety",
+        "bounds",
+        "built-on",
+        "timing",
+        "experiments",
+        "evidence",
+    ),
 }
 
 
@@ -54,9 +84,12 @@ def navigation() -> str:
 
 
 def front() -> str:
-    """The README, with its links as from this folder, and the navigation."""
+    """The README, with its links as from this folder, the index one level deeper, and the
+    navigation.
+    """
     text = (HERE.parent / "README.md").read_text(encoding="utf-8")
-    return LINK.sub(lambda link: f"{link[1]}({_from_here(link[2])})", text) + navigation()
+    pages = re.sub("^#", "##", (HERE / "index.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return LINK.sub(lambda link: f"{link[1]}({_from_here(link[2])})", text) + pages + navigation()
 
 
 def _from_here(target: str) -> str:

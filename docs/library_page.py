@@ -1,80 +1,132 @@
-"""`python docs/library_page.py` writes library.md: all that `kmp` offers, as its docstrings say."""
+"""`python docs/library_page.py` writes the two pages on Python from docstrings: library.md on
+`kmp`, and client.md on `service.client`.
+"""
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import kmp
 from kmp import estimator, orientation
+from service import client
+from service.contract import requests
 
-PAGE = Path(__file__).with_name("library.md")
-HEAD = """# The library `kmp`
+HERE = Path(__file__).parent
+LIBRARY = """# The library `kmp`
 
 <!-- Written by `python docs/library_page.py` from the docstrings in kmp/: change it there. -->
 
-All names are those of `import kmp`, but where a heading has a module. The
-[tutorial](../kmp/README.md) shows how they go together, and
-[a page of its own](coming-from.md) where to find what other libraries have.
+This page lists every function and class of `kmp`. All names are those of `import kmp`, except where
+a heading names a module. The [tutorial of kmp](../kmp/README.md) shows how they work together. If
+you know pbdlib, gmr or movement_primitives, [this page](coming-from.md) compares them with `kmp`.
 
 Letters: N reference points, M queries, V via-points, T samples, I inputs, O outputs. Values are
-immutable. What is wrong in a call is a ValueError that names the argument.
+immutable. A wrong argument raises a ValueError that names it.
 
-"""
-GROUPS = {
+![A primitive over time: its mean, regions of 1 and 2 standard deviations, and a via-point](kmp-over-time.png)
+
+The picture shows a primitive with two outputs. The mean passes through the via-point, and the
+regions are narrow where the demonstrations agree. The tutorial of kmp draws it step by step."""
+CLIENT = """# The Python client
+
+<!-- Written by `python docs/library_page.py` from the docstrings in service/client: change it there. -->
+
+This page lists what a program in Python needs to talk to a running daemon. All names are those of
+`import service.client`. The programs in [examples](../examples) use them, and the
+[wire](wire.md) describes the messages behind them.
+
+Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
+radians, or in metres if they slide.
+
+![The frames of a cell: base, plate, tool, tracker and both hands](frames.png)"""
+KMP_GROUPS = {
     "Learn": ("learn", "Learned", "Score", "GaussianMixture", "gaussian_process_reference", "Gaussians"),
     "Primitives": ("KMP", "MotionPrediction", "Uncertainty", "OrientationKMP", "LocalKMP", "CoordinateFrame"),
     "Kernels and means": ("GaussianKernel", "PeriodicKernel", "VelocityKernel", "AffineMean"),
     "Beyond": ("LinearConstraints", "superposed", "Correlation", "improve", "Improvement"),
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
 }
+CLIENT_GROUPS = {
+    "Connect": ("client_settings", "ClientSettings", "open_session", "endpoints"),
+    "Requests": ("Client",),
+    "Hands and joints": ("Tracker", "Follower", "Command"),
+    "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
+    "Errors": ("UnreachableError", "StartingError", "RefusedError"),
+}
+VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of service.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
 INSIDE = {"to_plot", "inner"}
-MADE_BY_THE_LIBRARY = {"KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"}
+RETURNED = {
+    *("KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"),
+    *("Command", "Cell", "ViaPointInForce", "Reply"),
+}  # values that a caller receives and does not construct
 
 
-def page() -> str:
-    """The page."""
-    parts = [HEAD.rstrip()]
-    for group, names in GROUPS.items():
-        parts += [f"## {group}", *(part for name in names for part in _told(name, getattr(kmp, name)))]
+def pages() -> dict[Path, str]:
+    """The texts of the pages, by their files."""
+    return {HERE / "library.md": _library(), HERE / "client.md": _client()}
+
+
+def _library() -> str:
+    """The page on `kmp`."""
+    parts = [LIBRARY, *_groups(KMP_GROUPS, kmp)]
     parts += ["## Orientations, `kmp.orientation`", inspect.cleandoc(orientation.__doc__ or "")]
     for name, value in inspect.getmembers(orientation, inspect.isfunction):
         if value.__module__ == orientation.__name__ and not name.startswith("_"):
-            parts += _told(name, value)
-    parts += ["## With scikit-learn, `kmp.estimator`", *_told("KMPRegressor", estimator.KMPRegressor)]
+            parts += _described(name, value)
+    parts += ["## With scikit-learn, `kmp.estimator`", *_described("KMPRegressor", estimator.KMPRegressor)]
     return "\n\n".join(parts) + "\n"
 
 
-def _told(name: str, value: Any) -> Iterator[str]:
-    """A function, or a class and what its values do."""
-    warns = inspect.isclass(value) and issubclass(value, Warning)
+def _client() -> str:
+    """The page on `service.client`."""
+    parts = [CLIENT, *_groups(CLIENT_GROUPS, client), "## Values, `service.contract.requests`"]
+    parts += [part for name in VALUES for part in _described(name, getattr(requests, name))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _groups(groups: dict[str, tuple[str, ...]], module: Any) -> Iterator[str]:
+    """The sections of a page: the names of a module below their headings."""
+    for group, names in groups.items():
+        yield f"## {group}"
+        for name in names:
+            yield from _described(name, getattr(module, name))
+
+
+def _described(name: str, value: Any) -> Iterator[str]:
+    """A function, or a class and its methods and properties."""
+    raised = inspect.isclass(value) and issubclass(value, Warning | Exception)
     yield f"### {name}"
-    if name not in MADE_BY_THE_LIBRARY and not warns:
-        yield _called(name, value)
+    if name not in RETURNED and not raised:
+        yield _signature(name, value)
     yield inspect.cleandoc(value.__doc__ or "")
-    if not inspect.isclass(value) or warns or name in WITHOUT_METHODS:
+    if not inspect.isclass(value) or raised or name in WITHOUT_METHODS:
         return
-    for part, one in inspect.getmembers(value):
-        ours = getattr(inspect.unwrap(getattr(one, "fget", getattr(one, "func", one))), "__module__", "") or ""
-        if part.startswith("_") or not ours.startswith("kmp.") or part in INSIDE or not one.__doc__:
+    for part, member in inspect.getmembers(value):
+        module = getattr(inspect.unwrap(getattr(member, "fget", getattr(member, "func", member))), "__module__", "")
+        ours = (module or "").startswith(("kmp.", "service."))
+        if part.startswith("_") or not ours or part in INSIDE or not member.__doc__:
             continue
-        yield _called(f"{name}.{part}", one) if callable(one) else f"`{name}.{part}`:"
-        yield inspect.cleandoc(one.__doc__)
+        yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
+        yield inspect.cleandoc(member.__doc__)
 
 
-def _called(name: str, value: Any) -> str:
-    """How it is called: its arguments by their names, without types, which the docstrings tell."""
+def _signature(name: str, value: Any) -> str:
+    """A call with the names of its arguments; their types are in the docstring."""
     signature = inspect.signature(value)
     parameters = [one.replace(annotation=one.empty) for one in signature.parameters.values() if one.name != "self"]
     arguments = str(signature.replace(parameters=parameters, return_annotation=signature.empty))
-    told = name + arguments
-    if len(told) > 96:
-        told = f"{name}(\n    " + arguments[1:-1].replace(", ", ",\n    ") + ",\n)"
-    return f"```python\n{told}\n```"
+    arguments = arguments.replace("'", '"')  # as the formatter writes it
+    text = name + arguments
+    if len(text) > 96:
+        text = f"{name}(\n    " + re.sub(r", (?![^(]*\))", ",\n    ", arguments[1:-1]) + ",\n)"
+    return f"```python\n{text}\n```"
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")

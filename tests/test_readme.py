@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
@@ -36,6 +37,24 @@ def test_the_program_runs_as_it_stands_and_the_service_follows_its_hands(tmp_pat
     number = r"-?\d+\.\d+"
     place = rf"\({number}, {number}, {number}\)"
     assert re.fullmatch(rf"mode follow: the tool is at {place}, its target at {place}\n", done.stdout)
+
+
+def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
+    """Its program as it stands, but shorter: the left hand moves to the tool once."""
+    page = (ROOT / "docs" / "first-tracker.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"<!-- tracker -->\n```python\n(.*?)```", page, re.DOTALL)
+    with serving(tmp_path, "--arm", "assumed") as daemon:
+        environment = os.environ | {"THIRDHAND_CONNECT": daemon.endpoint, "PYTHONPATH": str(ROOT)}
+        before = daemon.client.status().tool_m
+        command = [sys.executable, "-c", code.replace("range(3000)", "range(315)")]
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        after = daemon.client.status().tool_m
+    assert before is not None
+    assert after is not None
+    assert math.dist(before, after) > 0.1
 
 
 def test_the_environment_is_activated_before_the_first_bare_command() -> None:

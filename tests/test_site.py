@@ -16,12 +16,15 @@ import jinja2
 import pytest
 
 import kmp
+from service import client
+from service.cli.main import GROUPS
 from sim.experiments.evidence import EXPERIMENTS
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings") for path in folder.glob("*.md"))
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `service.client`, for the service's own programs
 
 
 def program(name: str) -> ModuleType:
@@ -39,17 +42,38 @@ def written_by(name: str) -> str:
     return str(program(name).page())
 
 
-def test_the_page_on_settings_is_that_of_the_settings() -> None:
-    written = (DOCS / "settings.md").read_text(encoding="utf-8")
-    assert written == written_by("settings_page"), "run `python docs/settings_page.py`"
+@pytest.mark.parametrize("name", ["settings", "command-line"])
+def test_a_page_that_a_program_writes_is_the_one_that_it_writes_now(name: str) -> None:
+    writer = f"{name.replace('-', '_')}_page"
+    assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), f"run `python docs/{writer}.py`"
 
 
-def test_the_page_on_the_library_is_that_of_its_docstrings_and_tells_all_that_it_offers() -> None:
-    written = (DOCS / "library.md").read_text(encoding="utf-8")
-    assert written == written_by("library_page"), "run `python docs/library_page.py`"
-    assert set(kmp.__all__) <= set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
-    for called in ("KMP.predict(queries)", "KMP.plot(", "LocalKMP.placed(frames)", "Gaussians.product(*others)"):
-        assert called in written
+def test_the_page_on_the_command_line_has_every_command_and_option() -> None:
+    written = written_by("command_line_page")
+    commands = {name for names in GROUPS.values() for name in names}
+    assert set(re.findall(r"^## thirdhand ([\w-]+)$", written, re.MULTILINE)) == commands
+    for text in ("### thirdhand via-points add", "| `--web [[HOST:]PORT]` |", "| `--at X Y Z` |", "`DEMO ...`"):
+        assert text in written
+
+
+def test_the_pages_on_python_are_those_of_the_docstrings_and_have_every_name() -> None:
+    for page, written in program("library_page").pages().items():
+        assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
+        module = {"library": kmp, "client": client}[page.stem]
+        headings = set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
+        assert {name for name in module.__all__ if callable(getattr(module, name)) and name not in INSIDE} <= headings
+        called = {
+            "library": ("KMP.predict(queries)", "KMP.plot(", "LocalKMP.placed(frames)", "Gaussians.product(*others)"),
+            "client": ("Client.load_skill(name)", "Tracker.publish(", "Follower.command(timeout_s=0.02)"),
+        }
+        assert [text for text in called[page.stem] if text not in written] == []
+
+
+def test_the_index_and_the_navigation_have_every_page() -> None:
+    there = {path.stem for path in DOCS.glob("*.md")} - {"index"}
+    linked = {link.removesuffix(".md") for link in LINK.findall((DOCS / "index.md").read_text(encoding="utf-8"))}
+    assert there <= linked
+    assert there <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
 def test_the_figures_of_the_experiments_are_those_of_the_results_and_marked_where_they_are_stale() -> None:
