@@ -4,14 +4,18 @@ wire, ROS 2 topics. Words that the glossary retires do not come back.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+import sim.__main__
+from service.cli import main
 from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
 from service.contract.records import Cause, Flag, Mode, Reason
@@ -200,6 +204,34 @@ PAGES = sorted(
     for path in folder.glob("*.md")
     if path.name != "CHANGELOG.md"
 )
+
+
+def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The commands below a parser."""
+    actions = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))  # noqa: SLF001
+    return {name: found for action in actions for name, found in action.choices.items()}
+
+
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    """The options of a command and of the commands below it."""
+    return {*parser._option_string_actions}.union(*map(options, commands(parser).values()))  # noqa: SLF001
+
+
+OPTIONS = {name: options(found) for name, found in (commands(main.parser()) | {"sim": sim.__main__.parser()}).items()}
+TABLES = {name: set(found) for name, found in msgspec.to_builtins(Settings()).items() if isinstance(found, dict)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_options_settings_and_files_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    code = re.findall(r"```(?:sh|console)\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL)
+    for name, rest in re.findall(r"(?:^|\s)thirdhand ([a-z][a-z-]*)([^|&#\n]*)", "\n".join(map("".join, code))):
+        assert name in OPTIONS, f"thirdhand {name}"
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest)) <= OPTIONS[name] | {"--help"}, name + rest
+    for table, name in re.findall(r"\[(\w+)\] (\w+)", text):
+        assert table not in TABLES or name in TABLES[table], f"[{table}] {name}"
+    for file in re.findall(r"`((?:service|sim|kmp|tests|docs|examples)/[\w./-]+\.\w+)`", text):
+        assert (ROOT / file).exists(), file
 
 
 def test_the_data_flow_is_drawn_once() -> None:
