@@ -4,8 +4,8 @@ shipped arm in its posture, a camera as the tracker, and a tool of 15 cm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib as mpl
 
@@ -36,8 +36,7 @@ LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class CoordinateFrame:
+class CoordinateFrame(NamedTuple):
     """A frame at an origin (3,) [m], with its axes as columns (3, 3)."""
 
     name: str

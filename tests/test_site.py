@@ -76,6 +76,14 @@ def test_the_index_and_the_navigation_have_every_page() -> None:
     assert there <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
+@pytest.mark.parametrize("name", ["frames", "loop"])
+def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawing = program(f"{name}_picture")
+    monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")
+    drawing.main()
+    assert (tmp_path / "drawn.png").stat().st_size > 20_000
+
+
 def test_the_figures_of_the_experiments_are_those_of_the_results_and_marked_where_they_are_stale() -> None:
     for page, text in program("experiments_page").pages().items():
         assert page.read_text(encoding="utf-8") == text, "run `python docs/experiments_page.py`"
