@@ -1,4 +1,4 @@
-"""The documentation as a site, of all pages in this folder: `python -m sphinx docs out/site`."""
+"""Configuration of the site that `python -m sphinx docs out/site` builds of all pages here."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ GROUPS = {
         "unseen-hands",
         "hardware",
         "own-arm",
+        "franka",
         "ros2-control",
+        "near-people",
         "rate",
         "look",
         "viewing",
@@ -72,14 +74,14 @@ GROUPS = {
 
 
 def navigation() -> str:
-    """The tables of contents of the pages that are there."""
-    there = {path.stem for path in HERE.glob("*.md")} - {"index"}
+    """The tables of contents of the pages that exist."""
+    pages = {path.stem for path in HERE.glob("*.md")} - {"index"}
     named = {name for names in GROUPS.values() for name in names}
-    groups = GROUPS | {"More": tuple(sorted(there - named))}
+    groups = GROUPS | {"More": tuple(sorted(pages - named))}
     return "".join(
         f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{lines}\n```\n"
         for caption, names in groups.items()
-        if (lines := "\n".join(name for name in names if name in there))
+        if (lines := "\n".join(name for name in names if name in pages))
     )
 
 
@@ -99,8 +101,8 @@ def _from_here(target: str) -> str:
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:
-    """As each page is read: the front page is the README, and what a link within the project leads
-    to but no site holds, folders and pages that are not in this one, is named instead.
+    """Change the source of a page before it is parsed. The front page is the README. A link to a
+    folder, or to a page outside of this site, becomes a name.
     """
     text = front() if page == "index" else source[0]
     source[0] = LINK.sub(_named_if_outside, text)

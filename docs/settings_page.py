@@ -67,7 +67,7 @@ def page() -> str:
 
 
 def _section(kind: Any, name: str) -> Iterator[str]:
-    """The heading, text and table of one table of the file; of the file itself without a name."""
+    """The heading, text and table of one table of the file. Without a name: of its top level."""
     comments = _comments(kind)
     if name:
         yield f"\n## [{name}]\n\n{_paragraphs(kind)}\n"
@@ -85,14 +85,14 @@ def _paragraphs(kind: Any) -> str:
 def _comments(kind: Any) -> dict[str, str]:
     """The comment beside each field of a class, by the field's name."""
     source = textwrap.dedent(inspect.getsource(kind))
-    told: dict[int, str] = {}
+    comments: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            told[token.start[0]] = token.string.removeprefix("#").strip()
+            comments[token.start[0]] = token.string.removeprefix("#").strip()
     fields = [node for node in ast.parse(source).body[0].body if isinstance(node, ast.AnnAssign)]  # type: ignore[attr-defined]
     return {
         ast.unparse(node.target): " ".join(
-            told[line] for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in told
+            comments[line] for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in comments
         )
         for node in fields
     }
@@ -103,7 +103,7 @@ def _default(field: types.Field) -> Any:
 
 
 def _value(value: Any) -> str:
-    """A default as TOML, or that there is none."""
+    """A default as TOML, or a remark if there is none."""
     if value is msgspec.NODEFAULT:
         return "must be given"
     return f"`{_toml(value)}`"
@@ -122,8 +122,8 @@ def _toml(value: Any) -> str:
 def _accepted(kind: Any) -> str:
     """The accepted values of a setting, in words."""
     if isinstance(kind, types.Metadata):
-        told = (kind.extra or {}).get("accepted")
-        return str(told).rstrip(",") if told else _accepted(kind.type)
+        words = (kind.extra or {}).get("accepted")
+        return str(words).rstrip(",") if words else _accepted(kind.type)
     if isinstance(kind, types.LiteralType):
         return ", ".join(f"`{_toml(value)}`" for value in kind.values)
     if isinstance(kind, types.BoolType):
@@ -144,8 +144,8 @@ def _accepted(kind: Any) -> str:
 
 
 def _each(kind: Any) -> str:
-    told = _range(kind)
-    return f", each {told}" if told else ""
+    bounds = _range(kind)
+    return f", each {bounds}" if bounds else ""
 
 
 def _range(kind: Any) -> str:

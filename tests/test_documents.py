@@ -1,5 +1,5 @@
 """The pages agree with the code: incidents, faults with their figures, tests behind promises, the
-wire, ROS 2 topics. Words that the glossary retires do not come back.
+wire, ROS 2 topics, commands, options, settings and files. Words that the glossary retires stay out.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ def table(head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_the_manual_says_of_each_word_what_the_service_says() -> None:
+def test_the_page_on_incidents_has_the_words_of_the_service() -> None:
     """Add a member, explain it, and put the row that this test misses into the manual."""
 
     def rows(*members: incidents.Member) -> list[list[str]]:
-        told = [(incidents.word(member), *incidents.explained(member)[:2]) for member in members]
-        return sorted([f"`{word}`", about, remedy] for word, about, remedy in told if word)
+        explained = [(incidents.word(member), *incidents.explained(member)[:2]) for member in members]
+        return sorted([f"`{word}`", about, remedy] for word, about, remedy in explained if word)
 
     reasons = [(row[0], row[2], row[3]) for row in table("reason")]
     assert sorted(table("mode")) == rows(*Mode)
@@ -56,7 +56,7 @@ def test_the_manual_says_of_each_word_what_the_service_says() -> None:
     assert set(modes.values()) == {"hold", "fault"}
 
 
-def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
+def test_every_field_of_the_status_is_explained_and_no_other() -> None:
     def named(cells: Iterable[str]) -> list[str]:
         return sorted(word for cell in cells for word in re.findall(r"`(\w+)`", cell))
 
@@ -65,30 +65,30 @@ def test_what_a_status_carries_is_told_of_and_nothing_else() -> None:
     scribe = next(row[1] for row in table("field") if row[0] == "`scribe`")
     assert named([scribe]) == sorted(Scribe(Settings()).status())
     fields = {*requests.Status.__struct_fields__, *requests.Source.__struct_fields__, *named([scribe])}
-    told = re.findall(r"`(\w+)`(?:, (?:under|in) `(\w+)`| in the status|, under `rejected`)", MANUAL)
-    words = "".join(told.about + told.remedy for told in incidents.BY_WORD.values())
-    told += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
-    assert {word for pair in told for word in pair if word} <= fields
+    mentioned = re.findall(r"`(\w+)`(?:, (?:under|in) `(\w+)`| in the status|, under `rejected`)", MANUAL)
+    words = "".join(entry.about + entry.remedy for entry in incidents.BY_WORD.values())
+    mentioned += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
+    assert {word for pair in mentioned for word in pair if word} <= fields
 
 
-def test_each_view_that_a_document_names_by_its_title_is_there() -> None:
+def test_each_view_that_a_page_names_by_its_title_exists() -> None:
     titles = {view.title for view in plot_views(Settings()).values()}
     for name in ("incidents.md", "viewing.md"):
         text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-        told = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
-        assert told <= titles
-        assert told or name != "incidents.md"
+        named = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
+        assert named <= titles
+        assert named or name != "incidents.md"
 
 
-def test_the_table_of_signs_is_the_arms() -> None:
+def test_the_table_of_signs_is_that_of_the_shipped_arm() -> None:
     text = (ROOT / "docs" / "hardware.md").read_text(encoding="utf-8")
     arm, names = Arm(Settings(), robot_description(Settings())), Settings().joints.names
     begin = np.array([0.0, 0.5, 0.0, 1.5, 0.0, -1.0, 0.0])
-    told = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)
-    assert [row[0] for row in told] == list(names)
-    for i, (_, *said) in enumerate(told):
+    rows = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)
+    assert [row[0] for row in rows] == list(names)
+    for i, (_, *written_mm) in enumerate(rows):
         moved = arm.at(begin + 0.3 * (np.arange(7) == i)).position - arm.at(begin).position
-        np.testing.assert_allclose(1000 * moved, [float(v) for v in said], atol=0.51)
+        np.testing.assert_allclose(1000 * moved, [float(v) for v in written_mm], atol=0.51)
     assert "({:.3f}, {:.3f}, {:.3f}) m".format(*arm.at(begin).position) in text
     assert f"{arm.at(np.zeros(7)).position[2]:.3f} m above" in text
 
@@ -127,8 +127,8 @@ def rows_of(page: str, first: str) -> list[str]:
     return [line for line in lines if line.startswith(first)]
 
 
-def says(channel: Channel) -> str:
-    """Who publishes or answers on a channel."""
+def publisher(channel: Channel) -> str:
+    """The role that publishes or answers on a channel."""
     if channel.direction == "out":
         return "the service" + ", which answers too" * channel.queryable
     if channel.direction == "request":
@@ -139,13 +139,13 @@ def says(channel: Channel) -> str:
 def test_the_table_of_the_wire_is_the_table_of_channels() -> None:
     assert rows_of("wire.md", "| `<cell>/") == [
         f"| `<cell>/{channel.key}` | `{channel.codec.type}` | `application/{channel.codec.encoding}` | "
-        f"{says(channel)} | {channel.rate} | {channel.about} |"
+        f"{publisher(channel)} | {channel.rate} | {channel.about} |"
         for channel in CHANNELS
         if channel.direction != "recording"
     ]
 
 
-def test_the_table_of_topics_is_what_ros2_is_told() -> None:
+def test_the_table_of_topics_is_that_of_the_ros2_node() -> None:
     does = {True: "subscribes | best effort, volatile", False: "publishes | reliable, volatile"}
     assert rows_of("ros2.md", "| `/<cell>/") == [
         f"| `/<cell>/{channel.key}` | `{ros2.type_of(channel)}`{', JSON' * (channel.codec.encoding == 'json')} | "
@@ -180,7 +180,7 @@ RETIRING = ("rehearse", "FASTEST", "Placed")
 
 
 def with_word(word: str) -> list[str]:
-    """Sources and pages, but the glossary, that hold a whole word."""
+    """Sources and pages that contain a whole word; without the glossary."""
     pattern = re.compile(rf"(?<!\w){re.escape(word)}" + r"(?!\w)" * word[-1].isalnum())
     folders = (ROOT / name for name in ("service", "kmp", "sim", "docs", "examples"))
     files = [path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".md", ".html")]

@@ -1,5 +1,5 @@
-"""The documentation: a site can be built of it, no link in it leads nowhere, and the pages that
-programs write are those of the code.
+"""The site of the documents: it builds without a warning, every link has a target, and the pages
+that programs write are those of the code.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def written_by(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", ["settings", "command-line"])
-def test_a_page_that_a_program_writes_is_the_one_that_it_writes_now(name: str) -> None:
+def test_a_generated_page_is_up_to_date(name: str) -> None:
     writer = f"{name.replace('-', '_')}_page"
     assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), f"run `python docs/{writer}.py`"
 
@@ -84,12 +84,12 @@ def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatc
     assert (tmp_path / "drawn.png").stat().st_size > 20_000
 
 
-def test_the_figures_of_the_experiments_are_those_of_the_results_and_marked_where_they_are_stale() -> None:
+def test_the_figures_of_the_experiments_are_those_of_the_results() -> None:
     for page, text in program("experiments_page").pages().items():
         assert page.read_text(encoding="utf-8") == text, "run `python docs/experiments_page.py`"
 
 
-def test_a_figure_without_a_result_and_a_stale_result_do_not_go_unseen() -> None:
+def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() -> None:
     page = program("experiments_page")
     options = {"share": 1.0, "arm": "wam", "set": "test"}
     results: dict[str, dict[str, Any]] = {
@@ -111,7 +111,7 @@ def test_a_figure_without_a_result_and_a_stale_result_do_not_go_unseen() -> None
         written("{{ phase.tremor }}")
 
 
-def test_what_users_of_other_libraries_are_told_of_is_there_and_runs() -> None:
+def test_names_and_programs_for_users_of_other_libraries_exist_and_run() -> None:
     text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
     cells = [line.strip("| ").split("|")[-1] for line in text.splitlines() if line.startswith("| ")]
     names = {name for cell in cells for name in re.findall(r"`([A-Za-z]\w*(?:\.\w+)*)[`(]", cell)}
@@ -137,7 +137,7 @@ def anchor(heading: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_no_link_within_the_project_leads_nowhere(page: Path) -> None:
+def test_every_link_within_the_project_has_a_target(page: Path) -> None:
     for link in LINK.findall(page.read_text(encoding="utf-8")):
         if re.match(r"[a-z]+:", link):
             continue
