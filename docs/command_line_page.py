@@ -106,7 +106,7 @@ def _meaning(action: argparse.Action) -> str:
     text = " ".join((action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%").split())
     if action.required and action.option_strings:
         text += " (required)"
-    return re.sub(r"(<[^>]+>)", r"`\1`", text).replace("|", "\\|")
+    return re.sub(r"(<\w+>[/\w]*)", r"`\1`", text).replace("|", "\\|")
 
 
 def _sentence(text: str) -> str:
