@@ -17,8 +17,9 @@ from typing import Any
 
 import jinja2
 
-from sim.experiments.evidence import EXPERIMENTS, RESULTS, result_of, staleness, tree
-from sim.experiments.moving_hands import MOST_LATE_S, UNSEEN_S
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.evidence import RESULTS, result_of, staleness, tree
+from sim.experiments.people.moving_hands import MOST_LATE_S, UNSEEN_S
 
 HERE = Path(__file__).parent
 WIDTH = 100

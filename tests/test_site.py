@@ -16,7 +16,7 @@ import jinja2
 import pytest
 
 import kmp
-from sim.experiments.evidence import EXPERIMENTS
+from sim.experiments.catalogue import EXPERIMENTS
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"

@@ -18,7 +18,8 @@ from pathlib import Path
 from types import ModuleType
 
 from service.contract.explain import ExplainedError, in_words
-from sim.experiments.evidence import EXPERIMENTS, RESULTS, commit, origin, result_of, staleness, tree
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.evidence import RESULTS, commit, origin, result_of, staleness, tree
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
 from sim.faulty_cell import FaultError
 from sim.parts import PartError
@@ -164,7 +165,7 @@ def main(arguments: list[str] | None = None) -> int:
                     print(f"{args.output / name}.json  belongs to this tree", flush=True)
                     continue
                 results = Results(args.output, name, said=not args.quiet)
-                experiment = importlib.import_module(f"sim.experiments.{name.removesuffix(OF_OTHERS)}")
+                experiment = importlib.import_module(f"sim.experiments.{EXPERIMENTS[name].module}")
                 redraw(results, experiment) if args.redraw else make(results, experiment, one)
             except Exception as error:
                 failed = True

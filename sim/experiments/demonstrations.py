@@ -15,15 +15,15 @@ from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
-from sim.experiments.beside_the_paper import at_the_events
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
+from sim.experiments.reproduction.beside_the_paper import at_the_events
 from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import GRASP_DISTANCE, Scene
 
-SEEDS = BY_EXPERIMENT["demonstrations"]
+SEEDS = EXPERIMENTS["demonstrations"].seeds
 MOST, ORDERS, SCENES = 10, SEEDS.learned["orders"], SEEDS.evaluation["scenes"]
 EVERY = 4  # of the samples, to save time
 

@@ -13,18 +13,18 @@ from service.contract.records import Mode
 from service.files.recording import Recording
 from service.files.shipped import shipped_skill
 from sim.bench import Bench, TaskEvents
-from sim.experiments import rivals
-from sim.experiments.beside_the_paper import differences
-from sim.experiments.live import live_run
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.load.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse
+from sim.experiments.reproduction.beside_the_paper import differences
 from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
+from sim.experiments.rivals import in_scenes as rivals
 from sim.experiments.scenes import Drawn
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.network import RunReport
 from sim.scene import Scene
 from sim.world import pixels
 
-SEED = BY_EXPERIMENT["hands"].evaluation["hands"].seed
+SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
 NOMINAL = Drawn(Scene(), 1.0, (), SEED)
 MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED

@@ -24,15 +24,15 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.settings.config import Settings
 from sim.experiments import spectra
-from sim.experiments.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
-from sim.experiments.linear_floor import best_linear
-from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
+from sim.experiments.people.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
+from sim.experiments.rivals.linear_filters import best_linear
 from sim.experiments.workers import shared_out
 
-SEEDS = BY_EXPERIMENT["motion"]
+SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "hands"))
 SECONDS = 15.0
 SETTLED_MM = 5.0

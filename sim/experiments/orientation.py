@@ -19,18 +19,18 @@ from service.files.shipped import shipped_skill
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.scenes import OFFSET_M, draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
 
 EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
 SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
 COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # of the position, as the shipped skill
-SCENES = BY_EXPERIMENT["orientation"].evaluation["scenes"]
-SEED, RATE_HZ = BY_EXPERIMENT["orientation"].evaluation["hands"].seed, 250
+SCENES = EXPERIMENTS["orientation"].seeds.evaluation["scenes"]
+SEED, RATE_HZ = EXPERIMENTS["orientation"].seeds.evaluation["hands"].seed, 250
 WORK_S = 3.0  # that the hands stay over the board
 
 

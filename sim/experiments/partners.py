@@ -22,10 +22,10 @@ from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
-from sim.experiments.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
-from sim.experiments.partner_rivals import RIVALS, left_out_by
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals.partners import RIVALS, left_out_by
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
 
@@ -41,7 +41,7 @@ RECORDED = {  # the beginnings of the files' names
 PEOPLE = ("give",)  # its groups are persons
 NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
 BLOCK = 9  # takes of `walk` that are left out together
-SEEDS = BY_EXPERIMENT["partners"]
+SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 DEMONSTRATORS = len(SEEDS.learned[KINDS[0]].numbers)
 SHOWN = {  # in the figure

@@ -11,15 +11,15 @@ import numpy as np
 import rerun as rr
 
 from service.files.shipped import shipped_skill
-from sim.experiments import rivals
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals import in_scenes as rivals
 from sim.scene import Scene
 from sim.script import PAUSE_RAMP_S, HandScript, Pause
 
 STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
-SEED, RATE_HZ = BY_EXPERIMENT["phase"].evaluation["hands"].seed, 500
+SEED, RATE_HZ = EXPERIMENTS["phase"].seeds.evaluation["hands"].seed, 500
 STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # of the hands, in the pause
 SETTLED_S = 0.3  # after the hands have stopped
 SHOWN_HZ = 20  # of what the figure shows

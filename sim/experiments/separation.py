@@ -25,15 +25,15 @@ from service.core.separation.tuning import SLIP_SPEED_MPS
 from service.files.shipped import shipped_skill
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
-from sim.experiments import rivals
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.rivals import in_scenes as rivals
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
-SCENES, RATE_HZ = BY_EXPERIMENT["separation"].evaluation["scenes"], 250  # half the rate, to save time
+SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
 REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust

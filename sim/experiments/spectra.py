@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from sim.experiments.moving_hands import PERIOD_S
+from sim.experiments.people.moving_hands import PERIOD_S
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)

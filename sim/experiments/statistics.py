@@ -14,17 +14,17 @@ import rerun as rr
 
 from service.files.shipped import shipped_skill
 from sim.bench import TaskEvents
-from sim.experiments import rivals
-from sim.experiments.live import live_run
+from sim.experiments.catalogue import DRAWING, EXPERIMENTS
+from sim.experiments.load.live import live_run
 from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot, rgb
+from sim.experiments.rivals import in_scenes as rivals
+from sim.experiments.rivals.skills import LookUp, NoDemonstrations
 from sim.experiments.scenes import draw
-from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
-from sim.experiments.skills import LookUp, NoDemonstrations
 from sim.experiments.workers import shared_out
 from sim.scene import GRASP_DISTANCE
 
-SEEDS = BY_EXPERIMENT["statistics"]
+SEEDS = EXPERIMENTS["statistics"].seeds
 SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
 ELL = 5.0  # of our skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most

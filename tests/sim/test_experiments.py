@@ -22,16 +22,17 @@ pytest.importorskip(
 )
 
 from kmp import GaussianMixture
-from sim.experiments import rivals, seeds
 from sim.experiments.__main__ import main
-from sim.experiments.evidence import EXPERIMENTS
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.catalogue import SHIPPED as SHIPPED_DEMONSTRATIONS
 from sim.experiments.hands import is_evidence
 from sim.experiments.rehearsal import demonstrated
+from sim.experiments.reproduction.table import METHODS
+from sim.experiments.reproduction.writing import recorded, write
 from sim.experiments.results import Array, ExperimentError
+from sim.experiments.rivals import in_scenes as rivals
 from sim.experiments.scenes import draw
 from sim.experiments.statistics import SCENES, wilson
-from sim.experiments.table import METHODS
-from sim.experiments.writing import recorded, write
 from sim.scene import MOST_MOVED, Scene
 from support.paths import ROOT
 
@@ -225,7 +226,7 @@ def test_every_experiment_has_a_test() -> None:
 DRAWN = [
     name
     for name in EXPERIMENTS
-    if hasattr(importlib.import_module(f"sim.experiments.{name.removesuffix('-of-others')}"), "draw_numbers")
+    if hasattr(importlib.import_module(f"sim.experiments.{EXPERIMENTS[name].module}"), "draw_numbers")
 ]
 
 
@@ -277,7 +278,7 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
 
 
 def test_the_fast_regression_of_the_rival_is_that_of_the_library() -> None:
-    samples = rivals.samples_of(demonstrated(seeds.SHIPPED._replace(numbers=range(1, 3))))[::10]
+    samples = rivals.samples_of(demonstrated(SHIPPED_DEMONSTRATIONS._replace(numbers=range(1, 3))))[::10]
     mixture = GaussianMixture.fit(samples, components=5, seed=0)
     np.testing.assert_allclose(
         rivals.regression_of(mixture)(samples[:, :6]), mixture.regress(samples[:, :6]).mean, atol=1e-12

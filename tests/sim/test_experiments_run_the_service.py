@@ -28,11 +28,13 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from service.settings.config import Settings, robot_description
-from sim.experiments import followers, rehearsal, rivals
-from sim.experiments.moving_hands import stops
+from sim.experiments import rehearsal
 from sim.experiments.open_loop import targets
-from sim.experiments.skills import LearnedByService
-from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen, served
+from sim.experiments.people.moving_hands import stops
+from sim.experiments.people.trials import RATE_HZ, Predicted, Seen, judge, seen, served
+from sim.experiments.rivals import followers
+from sim.experiments.rivals import in_scenes as rivals
+from sim.experiments.rivals.skills import LearnedByService
 from sim.people import person
 from sim.scene import Scene
 from sim.script import HandScript

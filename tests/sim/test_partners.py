@@ -11,10 +11,10 @@ import pytest
 from service.contract.records import SIDES
 from service.core.skill.model import LEVELS
 from service.learning.learn import learn
-from sim.experiments.left_out import JUDGED_HZ, LeftOut, Predicted, judged, left_out, predicted, read
-from sim.experiments.partner_rivals import MEMORY_S, RIVALS, carried, left_out_by, rows_of, scene_of
 from sim.experiments.partners import summary
+from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, Predicted, judged, left_out, predicted, read
 from sim.experiments.results import ExperimentError, Options, Results
+from sim.experiments.rivals.partners import MEMORY_S, RIVALS, carried, left_out_by, rows_of, scene_of
 from sim.made_tasks import takes
 
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from service.core.skill.skill import Skill
-from sim.experiments.mixtures import frames
-from sim.experiments.people import METHODS, Task, chosen, outcomes, run
-from sim.experiments.recorded_people import recorded_people
+from sim.experiments.people.comparison import METHODS, Task, chosen, outcomes, run
+from sim.experiments.people.recorded_people import recorded_people
+from sim.experiments.people.trials import RATE_HZ, Predicted, Seen, judge, seen
 from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service
-from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen
+from sim.experiments.rivals.mixtures import frames
+from sim.experiments.rivals.skills import GaussianProcess, LookUp, NoDemonstrations, Service
 from sim.people import Group, Person, person
 from sim.scene import TOOL_FROM_HAND
 from sim.sessions import BREAKING, MISTAKES, Session, breaking, demonstrations, played, session
@@ -228,10 +228,10 @@ def test_recorded_hands_make_people_for_tuning(tmp_path: Path) -> None:
 def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
-        monkeypatch.setattr(f"sim.experiments.people.{table}", {"tuning": value, "test": value})
-    monkeypatch.setattr("sim.experiments.people.BREAKING", BREAKING[:1])
+        monkeypatch.setattr(f"sim.experiments.people.comparison.{table}", {"tuning": value, "test": value})
+    monkeypatch.setattr("sim.experiments.people.comparison.BREAKING", BREAKING[:1])
     few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
-    monkeypatch.setattr("sim.experiments.people.METHODS", few)
+    monkeypatch.setattr("sim.experiments.people.comparison.METHODS", few)
     results = Results(tmp_path, "people", said=False)
     found = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
     mean = {name: {m: one[m]["mean"] for m in ("success", "path_rms_mm")} for name, one in found["methods"].items()}

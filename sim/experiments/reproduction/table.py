@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kmp import Gaussians
-from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
-from sim.experiments.promp import conditioned
+from sim.experiments.reproduction.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
+from sim.experiments.reproduction.promp import conditioned
+from sim.experiments.reproduction.writing import DURATION_S, TIMES
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, ExperimentError, Options, Results, pyplot
-from sim.experiments.writing import DURATION_S, TIMES
 
 WEIGHTS = 20  # of the DMP, for each of x and y: as many as ProMP has basis functions
 METHODS = {"kmp": ADAPTED, "promp": OTHER, "dmp": "#009E73", "gmm": DESIRED}

@@ -20,17 +20,17 @@ from service.core.skill.skill import Skill
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import adapted
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
 from sim.experiments.rehearsal import demonstrated
 from sim.experiments.results import Array
-from sim.experiments.rivals import COMPONENTS
+from sim.experiments.rivals.in_scenes import COMPONENTS
 from sim.experiments.scenes import OFFSET_M, draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import GRASP_DISTANCE, TOOL_FROM_HAND, Scene
 from sim.script import HandScript
 
 PAPER_ELL = 0.5  # of its section III-C, which names no unit: taken as metres
-SCENES = BY_EXPERIMENT["hands"].evaluation["scenes"]
+SCENES = EXPERIMENTS["hands"].seeds.evaluation["scenes"]
 
 
 class Variant(NamedTuple):

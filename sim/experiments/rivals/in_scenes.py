@@ -26,14 +26,14 @@ from service.learning.demonstration import Demonstration
 from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
 from sim.bench import Bench
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import Law, Said, by_law, differences, rival
+from sim.experiments.people.trials import Model
 from sim.experiments.results import Array, ExperimentError
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.trials import Model
 from sim.people import Places
 from sim.scene import Scene
 
-COMPONENTS, POINTS, SEED = 10, 200, BY_EXPERIMENT["statistics"].method
+COMPONENTS, POINTS, SEED = 10, 200, EXPERIMENTS["statistics"].seeds.method
 PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
 VIA_STD_M, EXACT_STD_M = 0.001, 0.0001
 BASES = 20  # of the ProMP, for each of x, y and z

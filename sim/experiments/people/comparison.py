@@ -15,12 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.core.skill.model import LEVELS
-from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
-from sim.experiments.recorded_people import recorded_people
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
-from sim.experiments.seeds import BY_EXPERIMENT, DRAWING, Stream
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
-from sim.experiments.trials import (
+from sim.experiments.catalogue import DRAWING, EXPERIMENTS, Stream
+from sim.experiments.people.recorded_people import recorded_people
+from sim.experiments.people.trials import (
     FAST_MPS,
     FOR_S,
     NEAR_M,
@@ -35,11 +32,14 @@ from sim.experiments.trials import (
     judge,
     seen,
 )
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.rivals.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
+from sim.experiments.rivals.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
 from sim.experiments.workers import shared_out
 from sim.people import Group, person
 from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
 
-SEEDS = BY_EXPERIMENT["people"]
+SEEDS = EXPERIMENTS["people"].seeds
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
 DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
 PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}

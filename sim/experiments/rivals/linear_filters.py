@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.core.skill.skill import Skill
-from sim.experiments.moving_hands import PERIOD_S, Moving
+from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
 REACH_S = 0.5  # of the filters into the past

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from kmp import GaussianMixture
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.people.trials import Predicted
 from sim.experiments.results import Array
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.trials import Predicted
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
 from sim.sessions import Shown
 
-LEAST_STD_M, SEED = 0.001, BY_EXPERIMENT["people"].method
+LEAST_STD_M, SEED = 0.001, EXPERIMENTS["people"].seeds.method
 UNUSUAL = 0.001  # share of the demonstrations' samples that are less usual than the threshold
 SLACK = 10.0  # [nat] less usual than those: far
 

@@ -12,11 +12,11 @@ import numpy as np
 import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
-from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reproduction.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
+from sim.experiments.reproduction.writing import DURATION_S, TIMES
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
-from sim.experiments.rivals import RIDGE, learned_promp
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.writing import DURATION_S, TIMES
+from sim.experiments.rivals.in_scenes import RIDGE, learned_promp
 
 BASES = 20  # for each of x and y
 COLUMNS = 5  # of the figure
@@ -40,7 +40,7 @@ ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
 SAMPLE_DEVIATION = 0.003  # of a sample as a reference point: lambda Sigma is about WEIGHT_RIDGE
 WEIGHT_RIDGE = 1e-6  # the functions are known without noise
-FUNCTIONS = BY_EXPERIMENT["promp"].evaluation["functions"]  # times and errors are averaged over them
+FUNCTIONS = EXPERIMENTS["promp"].seeds.evaluation["functions"]  # times and errors are averaged over them
 OUTPUTS = 3
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reproduction.writing import DURATION_S, TARGETS, TIMES, recorded, write
 from sim.experiments.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.writing import DURATION_S, TARGETS, TIMES, recorded, write
 
 ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
-SEEDS = BY_EXPERIMENT["letters"]
+SEEDS = EXPERIMENTS["letters"].seeds
 COMPONENTS, SEED = 8, SEEDS.method
 WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]

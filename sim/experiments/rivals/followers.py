@@ -23,8 +23,8 @@ from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.skill.skill import Skill
 from service.settings.config import Settings, robot_description
 from sim.closed_loop import START_NS, hand_event
-from sim.experiments.moving_hands import PERIOD_S, Moving
 from sim.experiments.open_loop import frames, targets
+from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
 SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it ...

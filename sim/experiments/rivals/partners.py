@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from service.learning.baselines import linear
-from sim.experiments.left_out import JUDGED_HZ, LeftOut, Predicted
+from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, Predicted
 from sim.experiments.results import Array
 
 MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now

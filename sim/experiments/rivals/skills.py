@@ -22,8 +22,8 @@ from service.core.skill.via_points import neighbourhoods
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill
 from service.learning.via_points import adapted
+from sim.experiments.people.trials import Predicted
 from sim.experiments.results import Array
-from sim.experiments.trials import Predicted
 from sim.people import Places
 from sim.sessions import Shown
 from sim.teach import places_of, recorded
