@@ -1,13 +1,16 @@
-"""The experiments: purpose, module, origin of the numbers, and seeds, tuning and evaluation apart.
+"""The experiments: the module of each, what its numbers depend on, and its seeds, tuning and
+evaluation apart.
 
 An experiment is a module with `run(results, options) -> numbers`, and a row of `EXPERIMENTS`. The
-command writes the seeds of the row into the result. No number of the service or of a rival may be
-chosen on what an experiment is evaluated on.
+first sentence of the module is its help. The command writes the seeds into the result. No number of
+the service or of a rival may be chosen on what an experiment is evaluated on.
 """
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -57,15 +60,21 @@ class Seeds(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """An experiment: its purpose, its module below `sim.experiments`, the digests and the options
-    of the command line that its numbers depend on, and its seeds.
+    """An experiment: its module below `sim.experiments`, the digests that its numbers depend on,
+    its seeds, and the options of the command line that it uses.
     """
 
-    about: str
     module: str
     depends_on: tuple[str, ...]
     seeds: Seeds
     options: tuple[str, ...] = ()
+
+    @property
+    def about(self) -> str:
+        """Its purpose: the first sentence of the module, read without importing it."""
+        path = Path(__file__).parent.joinpath(*self.module.split(".")).with_suffix(".py")
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        return " ".join(text.partition("\n\n")[0].split())
 
 
 def _scenes(count: int) -> dict[str, Stream]:
@@ -92,136 +101,47 @@ _WRITTEN = Seeds(_letters(1), tuning=_letters(0))
 _TUNED_HANDS = {"people": Stream("moving hands", 0, range(3)), "stops": Stream("sudden stop", 0, range(24))}
 _TEACHERS = {**_SHIPPED, "teachers": Stream("moving hands", 0, range(100, 105))}
 
-ALL = ("core", "learning", "kmp")
+ALL, CORE, KMP = ("core", "learning", "kmp"), ("core", "learning"), ("kmp",)
+_TEST, _TUNING, _LEARNED = (PERSON_SEEDS[group] for group in ("test", "tuning", "demonstrations"))
+_PEOPLE = Seeds(
+    {"people": Stream("person", _TEST, range(24)), "breaking": Stream("breaking scene", _TEST, range(40))},
+    tuning={"people": Stream("person", _TUNING, range(10)), "breaking": Stream("breaking scene", _TUNING, range(10))},
+    learned={"people": Stream("person", _LEARNED, range(6))},
+)
+_PARTNERS = Seeds(
+    {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in KINDS},
+    tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in KINDS},
+    learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in KINDS},
+)
+_FOLLOWED = {"people": Stream("moving hands", 0, range(200, 203)), "stops": Stream("sudden stop", 0, range(200, 224))}
+_OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
+_FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
+_ORDERS = {"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))}
+_HELD_OUT = {"demonstrations": Stream("demonstration", 1, range(21, 26))}
 
 EXPERIMENTS: Mapping[str, Experiment] = {
-    "hands": Experiment(
-        "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)",
-        "hands",
-        ALL,
-        Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED),
-    ),
-    "statistics": Experiment(
-        "100 random scenes whose places are taught, beside rivals, some of which need no demonstration",
-        "statistics",
-        ALL,
-        Seeds(_scenes(100), tuning=TUNED_SCENES, learned=_SHIPPED),
-    ),
-    "people": Experiment(
-        "learned skills on modelled people who did not demonstrate, beside seven rivals with the same places",
-        "people.comparison",
-        ALL,
-        Seeds(
-            {
-                "people": Stream("person", PERSON_SEEDS["test"], range(24)),
-                "breaking": Stream("breaking scene", PERSON_SEEDS["test"], range(40)),
-            },
-            tuning={
-                "people": Stream("person", PERSON_SEEDS["tuning"], range(10)),
-                "breaking": Stream("breaking scene", PERSON_SEEDS["tuning"], range(10)),
-            },
-            learned={"people": Stream("person", PERSON_SEEDS["demonstrations"], range(6))},
-        ),
-        ("group", "hands"),
-    ),
-    "partners": Experiment(
-        "what `thirdhand learn` makes of recordings of real third hands, and of made tasks that are not soldering",
-        "partners",
-        ALL,
-        Seeds(
-            {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in KINDS},
-            tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in KINDS},
-            learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in KINDS},
-        ),
-        ("data",),
-    ),
-    "motion": Experiment(
-        "how the tool follows moving hands: error, lag, smoothness, stops, beside rivals",
-        "motion",
-        ALL,
-        Seeds(
-            {
-                "people": Stream("moving hands", 0, range(200, 203)),
-                "stops": Stream("sudden stop", 0, range(200, 224)),
-                **_hands(Scene().seed),
-            },
-            tuning=_TUNED_HANDS,
-            learned=_TEACHERS,
-        ),
-        ("arm",),
-    ),
-    "motion-of-others": Experiment(
-        "the same with recorded hands: `motion --hands DIR`",
-        "motion",
-        ALL,
-        Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS),  # evaluated on recordings
-        ("arm", "hands"),
-    ),
-    "separation": Experiment(
-        "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
-        "separation",
-        ("core", "learning"),
-        Seeds(_scenes(100), tuning=TUNED_SCENES),
-    ),
-    "faults": Experiment(
-        "what happens when service, tracker, network, router, scribe or disk fail: time to rest, path, loss",
-        "load.faults",
-        ("core", "learning"),
-        Seeds(_hands(Scene().seed)),
-        ("arm",),
-    ),
-    "letters": Experiment(
-        "adaptation of handwritten letters (Figure 1)", "reproduction.letters", ("kmp",), _WRITTEN, ("letters",)
-    ),
+    "hands": Experiment("hands", ALL, Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED)),
+    "statistics": Experiment("statistics", ALL, Seeds(_scenes(100), tuning=TUNED_SCENES, learned=_SHIPPED)),
+    "people": Experiment("people.comparison", ALL, _PEOPLE, ("group", "hands")),
+    "partners": Experiment("partners", ALL, _PARTNERS, ("data",)),
+    "motion": Experiment("motion", ALL, _OTHERS._replace(evaluation=_FOLLOWED | _hands(Scene().seed)), ("arm",)),
+    "motion-of-others": Experiment("motion", ALL, _OTHERS, ("arm", "hands")),
+    "separation": Experiment("separation", CORE, Seeds(_scenes(100), tuning=TUNED_SCENES)),
+    "faults": Experiment("load.faults", CORE, Seeds(_hands(Scene().seed)), ("arm",)),
+    "letters": Experiment("reproduction.letters", KMP, _WRITTEN, ("letters",)),
     "promp": Experiment(
-        "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
-        "reproduction.promp",
-        ("kmp",),
-        Seeds(_letters(1) | {"functions": Stream("random function", 0, range(5))}, tuning=_WRITTEN.tuning),
-        ("letters",),
+        "reproduction.promp", KMP, Seeds(_letters(1) | _FUNCTIONS, tuning=_WRITTEN.tuning), ("letters",)
     ),
     "correlation": Experiment(
-        "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)",
-        "reproduction.correlation",
-        ("kmp",),
-        Seeds(_IN_SPACE | {"points": Stream("via-point", 0, range(2))}),
+        "reproduction.correlation", KMP, Seeds(_IN_SPACE | {"points": Stream("via-point", 0, range(2))})
     ),
-    "runs": Experiment(
-        "ten runs of that search with one letter and one via-point (Figure 3(c))",
-        "reproduction.runs",
-        ("kmp",),
-        Seeds(_IN_SPACE | {"searches": Stream("search", 0, range(10))}),
-    ),
-    "table": Experiment(
-        "DMP, ProMP, mixture regression and KMP on the same letters (Table I)",
-        "reproduction.table",
-        ("kmp",),
-        _WRITTEN,
-        ("letters",),
-    ),
-    "phase": Experiment(
-        "hands that pause and go back pause and reverse the robot",
-        "phase",
-        ("core", "learning"),
-        Seeds(_hands(11), learned=_SHIPPED),
-    ),
+    "runs": Experiment("reproduction.runs", KMP, Seeds(_IN_SPACE | {"searches": Stream("search", 0, range(10))})),
+    "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
+    "phase": Experiment("phase", CORE, Seeds(_hands(11), learned=_SHIPPED)),
     "orientation": Experiment(
-        "the tool turns the glass to the eyes: orientation predicted with the position, and followed",
-        "orientation",
-        ALL,
-        Seeds(_hands(31) | _scenes(5), tuning=TUNED_SCENES, learned=_SHIPPED),
+        "orientation", ALL, Seeds(_hands(31) | _scenes(5), tuning=TUNED_SCENES, learned=_SHIPPED)
     ),
     "demonstrations": Experiment(
-        "error against the number of demonstrations",
-        "demonstrations",
-        ("learning", "kmp"),
-        Seeds(
-            _scenes(40) | {"demonstrations": Stream("demonstration", 1, range(21, 26))},
-            tuning=TUNED_SCENES,
-            learned={
-                "demonstrations": Stream("demonstration", 1, range(1, 21)),
-                "orders": Stream("order", 0, range(4)),
-            },
-        ),
+        "demonstrations", ("learning", "kmp"), Seeds(_scenes(40) | _HELD_OUT, tuning=TUNED_SCENES, learned=_ORDERS)
     ),
 }

@@ -39,6 +39,7 @@ DECIMALS = 6  # of kmp's outputs: what CPUs agree on
 USUAL = Options()
 
 
+@functools.cache
 def tree() -> dict[str, str]:
     """The digests of this tree, by name."""
     return {"core": core_digest(recordings() / "golden.mcap"), "learning": _skill_digest(), "kmp": kmp_digest()}

@@ -1,7 +1,6 @@
-"""How the tool follows hands that move as people's do: error, lag, smoothness, and stops, beside
-what it competes with.
+"""Error, lag, smoothness and stops of a tool that follows moving hands, beside rivals.
 
-Errors are the tool's distance from what the skill makes of the truth at the same instant, lag
+Errors are distances of the tool from the skill's target for the true hands at the same instant, lag
 included.
 """
 

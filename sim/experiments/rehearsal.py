@@ -1,5 +1,5 @@
-"""The closed loop in process, faster than real time: the service's core and its own loop, driven
-tick by tick with the bench.
+"""The closed loop in process, faster than real time: the service's core and loop, driven tick by
+tick with the bench.
 """
 
 from __future__ import annotations

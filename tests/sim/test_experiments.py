@@ -21,16 +21,12 @@ pytest.importorskip(
     "movement_primitives", reason="ProMPs need movement_primitives: pip install 'thirdhand[experiments]'"
 )
 
-from kmp import GaussianMixture
 from sim.experiments.__main__ import main
 from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.catalogue import SHIPPED as SHIPPED_DEMONSTRATIONS
 from sim.experiments.hands import is_evidence
-from sim.experiments.rehearsal import demonstrated
 from sim.experiments.reproduction.table import METHODS
 from sim.experiments.reproduction.writing import recorded, write
 from sim.experiments.results import Array, ExperimentError
-from sim.experiments.rivals import in_scenes as rivals
 from sim.experiments.scenes import draw
 from sim.experiments.statistics import SCENES, wilson
 from sim.scene import MOST_MOVED, Scene
@@ -275,14 +271,6 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
     assert min(progress) > -0.05  # before the start the hands rest
     assert script.clock.at(script.duration_s)[0] == pytest.approx(drawn.scene.duration_s, abs=1e-6)
     assert max(progress) <= drawn.scene.duration_s + 1e-6
-
-
-def test_the_fast_regression_of_the_rival_is_that_of_the_library() -> None:
-    samples = rivals.samples_of(demonstrated(SHIPPED_DEMONSTRATIONS._replace(numbers=range(1, 3))))[::10]
-    mixture = GaussianMixture.fit(samples, components=5, seed=0)
-    np.testing.assert_allclose(
-        rivals.regression_of(mixture)(samples[:, :6]), mixture.regress(samples[:, :6]).mean, atol=1e-12
-    )
 
 
 def test_the_interval_of_a_rate_is_wilsons() -> None:

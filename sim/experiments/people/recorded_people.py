@@ -1,5 +1,5 @@
-"""People made of recorded hands: their reaches warped to the ways of a scene, and their tracker's
-noise as it was. For choosing parameters only.
+"""People made of recorded hands: their reaches warped to the paths of a scene, and their tracker's
+noise. Only for choosing parameters.
 
 Recordings are `.npz` files with `time_s` (T,), `left` and `right` (T, 3) [m].
 """

@@ -1,9 +1,10 @@
-"""Correlations adapted to a reward (the paper, section III-B and Figure 3): letters in space that
-cost the arm's joints less and less motion, and how much of that a single number would have done.
+"""Correlations learned from a reward (the paper, section III-B and Figure 3): letters in space that
+cost the joints less motion, and the share of it that one number saves too.
 
 The paper shows one letter, one via-point and a cost that falls. Here letters and via-points are the
-sample, and what was learned is set beside three others at the same distance from the reference: the
-best of as many random Lambda, Lambda = c I with the one number c, and what learning adds to that c.
+sample, and the learned Lambda is compared with three others at the same distance from the
+reference: the best of as many random ones, Lambda = c I with one number c, and what learning adds
+to that c.
 """
 
 from __future__ import annotations

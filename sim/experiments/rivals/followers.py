@@ -1,7 +1,6 @@
-"""What follows moving hands in `motion`: the service's own core, and what it competes with, at the
-same limits.
+"""Followers of moving hands in `motion`: the service's own core, and rivals at the same limits.
 
-All go through the same skill, inverse kinematics and joint limiter; only what lies between differs.
+All use the same skill, inverse kinematics and joint limiter; only what lies between differs.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""What no linear filter can better: the best causal ones for some hands, fitted to these very
-hands, without limits and arm.
+"""The best causal linear filters for given hands, fitted to these very hands, without limits and
+arm: a bound for all linear filters.
 """
 
 from __future__ import annotations
