@@ -49,7 +49,8 @@ BLOCK = 9  # takes of `walk` that are left out together
 SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 DEMONSTRATORS = len(SEEDS.learned[KINDS[0]].numbers)
-SHOWN = {  # in the figure
+GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
+SHOWN = {
     SERVICE: ("service", ADAPTED, "o"),
     "same elapsed time": ("same elapsed time", REFERENCE, "|"),
     "linear": ("linear", REFERENCE, "x"),
@@ -205,7 +206,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "recorded": {task: numbers_of(by_task[task]) for task in RECORDED if task in by_task},
         "made": {kind: numbers_of(by_task[kind]) for kind in KINDS if kind in by_task},
     }
-    drawnumbers_of(results, numbers)
+    draw_numbers(results, numbers)
     return numbers
 
 
@@ -279,20 +280,21 @@ def _label(name: str, methods: dict[str, Any], ending: str) -> str:
     """A set's name, and how often the service refuses."""
     ours = methods[SERVICE + ending]
     if ours.get("folds_refused"):
-        return f"{name}\n(learn refuses {ours['folds_refused']} of {ours['folds']})"
-    return name + f"\n(service refuses {ours['refuses']} of {ours['takes'] + ours['refuses']})" * bool(ours["refuses"])
+        return f"{name}\n(learn refuses {ours['folds_refused']} of {ours['folds']} skills)"
+    return name + f"\n({ours['refuses']} of {ours['takes'] + ours['refuses']} takes refused)" * bool(ours["refuses"])
 
 
-def drawnumbers_of(results: Results, numbers: dict[str, Any]) -> None:
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
     panels = []
-    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, places told", numbers["made"])):
+    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, via-points given", numbers["made"])):
         rows = []
         for task, one in sets.items():
             endings = [ending for ending in ("", TOLD) if SERVICE + ending in one["methods"]]
             rows += [
-                (task.replace("_", " ") + ending * (len(endings) > 1), one["methods"], ending) for ending in endings
+                (task.replace("_", " ") + GIVEN * bool(ending and len(endings) > 1), one["methods"], ending)
+                for ending in endings
             ]
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
@@ -307,16 +309,18 @@ def drawnumbers_of(results: Results, numbers: dict[str, Any]) -> None:
             ours = methods[SERVICE + ending]
             ax.plot(ours.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
             in_spite = ours.get("in_spite_of_refusal", {}).get("rms_mm", np.nan)
-            ax.plot(in_spite, y, "o", color=ADAPTED, ms=5, ls="", alpha=0.35, mew=0)
+            ax.plot(in_spite, y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
         ax.set_yticks(range(len(rows)), [_label(*row) for row in rows])
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
     for label, colour, marker in SHOWN.values():
         axes[0, 0].plot([], [], marker, color=colour, ms=5, ls="", label=label)
-    axes[0, 0].plot([], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, a time shift a take removed")
+    axes[0, 0].plot(
+        [], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, with the best time shift of each take"
+    )
     if any("in_spite_of_refusal" in methods[SERVICE + ending] for _, rows in panels for _, methods, ending in rows):
-        label = "service's skill, refused by learn and used in spite of it"
-        axes[0, 0].plot([], [], "o", color=ADAPTED, ms=5, ls="", alpha=0.35, mew=0, label=label)
+        label = "service, refused by learn, used in spite of it"
+        axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
     axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     results.figure(figure)
