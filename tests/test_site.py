@@ -18,7 +18,7 @@ import pytest
 import kmp
 from service import client
 from service.cli.main import GROUPS
-from sim.experiments.evidence import EXPERIMENTS
+from sim.experiments.catalogue import EXPERIMENTS
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"

@@ -18,7 +18,8 @@ from pathlib import Path
 from types import ModuleType
 
 from service.contract.explain import ExplainedError, in_words
-from sim.experiments.evidence import EXPERIMENTS, RESULTS, commit, origin, result_of, staleness, tree
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.evidence import RESULTS, commit, origin, result_of, staleness, tree
 from sim.experiments.results import ExperimentError, Options, Results, pyplot
 from sim.faulty_cell import FaultError
 from sim.parts import PartError
@@ -32,9 +33,18 @@ EXAMPLE = """example:
 """
 
 
+FOLDERS = {
+    "letters": "recorded letters besides the modelled ones: X.npz with demo00, demo01, ...",
+    "hands": "recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and right [m]",
+    "data": "recorded takes for `partners`, without which it measures the made tasks alone: robot_*.npz, "
+    "give_P*.npz and walk_*.npz with t [s], left, right and tool [m]",
+}
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    names = "\n".join(f"  {name:<16} {one.about}" for name, one in EXPERIMENTS.items())
+    recorded = {name: " (recorded hands)" * name.endswith(OF_OTHERS) for name in EXPERIMENTS}
+    names = "\n".join(f"  {name:<16} {one.about}{recorded[name]}" for name, one in EXPERIMENTS.items())
     p = argparse.ArgumentParser(
         prog="python -m sim.experiments",
         description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
@@ -42,69 +52,29 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "name",
-        metavar="NAME",
-        choices=[*EXPERIMENTS, "all", "stale"],
-        help="one of the above; all: those whose results in DIR are missing or stale; stale: list these",
-    )
-    p.add_argument(
-        "--output",
-        metavar="DIR",
-        type=Path,
-        help="folder of the results (for stale: recordings/experiments by default)",
-    )
-    p.add_argument(
-        "--letters",
-        metavar="DIR",
-        type=Path,
-        help="recorded letters to use besides the shipped model's: X.npz with demo00, demo01, ...",
-    )
-    p.add_argument(
-        "--hands",
-        metavar="DIR",
-        type=Path,
-        help="recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and right [m]",
-    )
-    p.add_argument(
-        "--data",
-        metavar="DIR",
-        type=Path,
-        help="recorded takes for `partners`, without which it does the made tasks alone: robot_*.npz, give_P*.npz and "
-        "walk_*.npz with t [s], left, right and tool [m]",
-    )
-    p.add_argument(
-        "--set",
-        choices=["tuning", "test"],
-        default="test",
-        help="the people of `people`: those on whom parameters are chosen, or those on whom nothing was "
-        "(default: %(default)s)",
-    )
-    p.add_argument(
-        "--workers",
-        metavar="N",
-        type=int,
-        default=min(2, os.cpu_count() or 1),
-        help="processes, where that helps (default: %(default)s)",
-    )
-    p.add_argument(
-        "--share", metavar="X", type=float, default=1.0, help="of the full size, for a quick look: above 0, up to 1"
-    )
-    p.add_argument(
-        "--arm", default="wam", help="of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
-    )
-    p.add_argument(
-        "--redraw",
-        action="store_true",
-        help="draw the figures of the numbers in DIR/NAME.json again, without measuring anew",
-    )
+    which = "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
+    p.add_argument("name", metavar="NAME", choices=[*EXPERIMENTS, "all", "stale"], help=which)
+    output = "folder of the results (for stale: recordings/experiments by default)"
+    p.add_argument("--output", metavar="DIR", type=Path, help=output)
+    for name, text in FOLDERS.items():
+        p.add_argument(f"--{name}", metavar="DIR", type=Path, help=text)
+    people = "the people of `people`: those on whom parameters are chosen, or the others (default: %(default)s)"
+    p.add_argument("--set", choices=["tuning", "test"], default="test", help=people)
+    workers = "processes, where that helps (default: %(default)s)"
+    p.add_argument("--workers", metavar="N", type=int, default=min(2, os.cpu_count() or 1), help=workers)
+    share = "of the full size, for a quick look: above 0, up to 1"
+    p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
+    arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
+    p.add_argument("--arm", default="wam", help=arm)
+    again = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
+    p.add_argument("--redraw", action="store_true", help=again)
     p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
 
 
 def jobs(name: str, options: Options) -> dict[str, Options]:
-    """The results that a name on the command line stands for, with the options that each heeds."""
+    """The results that a name on the command line stands for, with the options that each uses."""
     names = [name] if name in EXPERIMENTS else [*EXPERIMENTS]
     if options.hands is None and name == "all":
         names.remove("motion" + OF_OTHERS)
@@ -134,7 +104,7 @@ def make(results: Results, experiment: ModuleType, options: Options) -> None:
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)
     if (now := commit()) != results.origin["commit"]:
-        results.origin["commit"] += f" to {now}"  # somebody changed the tree meanwhile
+        results.origin["commit"] += f" to {now}"  # the tree was changed meanwhile
     print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
 
 
@@ -146,44 +116,42 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
-    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
-    wanted = jobs(args.name, options)
     if args.name.endswith(OF_OTHERS) and args.hands is None and not args.redraw:
         p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
-    if args.name == "stale":
-        return stale(args.output or RESULTS, wanted)
-    if args.output is None:
+    if args.name != "stale" and args.output is None:
         p.error("--output DIR is missing: the folder for the results")
-    failed = False
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
+    wanted = jobs(args.name, options)
     try:
-        pyplot()  # what is missing is said now, not after an hour
-        here = tree() if args.name == "all" and not args.anew and not args.redraw else None
-        for name, one in wanted.items():
-            try:
-                if here is not None and not staleness(name, result_of(args.output, name), here, one):
-                    print(f"{args.output / name}.json  belongs to this tree", flush=True)
-                    continue
-                results = Results(args.output, name, said=not args.quiet)
-                experiment = importlib.import_module(f"sim.experiments.{name.removesuffix(OF_OTHERS)}")
-                redraw(results, experiment) if args.redraw else make(results, experiment, one)
-            except Exception as error:
-                failed = True
-                said = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
-                sys.stderr.write(f"python -m sim.experiments: {name}: {said}")
+        if args.name == "stale":
+            return stale(args.output or RESULTS, wanted)
+        pyplot()  # reports now what is missing, not after an hour
+        return int(sum(made(name, one, args) for name, one in wanted.items()) > 0)
     except FAILURES as error:
         print(f"python -m sim.experiments: {in_words(error)}", file=sys.stderr)
         return 1
-    return int(failed)
+
+
+def made(name: str, options: Options, args: argparse.Namespace) -> int:
+    """Makes one result, or draws it again, where that is due; returns the exit code."""
+    try:
+        only_stale = args.name == "all" and not args.anew and not args.redraw
+        if only_stale and not staleness(name, result_of(args.output, name), tree(), options):
+            print(f"{args.output / name}.json  belongs to this tree", flush=True)
+            return 0
+        results = Results(args.output, name, said=not args.quiet)
+        experiment = importlib.import_module(f"sim.experiments.{EXPERIMENTS[name].module}")
+        redraw(results, experiment) if args.redraw else make(results, experiment, options)
+    except Exception as error:
+        said = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+        sys.stderr.write(f"python -m sim.experiments: {name}: {said}")
+        return 1
+    return 0
 
 
 def stale(folder: Path, wanted: dict[str, Options]) -> int:
     """Lists the results in a folder that do not belong to this tree; returns the exit code."""
-    try:
-        here = tree()
-        found = {name: staleness(name, result_of(folder, name), here, options) for name, options in wanted.items()}
-    except FAILURES as error:
-        print(f"python -m sim.experiments: {in_words(error)}", file=sys.stderr)
-        return 1
+    found = {name: staleness(name, result_of(folder, name), tree(), options) for name, options in wanted.items()}
     for name, why in found.items():
         if why:
             print(f"{name:<16} {why}")

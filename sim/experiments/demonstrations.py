@@ -1,6 +1,4 @@
-"""How many demonstrations are enough: the error on tasks that were not demonstrated against their
-number, 1 to 10.
-"""
+"""Error on tasks that were not demonstrated, against the number of demonstrations, 1 to 10."""
 
 from __future__ import annotations
 
@@ -9,21 +7,17 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.contract.requests import TOLERANCE_M
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
-from service.learning.skill_file import StoredSkill
-from service.learning.via_points import adapted
-from sim.experiments.beside_the_paper import at_the_events
-from sim.experiments.open_loop import targets
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reached import open_loop_mm, taught
 from sim.experiments.rehearsal import demonstrated
-from sim.experiments.results import OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
+from sim.experiments.results import OTHER, REFERENCE, TOOL, Options, Results, pyplot, rgb
 from sim.experiments.scenes import draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import GRASP_DISTANCE, Scene
 
-SEEDS = BY_EXPERIMENT["demonstrations"]
+SEEDS = EXPERIMENTS["demonstrations"].seeds
 MOST, ORDERS, SCENES = 10, SEEDS.learned["orders"], SEEDS.evaluation["scenes"]
 EVERY = 4  # of the samples, to save time
 
@@ -36,22 +30,22 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     )
     random, draws = np.random.default_rng(ORDERS.seed), len(orders)
     counts = list(range(1, most + 1))
-    taught = np.zeros((most, draws))
-    reproduction, events = np.zeros((most, draws)), np.zeros((most, draws, len(SCENES.numbers), 3))
+    as_learned, with_places = np.zeros((2, most, draws))
+    events = np.zeros((most, draws, len(SCENES.numbers), 3))
+    scenes = [draw(number, seed=SCENES.seed) for number in SCENES.numbers]
     for draw_number in orders:
         order = random.permutation(len(known))
         for count in counts:
             skill = learn([known[k] for k in order[:count]], components=10, seed=draw_number)
-            reproduction[count - 1, draw_number] = _reproduction_mm(skill, held_out)
-            taught[count - 1, draw_number] = _reproduction_mm(
-                adapted(skill, Scene().via_points(), tolerance=TOLERANCE_M), held_out
-            )
-            events[count - 1, draw_number] = [_events_mm(skill, number) for number in SCENES.numbers]
-        results.say(f"draw {draw_number + 1} of {draws}: {reproduction[:, draw_number].round(1)} mm")
+            at = count - 1, draw_number
+            as_learned[at] = _reproduction_mm(skill, held_out)
+            with_places[at] = _reproduction_mm(taught(skill, Scene().via_points()), held_out)
+            events[at] = [open_loop_mm(taught(skill, one.scene.via_points()), one) for one in scenes]
+        results.say(f"draw {draw_number + 1} of {draws}: {as_learned[:, draw_number].round(1)} mm")
     floor = _floor_mm(known, held_out)
     success = 100 * (events <= 1000 * GRASP_DISTANCE).all(axis=3).mean(axis=2)
     stream = results.recording()
-    for name, values, colour in (("reproduction_mm", reproduction, OTHER), ("success_percent", success, TOOL)):
+    for name, values, colour in (("reproduction_mm", as_learned, OTHER), ("success_percent", success, TOOL)):
         stream.log(f"/{name}", rr.SeriesLines(colors=[rgb(colour)], names=[name]), static=True)
         for count in counts:
             stream.set_time("demonstrations", sequence=count)
@@ -65,10 +59,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "floor_mm": floor,
         "by_count": {
             count: {
-                "reproduction_rms_mm": float(reproduction[count - 1].mean()),
-                "taught_rms_mm": float(taught[count - 1].mean()),
-                "reproduction_std_mm": float(reproduction[count - 1].std()),
-                "taught_std_mm": float(taught[count - 1].std()),
+                "reproduction_rms_mm": float(as_learned[count - 1].mean()),
+                "taught_rms_mm": float(with_places[count - 1].mean()),
+                "reproduction_std_mm": float(as_learned[count - 1].std()),
+                "taught_std_mm": float(with_places[count - 1].std()),
                 "events_median_mm": float(np.median(events[count - 1])),
                 "events_p95_mm": float(np.percentile(events[count - 1], 95)),
                 "largest_event": {
@@ -96,17 +90,6 @@ def _floor_mm(known: list[Demonstration], held_out: list[Demonstration]) -> floa
     """
     mean = np.mean([one.tool[:, :3] for one in known], axis=0)
     return float(1000 * np.sqrt(np.mean([np.sum((one.tool[:, :3] - mean) ** 2, axis=1) for one in held_out])))
-
-
-def _events_mm(skill: StoredSkill, number: int) -> Array:
-    """Of the skill taught the places of a random scene: how far its target is at each event (3,),
-    hands off by 8 mm per axis.
-    """
-    drawn = draw(number, seed=SCENES.seed)
-    scene = drawn.scene
-    taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
-    hands, wanted = at_the_events(scene, drawn.seed)
-    return np.asarray(1000 * np.linalg.norm(targets(taught, hands) - wanted, axis=1))
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:

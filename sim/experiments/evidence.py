@@ -17,7 +17,7 @@ import subprocess
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +26,8 @@ from service.core.frame import encode
 from service.files.mcap_file import machine
 from service.files.recording import Recording
 from service.files.shipped import SHIPPED_SKILL, recordings
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.results import Array, ExperimentError, Options
-from sim.experiments.seeds import BY_EXPERIMENT
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "recordings" / "experiments"
@@ -36,65 +36,10 @@ MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
 DECIMALS = 6  # of kmp's outputs: what CPUs agree on
 
 
-class Experiment(NamedTuple):
-    """An experiment's purpose, what its numbers depend on, and the options that it heeds."""
-
-    about: str
-    depends_on: tuple[str, ...]
-    options: tuple[str, ...] = ()
-
-
 USUAL = Options()
-ALL = ("core", "learning", "kmp")
-EXPERIMENTS: Mapping[str, Experiment] = {
-    "hands": Experiment(
-        "the soldering task through the running service: as learned, and adapted to new places (Figures 4 and 5)", ALL
-    ),
-    "statistics": Experiment(
-        "100 random scenes whose places are taught, side by side with rivals, some without any demonstration", ALL
-    ),
-    "people": Experiment(
-        "learned skills on modelled people who did not demonstrate, beside seven rivals told the same places",
-        ALL,
-        ("group", "hands"),
-    ),
-    "partners": Experiment(
-        "learned skills on recordings of real third hands, and on made tasks that are not soldering", ALL, ("data",)
-    ),
-    "motion": Experiment(
-        "how the tool follows hands that move as people's do: error, lag, smoothness, stops, beside rivals",
-        ALL,
-        ("arm",),
-    ),
-    "motion-of-others": Experiment("the same with recorded hands: `motion --hands DIR`", ALL, ("arm", "hands")),
-    "separation": Experiment(
-        "how near the arm comes to hands and how fast, in random scenes and with hands thrust in its way",
-        ("core", "learning"),
-    ),
-    "faults": Experiment(
-        "what happens when service, tracker, network, router, scribe or disk fail: time to rest, way, loss",
-        ("core", "learning"),
-        ("arm",),
-    ),
-    "letters": Experiment("adaptation of handwritten letters (Figure 1)", ("kmp",), ("letters",)),
-    "promp": Experiment(
-        "KMP beside ProMP on the same letters (Figure 2), and what each costs as the input's dimension grows",
-        ("kmp",),
-        ("letters",),
-    ),
-    "correlation": Experiment(
-        "correlations learned from a reward by policy improvement, with a via-point kept (Figure 3)", ("kmp",)
-    ),
-    "runs": Experiment("ten runs of that search with one letter and one via-point (Figure 3(c))", ("kmp",)),
-    "table": Experiment("DMP, ProMP, mixture regression and KMP on the same letters (Table I)", ("kmp",), ("letters",)),
-    "phase": Experiment("hands that pause and go back pause and reverse the robot", ("core", "learning")),
-    "orientation": Experiment(
-        "the tool turns the glass to the eyes: orientation predicted with the position, and followed", ALL
-    ),
-    "demonstrations": Experiment("error against the number of demonstrations", ("learning", "kmp")),
-}
 
 
+@functools.cache
 def tree() -> dict[str, str]:
     """The digests of this tree, by name."""
     return {"core": core_digest(recordings() / "golden.mcap"), "learning": _skill_digest(), "kmp": kmp_digest()}
@@ -168,7 +113,7 @@ def origin(name: str, options: Options) -> dict[str, Any]:
         "commit": commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": {**{part: known.get(part, "unknown") for part in MACHINE}, "cores": os.cpu_count()},
-        "seeds": BY_EXPERIMENT[name].named(),
+        "seeds": EXPERIMENTS[name].seeds.named(),
         "options": options_of(name, options),
         "depends_on": {one: here[one] for one in EXPERIMENTS[name].depends_on},
     }

@@ -12,19 +12,19 @@ import numpy as np
 from service.contract.records import Mode
 from service.files.recording import Recording
 from service.files.shipped import shipped_skill
-from sim.bench import Bench, TaskEvents
-from sim.experiments import rivals
-from sim.experiments.beside_the_paper import differences
-from sim.experiments.live import live_run
+from sim.bench import Bench
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.load.live import live_run
+from sim.experiments.reached import EVENTS, ours
 from sim.experiments.rehearsal import demonstrated, rehearse
+from sim.experiments.reproduction.beside_the_paper import differences
 from sim.experiments.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
 from sim.experiments.scenes import Drawn
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.network import RunReport
 from sim.scene import Scene
 from sim.world import pixels
 
-SEED = BY_EXPERIMENT["hands"].evaluation["hands"].seed
+SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
 NOMINAL = Drawn(Scene(), 1.0, (), SEED)
 MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED
@@ -36,7 +36,6 @@ SHOWN_HZ, SERVICE_HZ = 20, 500  # of the ways in the figure, and of the recordin
 EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.24), (640, 480)
 THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
 DRAWN = {"reproduction": "dotted: as learned", "adaptation": "solid: adapted"}
-EVENTS = TaskEvents.__struct_fields__
 
 
 class Traces(NamedTuple):
@@ -129,7 +128,7 @@ def _recorded(path: Path) -> Traces:
 
 def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
     skill = shipped_skill()
-    adapt = rivals.ours(skill)(drawn.scene) if taught else lambda bench: skill
+    adapt = ours(drawn.scene) if taught else lambda bench: skill
     seen = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
     began = int(np.argmax(seen.time_s > 0))
     each = 250 // SHOWN_HZ
@@ -223,7 +222,7 @@ def _draw_stages(results: Results) -> None:
             shots.append((colours, matrix, Traces(path[:, 0], path[:, 1], path[:, 2])))
             so_far.clear()
 
-    rehearse(MOVED.script(), rivals.ours(shipped_skill())(scene), rate_hz=250, look=look)
+    rehearse(MOVED.script(), ours(scene), rate_hz=250, look=look)
     plt = pyplot()
     figure, grid = plt.subplots(2, 2, figsize=(9, 6.6))
     for axes, (colours, matrix, traces), title in zip(grid.flat, shots, titles, strict=True):

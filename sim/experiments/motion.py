@@ -1,7 +1,6 @@
-"""How the tool follows hands that move as people's do: error, lag, smoothness, and stops, beside
-what it competes with.
+"""Error, lag, smoothness and stops of a tool that follows moving hands, beside rivals.
 
-Errors are the tool's distance from what the skill makes of the truth at the same instant, lag
+Errors are distances of the tool from the skill's target for the true hands at the same instant, lag
 included.
 """
 
@@ -24,15 +23,15 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.settings.config import Settings
 from sim.experiments import spectra
-from sim.experiments.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
-from sim.experiments.linear_floor import best_linear
-from sim.experiments.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
+from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
+from sim.experiments.people.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
 from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
+from sim.experiments.rivals.linear_filters import best_linear
 from sim.experiments.workers import shared_out
 
-SEEDS = BY_EXPERIMENT["motion"]
+SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "hands"))
 SECONDS = 15.0
 SETTLED_MM = 5.0

@@ -14,23 +14,21 @@ import numpy as np
 import rerun as rr
 
 from kmp.orientation import exp, log, multiplied
-from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.files.shipped import shipped_skill
+from service.contract.requests import ViaPoint
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill
-from service.learning.via_points import adapted
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reached import ours, taught
+from sim.experiments.rehearsal import Rehearsed, demonstrated, rehearse
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.scenes import OFFSET_M, draw
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.scenes import Drawn, draw
 from sim.scene import TOOL_ORIENTATION, Scene
-from sim.script import HandScript
 
 EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
 SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
 COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # of the position, as the shipped skill
-SCENES = BY_EXPERIMENT["orientation"].evaluation["scenes"]
-SEED, RATE_HZ = BY_EXPERIMENT["orientation"].evaluation["hands"].seed, 250
+SCENES = EXPERIMENTS["orientation"].seeds.evaluation["scenes"]
+SEED, RATE_HZ = EXPERIMENTS["orientation"].seeds.evaluation["hands"].seed, 250
 WORK_S = 3.0  # that the hands stay over the board
 
 
@@ -44,17 +42,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     skill = learn_turning()
     runs: dict[str, Rehearsed] = {}
     for name, scene in scenes.items():
-        script = HandScript(scene, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M)
-        taught = adapted(skill, turned(scene), tolerance=TOLERANCE_M)
-        runs[name] = rehearse(script, lambda bench: taught, rate_hz=RATE_HZ, keep=True)  # noqa: B023
+        script = Drawn(scene, 1.0, (), SEED).script()
+        there = taught(skill, turned(scene))
+        runs[name] = rehearse(script, lambda bench: there, rate_hz=RATE_HZ, keep=True)  # noqa: B023
         results.say(f"{name}: {_measured(runs[name], scene)}")
     nominal = scenes["nominal"]
-    fixed = rehearse(
-        HandScript(nominal, seed=SEED, offset_std=OFFSET_M, tremor_rms=TREMOR_M, noise_std=NOISE_M),
-        lambda bench: adapted(shipped_skill(), nominal.via_points(), tolerance=TOLERANCE_M),
-        rate_hz=RATE_HZ,
-        keep=True,
-    )
+    fixed = rehearse(Drawn(nominal, 1.0, (), SEED).script(), ours(nominal), rate_hz=RATE_HZ, keep=True)
     _draw(results, runs["nominal"], fixed, nominal)
     _record(results, runs["nominal"])
     return {

@@ -1,14 +1,18 @@
-"""What learned skills are worth where a third hand does something else than soldering: recordings
-of real partners, and made tasks of eleven kinds. Ours beside its rivals, on takes left out.
+"""Learned skills where a third hand does something other than soldering: recordings of real
+partners, and made tasks of eleven kinds. Ours beside rivals, on takes that were left out.
 
+What is judged is what a user has: the skill of `thirdhand learn` with its defaults. Where the
+command refuses, there is none, and the error that the skill would have had is given apart.
 Recordings are left out take by take, person by person, or in blocks. The made tasks are shown by
-some people and done by others. A rival that is told the places knows as much as a skill between
-them.
+some people and done by others. A rival that is given the via-points knows as much as a skill
+between them.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,16 +20,17 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from service.contract.requests import TOLERANCE_M
+from service.cli.main import parser
 from service.core.skill.model import LEVELS
 from service.learning.judgement import Figures
 from service.learning.learn import learn
-from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted
-from sim.experiments.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
-from sim.experiments.partner_rivals import RIVALS, left_out_by
+from service.learning.skill_file import SkillError, StoredSkill
+from service.settings.config import Settings
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
+from sim.experiments.reached import taught
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals.partners import RIVALS, left_out_by
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
 
@@ -41,10 +46,11 @@ RECORDED = {  # the beginnings of the files' names
 PEOPLE = ("give",)  # its groups are persons
 NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
 BLOCK = 9  # takes of `walk` that are left out together
-SEEDS = BY_EXPERIMENT["partners"]
+SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 DEMONSTRATORS = len(SEEDS.learned[KINDS[0]].numbers)
-SHOWN = {  # in the figure
+GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
+SHOWN = {
     SERVICE: ("service", ADAPTED, "o"),
     "same elapsed time": ("same elapsed time", REFERENCE, "|"),
     "linear": ("linear", REFERENCE, "x"),
@@ -55,9 +61,7 @@ SHOWN = {  # in the figure
 
 
 class Part(NamedTuple):
-    """What one process does at once: a set with what is left out of it; a group, or for a made kind
-    nothing.
-    """
+    """The work of one process: a task and the group left out of it; made kinds leave none out."""
 
     task: str
     out: str
@@ -65,13 +69,22 @@ class Part(NamedTuple):
     data: Path | None
 
 
-class Found(NamedTuple):
-    """What each method's takes were judged, and what `learn` says of the skill, or why there is
-    none.
-    """
+class Fold(NamedTuple):
+    """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
 
-    judged: dict[str, list[Judged]]
-    said: dict[str, dict[str, Any]]
+    refusals: tuple[str, ...]  # of the command; with any, it writes no skill
+    figures: Figures | None  # none where nothing could be learned
+    model: str
+    accepted: list[Judged | None]  # each take with the command's skill; None: refused
+    in_spite: list[Judged]  # each take of a refused fold, with the skill used in spite of the refusal
+    take_refusals: list[str]  # via-points that the skill cannot be adapted to
+
+
+class Found(NamedTuple):
+    """The judged takes of each rival, and the service's fold without and with via-points."""
+
+    rivals: dict[str, list[Judged]]
+    service: dict[str, Fold]
 
 
 @functools.lru_cache(maxsize=2)
@@ -104,46 +117,69 @@ def _group(task: str, number: int, name: str) -> str:
 
 
 def part(one: Part) -> Found:
-    """What is found on one part."""
+    """The fold of one part."""
     shown, asked = _takes(one.task, one.people, one.data)
     if one.out:
         shown, asked = [t for t in shown if t.group != one.out], [t for t in asked if t.group == one.out]
     named = bool(shown[0].demonstration.places)
     found = Found({}, {})
     for told in [False] * (one.task not in KINDS) + [True] * named:
-        ending = TOLD * told
         for name, rival in RIVALS.items():
             said = left_out_by(rival, shown, asked, told=told)
-            found.judged[name + ending] = [judged(*pair) for pair in zip(asked, said, strict=True)]
-        found.judged[SERVICE + ending], found.said[SERVICE + ending] = _service(shown, asked, told=told)
+            found.rivals[name + TOLD * told] = [judged(*pair) for pair in zip(asked, said, strict=True)]
+        found.service[SERVICE + TOLD * told] = served(shown, asked, told=told)
     return found
 
 
-def _service(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) -> tuple[list[Judged], dict[str, Any]]:
-    """The service's skill of what is shown, which is told the places of each take or not."""
-    demonstrations = [one.demonstration if told else one.demonstration._replace(places=()) for one in shown]
+@functools.cache
+def _defaults() -> argparse.Namespace:
+    """The options of `thirdhand learn` that nobody gave."""
+    return parser().parse_args(["learn", "take.mcap", "--output", "skill.npz"])
+
+
+def as_command(shown: Sequence[LeftOut], *, told: bool) -> tuple[StoredSkill | None, tuple[str, ...]]:
+    """The skill of `thirdhand learn` with its defaults, an arm's reach included, and the reasons
+    why the command writes none. `told`: the takes hold their via-points.
+    """
+    args = _defaults()
     try:
-        skill = learn(demonstrations)
+        skill = learn(
+            [one.demonstration if told else one.demonstration._replace(places=()) for one in shown],
+            name=args.output.stem,
+            names=[one.name for one in shown],
+            **{name: getattr(args, name) for name in ("components", "points", "ell", "penalty", "seed")},
+        )
     except SkillError as error:
-        return [], {"refused": [str(error)]}
-    figures = msgspec.json.decode(skill.figures, type=Figures)
-    said: dict[str, Any] = {
-        "refused": [],
-        "model": type(skill.model).__name__,
-        "error_mm": figures.all.error_mm,
-        "ambiguous": figures.ambiguous / 100,
-        "unsafe": list(figures.unsafe),
-        "warnings": list(figures.warnings),
-    }
-    out = []
+        return None, (str(error),)
+    return skill, figures_of(skill).unsafe
+
+
+def figures_of(skill: StoredSkill) -> Figures:
+    """The figures in a skill's file."""
+    return msgspec.json.decode(skill.figures, type=Figures)
+
+
+def served(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) -> Fold:
+    """The service's skill of the shown takes, on those that are left out.
+
+    An accepted skill is judged within the reach of the arm. A refused one is judged without it, as
+    otherwise the reach alone would decide.
+    """
+    skill, refusals = as_command(shown, told=told)
+    if skill is None:
+        return Fold(refusals, None, "", [None] * len(asked), [], [])
+    fold = Fold(refusals, figures_of(skill), type(skill.model).__name__, [], [], [])
     for take in asked:
+        one = None
         try:
-            there = adapted(skill, take.demonstration.places, tolerance=TOLERANCE_M) if told else skill
+            there = taught(skill, take.demonstration.places) if told else skill
+            one = judged(take, predicted(there, take, reach=None if refusals else Settings().reach))
         except SkillError as error:
-            said["refused"].append(str(error))
-            continue
-        out.append(judged(take, predicted(there, take)))
-    return out, said
+            fold.take_refusals.append(str(error))
+        if refusals and one:
+            fold.in_spite.append(one)
+        fold.accepted.append(None if refusals else one)
+    return fold
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -159,41 +195,48 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     by_task: dict[str, list[Found]] = {}
     for one, found in zip(parts, shared_out(part, parts, options.workers), strict=True):
         by_task.setdefault(one.task, []).append(found)
-        ours = next(name for name in reversed(found.judged) if name.startswith(SERVICE))
-        results.say(f"{one.task} {one.out}: {_line(found.judged[ours])}")
+        *_, ours = found.service.values()
+        results.say(f"{one.task} {one.out}: {_line(ours)}")
     numbers = {
         "judged_hz": JUDGED_HZ,
         "levels": LEVELS,
         "demonstrators": people,
         "takes_each": EACH,
         "tested_people": people,
-        "recorded": {task: _numbers(by_task[task]) for task in RECORDED if task in by_task},
-        "made": {kind: _numbers(by_task[kind]) for kind in KINDS if kind in by_task},
+        "recorded": {task: numbers_of(by_task[task]) for task in RECORDED if task in by_task},
+        "made": {kind: numbers_of(by_task[kind]) for kind in KINDS if kind in by_task},
     }
     draw_numbers(results, numbers)
     return numbers
 
 
-def _numbers(found: Sequence[Found]) -> dict[str, Any]:
-    """The numbers of a set: of each method, and what `learn` says."""
-    methods = list(found[0].judged)
-    out: dict[str, Any] = {
-        "folds": len(found),
-        "methods": {name: summary([one for part in found for one in part.judged[name]]) for name in methods},
-    }
-    for name in (name for name in methods if name.startswith(SERVICE)):
-        said = [part.said[name] for part in found]
-        learned = [one for one in said if "model" in one]
-        out["methods"][name] |= {
-            "refuses": out["methods"]["mean" + name.removeprefix(SERVICE)]["takes"] - out["methods"][name]["takes"],
-            "reasons": list(dict.fromkeys(reason for one in said for reason in one["refused"]))[:2],
-            "model": learned[0]["model"] if learned else None,
-            "learn_says_mm": float(np.mean([one["error_mm"] for one in learned])) if learned else None,
-            "ambiguous": float(np.mean([one["ambiguous"] for one in learned])) if learned else None,
-            "unsafe": sum(bool(one["unsafe"]) for one in learned),
-            "says": [*learned[0]["unsafe"], *learned[0]["warnings"]] if learned else [],
+def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
+    """The numbers of a set: of each rival, and of the service.
+
+    Those of the service are of accepted takes alone, and `beside_mm` has each rival on these takes.
+    """
+    methods = {name: summary([one for part in found for one in part.rivals[name]]) for name in found[0].rivals}
+    for name in found[0].service:
+        folds, told = [part.service[name] for part in found], name.removeprefix(SERVICE)
+        accepted = [one is not None for fold in folds for one in fold.accepted]
+        beside = {rival: [one for part in found for one in part.rivals[rival + told]] for rival in RIVALS}
+        there = {rival: summary(list(itertools.compress(rows, accepted))) for rival, rows in beside.items()}
+        reasons = [text for fold in folds for text in (*fold.refusals, *fold.take_refusals)]
+        figures = [fold.figures for fold in folds if fold.figures]
+        methods[name] = summary([one for fold in folds for one in fold.accepted if one]) | {
+            "folds": len(folds),
+            "folds_refused": sum(bool(fold.refusals) for fold in folds),
+            "refuses": accepted.count(False),
+            "reasons": list(dict.fromkeys(reasons))[:2],
+            "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
+            "beside_mm": {rival: rows.get("rms_mm") for rival, rows in there.items()},
+            "model": next((fold.model for fold in folds if fold.model), None),
+            "learn_says_mm": float(np.mean([one.all.error_mm for one in figures])) if figures else None,
+            "ambiguous": float(np.mean([one.ambiguous for one in figures])) / 100 if figures else None,
+            "unsafe": sum(bool(one.unsafe) for one in figures),
+            "says": [*figures[0].unsafe, *figures[0].warnings] if figures else [],
         }
-    return out
+    return {"folds": len(found), "methods": methods}
 
 
 def summary(rows: Sequence[Judged]) -> dict[str, Any]:
@@ -220,34 +263,38 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
     }
 
 
-def _line(rows: Sequence[Judged]) -> str:
-    one = summary(rows)
+def _line(fold: Fold) -> str:
+    """A fold as a line of progress."""
+    one = summary([row for row in fold.accepted if row] or fold.in_spite)
     if not one["takes"]:
-        return "refused"
+        return f"refused: {[*fold.refusals, *fold.take_refusals][0]}"
     inside = [100 * one["coverage"][LEVELS.index(level)] for level in (0.5, 0.95)]
-    return (
-        f"{one['rms_mm']:.0f} mm, {one['shifted_rms_mm']:.0f} shifted, worst {one['worst_mm']:.0f}, "
-        f"inside {inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %, unsure {100 * one['unsure']:.0f} %"
-        + ("" if one["told"] is None else f", told of {100 * one['told']:.0f} % of what is 10 cm wrong")
+    text = (
+        f"{one['rms_mm']:.0f} mm, {one['shifted_rms_mm']:.0f} shifted, worst {one['worst_mm']:.0f}, inside "
+        f"{inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %, uncertain {100 * one['unsure']:.0f} %"
     )
+    return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
 
 
 def _label(name: str, methods: dict[str, Any], ending: str) -> str:
     """A set's name, and how often the service refuses."""
     ours = methods[SERVICE + ending]
-    return name + f"\n(service refuses {ours['refuses']} of {ours['takes'] + ours['refuses']})" * bool(ours["refuses"])
+    if ours.get("folds_refused"):
+        return f"{name}\n(learn refuses {ours['folds_refused']} of {ours['folds']} skills)"
+    return name + f"\n({ours['refuses']} of {ours['takes'] + ours['refuses']} takes refused)" * bool(ours["refuses"])
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
     panels = []
-    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, places told", numbers["made"])):
+    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, via-points given", numbers["made"])):
         rows = []
         for task, one in sets.items():
             endings = [ending for ending in ("", TOLD) if SERVICE + ending in one["methods"]]
             rows += [
-                (task.replace("_", " ") + ending * (len(endings) > 1), one["methods"], ending) for ending in endings
+                (task.replace("_", " ") + GIVEN * bool(ending and len(endings) > 1), one["methods"], ending)
+                for ending in endings
             ]
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
@@ -261,12 +308,19 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
                 ax.plot(methods[name + ending].get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
             ours = methods[SERVICE + ending]
             ax.plot(ours.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
+            in_spite = ours.get("in_spite_of_refusal", {}).get("rms_mm", np.nan)
+            ax.plot(in_spite, y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
         ax.set_yticks(range(len(rows)), [_label(*row) for row in rows])
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
     for label, colour, marker in SHOWN.values():
         axes[0, 0].plot([], [], marker, color=colour, ms=5, ls="", label=label)
-    axes[0, 0].plot([], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, a time shift a take removed")
+    axes[0, 0].plot(
+        [], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, with the best time shift of each take"
+    )
+    if any("in_spite_of_refusal" in methods[SERVICE + ending] for _, rows in panels for _, methods, ending in rows):
+        label = "service, refused by learn, used in spite of it"
+        axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
     axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     results.figure(figure)

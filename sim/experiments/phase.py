@@ -1,5 +1,7 @@
-"""No segmentation and no phase: hands that pause pause the robot, hands that go back take it back
-(behind them by its lag, either way), where a trajectory over time goes on.
+"""Hands that pause pause the robot, and hands that go back take it back, without segmentation or
+phase; a trajectory over time continues.
+
+At the same progress of the hands the tool is behind by its lag, either way.
 """
 
 from __future__ import annotations
@@ -11,15 +13,18 @@ import numpy as np
 import rerun as rr
 
 from service.files.shipped import shipped_skill
-from sim.experiments import rivals
-from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated, rehearse
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reached import ours, places_in, shown
+from sim.experiments.rehearsal import TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
+from sim.experiments.rivals.as_skill import in_bench
+from sim.experiments.rivals.promp import ProMPOverTime
+from sim.experiments.scenes import Drawn
 from sim.scene import Scene
-from sim.script import PAUSE_RAMP_S, HandScript, Pause
+from sim.script import PAUSE_RAMP_S, Pause
 
 STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
-SEED, RATE_HZ = BY_EXPERIMENT["phase"].evaluation["hands"].seed, 500
+SEED, RATE_HZ = EXPERIMENTS["phase"].seeds.evaluation["hands"].seed, 500
 STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # of the hands, in the pause
 SETTLED_S = 0.3  # after the hands have stopped
 SHOWN_HZ = 20  # of what the figure shows
@@ -28,17 +33,17 @@ SHOWN_HZ = 20  # of what the figure shows
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     rate_hz = RATE_HZ if options.share == 1 else 250
-    skill, scene = shipped_skill(), Scene()
-    adapts = {"ours": rivals.ours(skill), "promp": rivals.promp(skill, demonstrated())}
+    scene = Scene()
+    promp = ProMPOverTime().learn(shown()).place(places_in(scene))
     runs: dict[str, Rehearsed] = {}
     progress: dict[str, Array] = {}
-    for name, adapt in adapts.items():
-        script = HandScript(scene, seed=SEED, pauses=(STOP, BACK), tremor_rms=TREMOR_M, noise_std=NOISE_M)
-        runs[name] = rehearse(script, adapt(scene), rate_hz=rate_hz, keep=True)
+    for name, skill_for in {"ours": ours(scene), "promp": in_bench(shipped_skill(), promp)}.items():
+        script = Drawn(scene, 1.0, (STOP, BACK), SEED).script()
+        runs[name] = rehearse(script, skill_for, rate_hz=rate_hz, keep=True)
         progress[name] = np.array([script.clock.at(t)[0] for t in runs[name].time_s])
         results.say(f"{name}: {runs[name].errors_mm} mm")
     _record(results, runs, progress["ours"])
-    shown = slice(int(np.argmax(runs["ours"].time_s > 0)), None, round(rate_hz / SHOWN_HZ))
+    samples = slice(int(np.argmax(runs["ours"].time_s > 0)), None, round(rate_hz / SHOWN_HZ))
     numbers = {
         "pause": STOP._asdict(),
         "back": BACK._asdict(),
@@ -47,9 +52,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "hand_from_its_place_in_the_pause_mm": _from_its_place_mm(runs["ours"], scene),
         **{name: _measured(one, progress[name]) for name, one in runs.items()},
         "shown": {
-            "time_s": runs["ours"].time_s[shown].round(3),
-            "progress_s": progress["ours"][shown].round(3),
-            **{name: one.tool[shown].round(4).T for name, one in runs.items()},
+            "time_s": runs["ours"].time_s[samples].round(3),
+            "progress_s": progress["ours"][samples].round(3),
+            **{name: one.tool[samples].round(4).T for name, one in runs.items()},
         },
     }
     draw_numbers(results, numbers)

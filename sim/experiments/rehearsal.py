@@ -1,5 +1,5 @@
-"""The closed loop in process, faster than real time: the service's core and its own loop, driven
-tick by tick with the bench.
+"""The closed loop in process, faster than real time: the service's core and loop, driven tick by
+tick with the bench.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service.learning.demonstration import Demonstration
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop
-from sim.experiments.seeds import SHIPPED, Stream
+from sim.experiments.catalogue import SHIPPED, Stream
 from sim.scene import Scene
 from sim.script import Array, HandScript
 from sim.teach import demonstrate

@@ -1,6 +1,5 @@
-"""Where an experiment's results go:
-
-PNG figures, one JSON of its numbers, a Rerun recording, and progress on standard error.
+"""Results of an experiment: PNG figures, one JSON of its numbers, a Rerun recording, and progress
+on standard error.
 """
 
 from __future__ import annotations

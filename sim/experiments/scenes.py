@@ -1,5 +1,5 @@
-"""Random soldering scenes: places, tempo, pauses and second thoughts of the hands, each from a seed
-and its number.
+"""Random soldering scenes: places, speed, pauses and reversals of the hands, each from a seed and
+its number.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from sim.scene import MOST_MOVED, Scene
 from sim.script import Clock, HandScript, Pause
 
 LOWEST_M = 0.05  # above the table
-OFFSET_M = 0.008  # of where the hands really come to, each axis
+OFFSET_M = 0.008  # deviation of where the hands stop, each axis
 
 
 class Drawn(NamedTuple):
@@ -39,16 +39,16 @@ class Drawn(NamedTuple):
 
     @property
     def turns(self) -> int:
-        """How often the hands go back and come again."""
+        """The number of times the hands go back and return."""
         return sum(pause.depth > 1 for pause in self.pauses)
 
 
 def draw(number: int, *, seed: int) -> Drawn:
     """One random scene.
 
-    Handover, glass and soldering place each anywhere within 15 cm of the nominal one, 5 cm above
-    the table or higher; hands 0.5 to 2 times as fast; one pause in two scenes of three; in every
-    other scene the hands go back once for a while and come again.
+    Handover, glass and soldering place lie anywhere within 15 cm of the nominal ones, at least 5 cm
+    above the table. Hands are 0.5 to 2 times as fast. In two scenes of three they pause once; in
+    every other scene they go back once for a while and return.
     """
     random = np.random.default_rng([seed, number])
     nominal = Scene()
@@ -64,8 +64,7 @@ def draw(number: int, *, seed: int) -> Drawn:
     halves = [0, 1] if random.random() < 1 / 2 else [1, 0]
     for half, wanted, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
         if wanted:
-            # Both in their own half of the script; what lies before the second half is moved by
-            # what the first one lost.
+            # Each lies in its own half of the script; the second is delayed by the first.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
             pauses.append(Pause(at_s, float(random.uniform(0.6, longest_s)), depth))
     ordered = sorted(pauses)

@@ -1,11 +1,12 @@
-"""How near the arm comes to hands, and how fast:
+"""Distance and speed of the arm toward hands: random scenes in closed loop, and scenes in which a
+hand is thrust in its way.
 
-random scenes in closed loop, and others in which a hand is thrust in the way, judged from outside:
-joints as the simulation measures them, hands as they are.
+Both are judged from outside: joints as the simulation measures them, hands as they are.
 """
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -22,18 +23,17 @@ from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
 from service.core.separation.tuning import SLIP_SPEED_MPS
-from service.files.shipped import shipped_skill
 from service.settings.config import Settings, robot_description
-from sim.bench import Bench, TaskEvents
-from sim.experiments import rivals
+from sim.bench import Bench
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reached import EVENTS, ours
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
-from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
-SCENES, RATE_HZ = BY_EXPERIMENT["separation"].evaluation["scenes"], 250  # half the rate, to save time
+SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
 REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
 AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
@@ -137,11 +137,8 @@ def run_one(task: tuple[str, int]) -> Outcome:
                 (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
             )
 
-    skill_for = rivals.ours(shipped_skill())(drawn.scene)
-    if kind == "unheeded":
-        with patch.object(Separation, "step"):
-            done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
-    else:
+    skill_for = ours(drawn.scene)
+    with patch.object(Separation, "step") if kind == "unheeded" else nullcontext():
         done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
     away_s = script.away_s if isinstance(script, ThrustScript) else 0.0
     return _judged(kind, number, drawn, away_s, done, clearances)
@@ -174,7 +171,7 @@ def _judged(
         number,
         done.events.success,
         done.errors_mm,
-        tuple(getattr(done.events, name).time_s for name in TaskEvents.__struct_fields__),
+        tuple(getattr(done.events, name).time_s for name in EVENTS),
         away_s,
         1000 * min(map(min, clearances)),
         1000 * float(distance[began].min()),
@@ -323,10 +320,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
 def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
     """By how much the events come later than if nobody were heeded [s]."""
     late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
-    return {
-        name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())}
-        for i, name in enumerate(TaskEvents.__struct_fields__)
-    }
+    return {name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())} for i, name in enumerate(EVENTS)}
 
 
 def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:

@@ -1,5 +1,5 @@
-"""At which frequencies the joints move while the tool does, for `motion`: what lies between 4 and
-13 Hz is neither a person's way nor seen as one.
+"""Joint speeds by frequency while the tool moves, for `motion`. Between 4 and 13 Hz a person's
+motion has nothing.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from sim.experiments.moving_hands import PERIOD_S
+from sim.experiments.people.moving_hands import PERIOD_S
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)

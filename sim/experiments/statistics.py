@@ -1,11 +1,10 @@
-"""How often the task succeeds where its places are taught:
-
-100 random scenes in closed loop, our skill beside its rivals and what needs no demonstration, and a
-few scenes in real time over Zenoh.
+"""Success rate of the task with taught places: 100 random scenes in closed loop, our skill beside
+rivals, some of which need no demonstration; and a few scenes in real time over Zenoh.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -13,32 +12,37 @@ import numpy as np
 import rerun as rr
 
 from service.files.shipped import shipped_skill
-from sim.bench import TaskEvents
-from sim.experiments import rivals
-from sim.experiments.live import live_run
-from sim.experiments.rehearsal import demonstrated, rehearse
+from sim.experiments.catalogue import DRAWING, EXPERIMENTS
+from sim.experiments.load.live import live_run
+from sim.experiments.reached import EVENTS, places_in, shown
+from sim.experiments.rehearsal import rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot, rgb
+from sim.experiments.rivals.as_skill import in_bench
+from sim.experiments.rivals.gaussian_process import SampleProcess
+from sim.experiments.rivals.method import Learn, Model
+from sim.experiments.rivals.mixtures import MixtureRegression
+from sim.experiments.rivals.places import LookUp, NoDemonstrations
+from sim.experiments.rivals.promp import ProMPOverTime
+from sim.experiments.rivals.service import COMPONENTS, LearnedByService, Paper
 from sim.experiments.scenes import draw
-from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
-from sim.experiments.skills import LookUp, NoDemonstrations
 from sim.experiments.workers import shared_out
+from sim.people import Places
 from sim.scene import GRASP_DISTANCE
 
-SEEDS = BY_EXPERIMENT["statistics"]
+SEEDS = EXPERIMENTS["statistics"].seeds
 SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
 ELL = 5.0  # of our skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
-METHODS = {
-    "ours": "KMP, taught places\n(the service)",
-    "none": "the places and the start,\nno demonstrations",
-    "look_up": "look-up of these,\nweighted by distance",
-    "gaussian_process_5": "Gaussian process,\nour ell, same places",
-    "gaussian_process": "Gaussian process,\nsame places",
-    "paper": "KMP, the paper's\nell, lambda, points",
-    "promp": "ProMP over time,\nnominal speed",
-    "gmr": "GMR alone",
+METHODS: dict[str, tuple[str, Learn]] = {
+    "ours": ("KMP, taught places\n(the service)", lambda shown: LearnedByService(shipped_skill())),
+    "none": ("the places and the start,\nno demonstrations", NoDemonstrations(ell=ELL).learn),
+    "look_up": ("look-up of these,\nweighted by distance", LookUp().learn),
+    "gaussian_process_5": ("Gaussian process,\nour ell, same places", SampleProcess(ell=ELL).learn),
+    "gaussian_process": ("Gaussian process,\nsame places", SampleProcess().learn),
+    "paper": ("KMP, the paper's\nell, lambda, points", Paper().learn),
+    "promp": ("ProMP over time,\nnominal speed", ProMPOverTime().learn),
+    "gmr": ("GMR alone", MixtureRegression(COMPONENTS).learn),
 }
-NAMES = TaskEvents.__struct_fields__
 LEAST_MM = 1e-3  # to what errors are rounded: the least that a logarithmic axis shows
 
 
@@ -54,29 +58,18 @@ class Outcome(NamedTuple):
     held_s: float
 
 
-_adapts: dict[str, rivals.Adapt] = {}
-
-
-def prepare() -> None:
-    """Learns what each method needs, once in a process."""
-    if _adapts:
-        return
-    skill, demonstrations = shipped_skill(), demonstrated()
-    _adapts["ours"] = rivals.ours(skill)
-    _adapts["none"] = rivals.of_model(skill, NoDemonstrations(ell=ELL))
-    _adapts["look_up"] = rivals.of_model(skill, LookUp())
-    _adapts["gaussian_process_5"] = rivals.gaussian_process(skill, demonstrations, ell=ELL)
-    _adapts["gaussian_process"] = rivals.gaussian_process(skill, demonstrations)
-    _adapts["paper"] = rivals.paper(skill, demonstrations)
-    _adapts["promp"] = rivals.promp(skill, demonstrations)
-    _adapts["gmr"] = rivals.gmr(skill, demonstrations)
+@functools.cache
+def _learned(method: str) -> Model[Places]:
+    """What a method learned, once in a process."""
+    return METHODS[method][1](shown())
 
 
 def outcome(task: tuple[str, int]) -> Outcome:
-    """What became of one scene with one method."""
+    """One scene with one method."""
     method, number = task
     drawn = draw(number, seed=SCENES.seed)
-    done = rehearse(drawn.script(), _adapts[method](drawn.scene), rate_hz=OURS_HZ if method == "ours" else RIVALS_HZ)
+    skill_for = in_bench(shipped_skill(), _learned(method).place(places_in(drawn.scene)))
+    done = rehearse(drawn.script(), skill_for, rate_hz=OURS_HZ if method == "ours" else RIVALS_HZ)
     return Outcome(method, number, done.errors_mm, done.events.success, done.held_s)
 
 
@@ -87,9 +80,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     live_count = LIVE_SCENES if options.share == 1 else 0
     tasks = [(method, number) for method in METHODS for number in scenes]
     found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
-    if options.workers == 1:
-        prepare()
-    for one in shared_out(outcome, tasks, options.workers, prepare=prepare):
+    for one in shared_out(outcome, tasks, options.workers):
         found[one.method].append(one)
         done = found[one.method]
         if not one.success and one.method == "ours":
@@ -104,7 +95,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             {
                 "scene": number,
                 "success": live.success,
-                "errors_mm": [getattr(live.events, name).error_mm for name in NAMES],
+                "errors_mm": [getattr(live.events, name).error_mm for name in EVENTS],
                 "errors_in_process_mm": inside.errors_mm,
                 "agrees": live.success == inside.success,
             }
@@ -140,7 +131,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
                 "max": float(errors[:, i].max()),
                 "missed": int((errors[:, i] > 1000 * GRASP_DISTANCE).sum()),
             }
-            for i, name in enumerate(NAMES)
+            for i, name in enumerate(EVENTS)
         },
     }
 
@@ -164,12 +155,12 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         rates.plot((100 * low, 100 * high), (i, i), color="black", lw=1.2)
         rates.text(max(rate, 100 * high) + 2, i, f"{rate:.0f}", va="center")
         errors = np.array(numbers["errors_mm_by_scene"][method])
-        for axes, name, error in zip(events, NAMES, errors.T, strict=True):
+        for axes, name, error in zip(events, EVENTS, errors.T, strict=True):
             at = i + random.uniform(-0.25, 0.25, len(error))
             axes.scatter(np.maximum(error, LEAST_MM), at, s=5, color=colour, alpha=0.5, lw=0)
             axes.plot([max(one[f"{name}_mm"]["median"], LEAST_MM)] * 2, (i - 0.38, i + 0.38), color="black", lw=1.6)
     rates.set(xlim=(0, 116), xticks=range(0, 101, 25), xlabel="scenes in which all three\nevents succeeded [%]")
-    rates.set_yticks(range(len(found)), [METHODS[method] for method in found])
+    rates.set_yticks(range(len(found)), [METHODS[method][0] for method in found])
     rates.invert_yaxis()
     titles = (
         "board handed over:\ntool to left hand",
@@ -196,7 +187,7 @@ def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
     stream = results.recording()
     for method, rows in found.items():
         colour = ADAPTED if method == "ours" else OTHER
-        for event, name in enumerate(NAMES):
+        for event, name in enumerate(EVENTS):
             values: Array = np.array([one.errors_mm[event] for one in rows])
             stream.log(f"/{name}/{method}", rr.SeriesPoints(colors=[rgb(colour)], names=[method]), static=True)
             times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]

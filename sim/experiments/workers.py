@@ -1,4 +1,4 @@
-"""The runs of an experiment, shared out over processes."""
+"""Tasks of an experiment, distributed over processes."""
 
 from __future__ import annotations
 

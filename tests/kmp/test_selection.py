@@ -5,7 +5,7 @@ import pytest
 
 import kmp
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, PeriodicKernel, VelocityKernel
-from sim.experiments.writing import write
+from sim.experiments.reproduction.writing import write
 from support.shown_skills import driven_by_hands, off, over_time, two_hands
 
 

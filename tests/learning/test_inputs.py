@@ -16,7 +16,7 @@ from service.learning.inputs import KINDS, Inputs
 from service.learning.judgement import Figures, table
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill, decoded
-from sim.experiments.left_out import judged, left_out, predicted
+from sim.experiments.people.left_out import judged, left_out, predicted
 
 TIMES = np.arange(0.0, 6.0, 0.04)
 CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is fixed to

@@ -16,7 +16,7 @@ from service.files.demonstration_reader import read_demonstration
 from service.learning.judgement import Figures
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
-from sim.experiments.left_out import judged, left_out, predicted
+from sim.experiments.people.left_out import judged, left_out, predicted
 from support import spoiled
 from support.cell import told
 from support.paths import RECORDINGS

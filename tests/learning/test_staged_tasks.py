@@ -23,7 +23,7 @@ from service.learning.learn import learn
 from service.learning.skill_file import SkillError, decoded
 from service.learning.stages import delay_of
 from service.learning.via_points import adapted, in_force, warnings_of
-from sim.experiments.left_out import judged, left_out, predicted
+from sim.experiments.people.left_out import judged, left_out, predicted
 from sim.made_tasks import takes
 from sim.teach import by_people
 

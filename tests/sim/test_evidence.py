@@ -25,14 +25,14 @@ from service.files.shipped import recordings, shipped_skill
 from service.settings.config import Settings
 from sim.experiments import evidence
 from sim.experiments.__main__ import jobs, main
-from sim.experiments.evidence import EXPERIMENTS, core_digest, kmp_digest, options_of, origin, staleness, tree
+from sim.experiments.catalogue import EXPERIMENTS, Stream
+from sim.experiments.evidence import core_digest, kmp_digest, options_of, origin, staleness, tree
 from sim.experiments.results import ExperimentError, Options
-from sim.experiments.seeds import BY_EXPERIMENT, Stream
 from sim.golden import record
 from support.cell import thirdhand
 from support.paths import ROOT
 
-MODULES = sorted((ROOT / "sim" / "experiments").glob("*.py"))
+MODULES = sorted((ROOT / "sim" / "experiments").rglob("*.py"))
 NAMED = {"commit", "date", "machine", "seeds", "options", "depends_on"}
 
 
@@ -40,12 +40,11 @@ class TestSeeds:
     """The table of seeds."""
 
     def test_nothing_is_evaluated_on_what_it_was_tuned_on_or_learned_from(self) -> None:
-        assert set(BY_EXPERIMENT) == set(EXPERIMENTS)
-        tuned = [stream for seeds in BY_EXPERIMENT.values() for stream in seeds.tuning.values()]
+        tuned = [stream for one in EXPERIMENTS.values() for stream in one.seeds.tuning.values()]
         assert tuned
-        for name, seeds in BY_EXPERIMENT.items():
-            others = [*tuned, *seeds.learned.values()]
-            for one, other in itertools.product(seeds.evaluation.values(), others):
+        for name, experiment in EXPERIMENTS.items():
+            others = [*tuned, *experiment.seeds.learned.values()]
+            for one, other in itertools.product(experiment.seeds.evaluation.values(), others):
                 assert not one.overlaps(other), f"{name}: {one} and {other}"
 
     def test_streams_overlap_where_they_share_a_seed_and_a_number(self) -> None:
@@ -57,7 +56,7 @@ class TestSeeds:
         assert (list(one.share(0.5)), list(one.share(0.01, least=2))) == ([0, 1, 2, 3, 4], [0, 1])
 
     @pytest.mark.parametrize(
-        "path", [path for path in MODULES if path.stem not in ("seeds", "evidence")], ids=lambda path: path.stem
+        "path", [path for path in MODULES if path.stem not in ("catalogue", "evidence")], ids=lambda path: path.stem
     )
     def test_an_experiment_has_no_seed_of_its_own(self, path: Path) -> None:
         """A generator's first number, an argument and a constant `seed` come from elsewhere."""
@@ -142,7 +141,7 @@ def test_a_result_names_its_origin_and_a_folder_by_its_files(tmp_path: Path) -> 
     assert set(found) == NAMED
     assert set(found["options"]) == {"share", "data"}  # it heeds no hands
     assert set(found["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
-    assert found["seeds"] == BY_EXPERIMENT["partners"].named()
+    assert found["seeds"] == EXPERIMENTS["partners"].seeds.named()
     assert found["depends_on"] == tree()
     before = found["options"]["data"]
     assert before["files"] == 1
@@ -195,7 +194,7 @@ class TestAll:
 
         few = {name: EXPERIMENTS[name] for name in ("letters", "promp", "table")}
         for name in few:
-            monkeypatch.setitem(sys.modules, f"sim.experiments.{name}", module(name))
+            monkeypatch.setitem(sys.modules, f"sim.experiments.{EXPERIMENTS[name].module}", module(name))
         monkeypatch.setattr(
             "sim.experiments.__main__.EXPERIMENTS", {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]}
         )

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import msgspec
@@ -28,11 +28,14 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from service.settings.config import Settings, robot_description
-from sim.experiments import followers, rehearsal, rivals
-from sim.experiments.moving_hands import stops
+from sim.experiments import rehearsal
 from sim.experiments.open_loop import targets
-from sim.experiments.skills import LearnedByService
-from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen, served
+from sim.experiments.people.moving_hands import stops
+from sim.experiments.people.trials import RATE_HZ, Seen, judge, seen, served
+from sim.experiments.reached import ours
+from sim.experiments.rivals import followers
+from sim.experiments.rivals.method import DependsOn, Observed, Predicted
+from sim.experiments.rivals.service import LearnedByService
 from sim.people import person
 from sim.scene import Scene
 from sim.script import HandScript
@@ -112,23 +115,23 @@ class TestPeople:
         of_two = [one._replace(places=(one.places[0], one.places[2])) for one in by_people(3)]
         learned = learn(of_two)
         assert isinstance(learned.model, StagedKMP)
-        ours = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
-        placed, belief = ours.model.placed, np.eye(1, MOST_STAGES)[0]
+        exact = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
+        placed, belief = exact.model.placed, np.eye(1, MOST_STAGES)[0]
 
         class Copy:
             """Our means and covariances as a rival's: only how they move is the experiments'."""
 
-            memoryless = True
+            depends_on = DependsOn.HANDS
 
-            def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
-                return placed.mean(hands, np.tile(belief, (len(hands), 1)), rest)
+            def mean(self, seen: Observed) -> np.ndarray:
+                return placed.mean(seen.hands, np.tile(belief, (len(seen.hands), 1)), seen.stillness)
 
-            def predict(self, hands: np.ndarray, rest: np.ndarray) -> Predicted:
-                covariances = [placed.covariance(*one) for one in zip(hands, [belief] * len(hands), rest, strict=True)]
-                far = placed.gates_m(hands) > ours.threshold
-                return Predicted(self.mean(hands, rest), np.array(covariances), far)
+            def predict(self, seen: Observed) -> Predicted:
+                rows = zip(seen.hands, [belief] * len(seen.hands), seen.stillness, strict=True)
+                far = placed.gates_m(seen.hands) > exact.threshold
+                return Predicted(self.mean(seen), np.array([placed.covariance(*one) for one in rows]), far)
 
-        wanted, found = served(ours, shown), served(Copy(), shown)
+        wanted, found = served(exact, shown), served(Copy(), shown)
         both = (wanted["mode"] == Mode.FOLLOW) & (found["mode"] == Mode.FOLLOW)
         assert both.mean() > 0.8
         assert np.abs(wanted["target_acceleration"][both]).max() == 3.0  # the service's own limit is met
@@ -154,10 +157,8 @@ def test_motion_follows_through_the_controller() -> None:
         assert array.tobytes() == wanted[name].tobytes(), name
 
 
-@pytest.mark.parametrize("adapt", [rivals.ours, lambda skill: lambda scene: lambda bench: skill])
-def test_what_is_rehearsed_is_what_the_controller_does(
-    adapt: Callable[[Skill], rivals.Adapt], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("teach", [True, False])
+def test_what_is_rehearsed_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """`statistics`, `phase`, `orientation`, `separation`, and `hands` in process."""
     known: list[Tick] = []
     run = rehearsal.run
@@ -169,8 +170,9 @@ def test_what_is_rehearsed_is_what_the_controller_does(
 
     monkeypatch.setattr(rehearsal, "run", lambda controller, ticks, taps: run(controller, kept(ticks), taps))
     scene, skill = Scene(), shipped_skill()
-    done = rehearsal.rehearse(HandScript(scene, seed=3, speed=2.0), adapt(skill)(scene), rate_hz=125, keep=True)
-    taught = skill if adapt is not rivals.ours else adapted(skill, scene.via_points(), tolerance=TOLERANCE_M)
+    skill_for = ours(scene) if teach else lambda bench: skill
+    done = rehearsal.rehearse(HandScript(scene, seed=3, speed=2.0), skill_for, rate_hz=125, keep=True)
+    taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M) if teach else skill
     wanted = of_the_service(taught, known, msgspec.structs.replace(Settings(), rate_hz=125))
     assert done.frames.tobytes() == wanted.tobytes()
     assert (wanted["mode"] == Mode.FOLLOW).mean() > 0.5

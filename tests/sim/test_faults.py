@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
 
 from sim.experiments.__main__ import main
-from sim.experiments.faults import SHORT
+from sim.experiments.load.faults import SHORT
 from sim.parts import Part
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.timed]

@@ -5,16 +5,24 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from service.cli.main import main as command
 from service.contract.records import SIDES
 from service.core.skill.model import LEVELS
+from service.core.skill.skill import is_reachable
+from service.files.demonstration_reader import write_demonstration
 from service.learning.learn import learn
-from sim.experiments.left_out import JUDGED_HZ, LeftOut, Predicted, judged, left_out, predicted, read
-from sim.experiments.partner_rivals import MEMORY_S, RIVALS, carried, left_out_by, rows_of, scene_of
-from sim.experiments.partners import summary
+from service.learning.skill_file import decoded
+from service.settings.config import Settings
+from sim.experiments.partners import Fold, Found, as_command, numbers_of, served, summary
+from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, judged, left_out, predicted, read
 from sim.experiments.results import ExperimentError, Options, Results
+from sim.experiments.rivals.method import Predicted
+from sim.experiments.rivals.partners import MEMORY_S, RIVALS, carried, in_mean_scene, left_out_by, past, scene_of
 from sim.made_tasks import takes
 
 
@@ -93,7 +101,7 @@ def test_coverage_is_what_a_covariance_says(asked: list[LeftOut]) -> None:
 def test_told_are_moments_far_off_at_which_it_held_or_was_unsure(asked: list[LeftOut]) -> None:
     one, off = asked[0], np.array([[0.11, 0, 0], [0.11, 0, 0], [0.2, 0, 0], [0.09, 0, 0], [0, 0, 0], [0, 0, 0]])
     held, unsure = (np.array(flags, bool) for flags in ([1, 0, 0, 0, 1, 0], [1, 1, 0, 1, 0, 0]))
-    found = judged(one._replace(tool=off), Predicted(np.zeros((6, 3)), held=held, unsure=unsure))
+    found = judged(one._replace(tool=off), Predicted(np.zeros((6, 3)), held=held, uncertain=unsure))
     assert (found.wrong, found.told, found.held, found.unsure) == (3, 2, 2, 3)
     numbers = summary([found])
     assert (numbers["wrong"], numbers["told"], numbers["unsure"]) == pytest.approx((1 / 2, 2 / 3, 1 / 2))
@@ -104,12 +112,12 @@ def test_what_is_carried_to_a_place_and_back_is_where_it_was(asked: list[LeftOut
     here, there = scene_of(asked[0])[2], scene_of(asked[1])[2]
     assert np.abs(carried(here, here, there) - there).max() < 0.005
     assert np.abs(carried(here + 0.01, here, here) - here - 0.01).max() < 1e-12
-    rows = rows_of(asked[0], scene_of(asked[0]))
-    assert rows.hands == pytest.approx(asked[0].hands)
-    assert rows.velocities == pytest.approx(asked[0].velocities, abs=1e-9)
+    same = in_mean_scene(asked[0], scene_of(asked[0]))
+    assert same.hands == pytest.approx(asked[0].hands)
+    assert same.velocities == pytest.approx(asked[0].velocities, abs=1e-9)
     now = round(MEMORY_S[0] * JUDGED_HZ) + 50
-    before = rows.past[now, :6] + rows.hands[now]
-    assert before == pytest.approx(rows.hands[now - round(MEMORY_S[0] * JUDGED_HZ)])
+    before = past(same)[now, :6] + same.hands[now]
+    assert before == pytest.approx(same.hands[now - round(MEMORY_S[0] * JUDGED_HZ)])
 
 
 def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut]) -> None:
@@ -171,3 +179,74 @@ def test_a_reduced_run_has_all_methods_and_says_what_is_refused(
     # what it cannot learn or be told is refused with a reason, take by take or as a whole
     assert cyclic["takes"] + cyclic["refuses"] == 6
     assert bool(cyclic["reasons"]) == bool(cyclic["refuses"])
+
+
+def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
+    """The takes, with hands, tool and via-points moved along x."""
+    moved, out = np.array([metres, 0, 0, 0, 0, 0, 0]), []
+    for one in takes_:
+        d = one.demonstration
+        places = tuple(
+            msgspec.structs.replace(
+                p, **{part: tuple(np.add(getattr(p, part), moved[:3]).tolist()) for part in ("left", "right", "tool")}
+            )
+            for p in d.places
+        )
+        d = d._replace(left=d.left + moved, right=d.right + moved, tool=d.tool + moved, places=places)
+        out.append(left_out(one.name, one.group, d))
+    return out
+
+
+@pytest.mark.parametrize("metres", [0.0, 1.0])
+def test_a_skill_is_judged_and_refused_as_the_command_does(
+    metres: float, shown: list[LeftOut], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = beside(shown, metres)
+    files = [tmp_path / f"{one.name}.mcap" for one in moved]
+    for path, one in zip(files, moved, strict=True):
+        write_demonstration(path, one.demonstration)
+    skill, refusals = as_command(moved, told=True)
+    written = tmp_path / "skill.npz"
+    assert command(["learn", *map(str, files), "--output", str(written)]) == bool(refusals) == (metres > 0)
+    said = capsys.readouterr().err
+    assert written.exists() == (not refusals)
+    assert all(text in said for text in refusals)
+    assert skill is not None
+    if not refusals:
+        same = decoded(written.read_bytes(), origin="skill.npz")
+        np.testing.assert_allclose(same.mean(skill.hands), skill.mean(skill.hands), atol=1e-6)
+    else:
+        assert "arm's reach" in refusals[0]
+
+
+def test_a_refused_fold_enters_no_mean_and_its_error_is_given_apart(shown: list[LeftOut], asked: list[LeftOut]) -> None:
+    def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
+        said = left_out_by(RIVALS["mean"], takes_, tested, told=True)
+        rows = [judged(*pair) for pair in zip(tested, said, strict=True)]
+        return Found(dict.fromkeys((f"{name}, told" for name in RIVALS), rows), {"service, told": fold(takes_, tested)})
+
+    def fold(takes_: list[LeftOut], tested: list[LeftOut]) -> Fold:
+        return served(takes_, tested, told=True)
+
+    good, refused = found(shown, asked), found(beside(shown, 1.0), beside(asked, 1.0))
+    alone, both = (numbers_of(rows)["methods"]["service, told"] for rows in ([good], [good, refused]))
+    for one, folds, refuses in ((alone, 0, 0), (both, 1, len(asked))):
+        assert (one["folds_refused"], one["refuses"], one["takes"]) == (folds, refuses, len(asked))
+    assert both["rms_mm"] == alone["rms_mm"] < alone["beside_mm"]["mean"] == both["beside_mm"]["mean"]
+    assert alone["in_spite_of_refusal"] == {"takes": 0}
+    assert both["in_spite_of_refusal"]["takes"] == len(asked)
+    assert both["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)  # the same takes elsewhere
+    nothing = numbers_of([refused])["methods"]["service, told"]
+    assert nothing["takes"] == 0
+    assert "rms_mm" not in nothing
+    assert nothing["beside_mm"]["mean"] is None
+    assert "arm's reach" in nothing["reasons"][0]
+
+
+def test_a_prediction_is_held_within_the_arms_reach_where_one_is_given(shown: list[LeftOut]) -> None:
+    far, reach = beside(shown, 1.0), Settings().reach
+    skill, _ = as_command(far, told=True)
+    assert skill is not None
+    wider = replace(reach, outer=reach.outer + 1e-4)
+    assert all(is_reachable(at, wider) for at in predicted(skill, far[0], reach=reach).mean)
+    assert not any(is_reachable(at, wider) for at in predicted(skill, far[0]).mean)

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from service.core.skill.skill import Skill
-from sim.experiments.mixtures import frames
-from sim.experiments.people import METHODS, Task, chosen, outcomes, run
-from sim.experiments.recorded_people import recorded_people
+from sim.experiments.people.comparison import METHODS, Task, chosen, outcomes, run
+from sim.experiments.people.recorded_people import recorded_people
+from sim.experiments.people.trials import RATE_HZ, Seen, judge, seen
 from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service
-from sim.experiments.trials import RATE_HZ, Predicted, Seen, judge, seen
+from sim.experiments.rivals.gaussian_process import GaussianProcess
+from sim.experiments.rivals.method import DependsOn, Observed, Predicted
+from sim.experiments.rivals.mixtures import frames
+from sim.experiments.rivals.places import LookUp, NoDemonstrations
+from sim.experiments.rivals.service import Service
 from sim.people import Group, Person, person
 from sim.scene import TOOL_FROM_HAND
 from sim.sessions import BREAKING, MISTAKES, Session, breaking, demonstrations, played, session
@@ -118,16 +121,17 @@ def test_a_scene_that_breaks_differs_in_one_way_and_can_be_done(kind: str) -> No
 class Still:
     """A skill whose tool stays where it is, and that says it is far."""
 
-    memoryless = True
+    depends_on = DependsOn.HANDS
 
     def __init__(self, at: np.ndarray, *, far: bool) -> None:
         self.at, self.far = at, far
 
-    def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        return np.tile(self.at, (len(hands), 1))
+    def mean(self, seen: Observed) -> np.ndarray:
+        return np.tile(self.at, (len(seen.hands), 1))
 
-    def predict(self, hands: np.ndarray, rest: np.ndarray) -> Predicted:
-        return Predicted(self.mean(hands, rest), np.tile(np.eye(3), (len(hands), 1, 1)), np.full(len(hands), self.far))
+    def predict(self, seen: Observed) -> Predicted:
+        count = len(seen.hands)
+        return Predicted(self.mean(seen), np.tile(np.eye(3), (count, 1, 1)), np.full(count, self.far))
 
 
 class TestJudging:
@@ -157,8 +161,8 @@ class TestJudging:
 
     def test_the_service_lets_no_skill_pass_a_hand_that_it_sees(self, as_seen: Seen) -> None:
         class Onto(Still):
-            def mean(self, hands: np.ndarray, rest: np.ndarray) -> np.ndarray:
-                return hands[:, :3] + 0.02 * np.sin(12 * np.arange(len(hands)) / RATE_HZ)[:, None]
+            def mean(self, seen: Observed) -> np.ndarray:
+                return seen.hands[:, :3] + 0.02 * np.sin(12 * np.arange(len(seen.hands)) / RATE_HZ)[:, None]
 
         assert not judge(Onto(np.zeros(3), far=False), as_seen).too_near
 
@@ -177,14 +181,13 @@ def test_skills_go_to_the_places_they_are_told(
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
     hands = frames(places)[1:, :6]
-    rest = np.ones((len(hands), 2))
 
     def mean() -> np.ndarray:
-        return placed.mean(hands) if isinstance(placed, Skill) else placed.mean(hands, rest)
+        return placed.mean(hands) if isinstance(placed, Skill) else placed.mean(Observed.resting(hands))
 
     np.testing.assert_allclose(mean(), frames(places)[1:, 6:], atol=0.008)
     if not isinstance(placed, Skill):
-        np.testing.assert_allclose(placed.predict(hands, rest).mean, mean(), atol=1e-9)
+        np.testing.assert_allclose(placed.predict(Observed.resting(hands)).mean, mean(), atol=1e-9)
     hands[:, 0] += 0.01  # only at the handover the tool goes with the left hand
     moved = mean() - frames(places)[1:, 6:]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.0, 0.0], atol=0.003)
@@ -194,8 +197,8 @@ def test_the_process_tells_the_demonstrations_apart() -> None:
     """Its likelihood's slopes, by differences, are those it is maximised with: it comes to rest."""
     model = GaussianProcess(each=10).learn(demonstrations(3))
     assert model.shared.variance > model.own.variance
-    known = model.without(0).place(None).predict(model.inputs[model.owner == 1], model.inputs[model.owner == 1])
-    assert known.deviation.max() < np.sqrt(model.shared.variance + model.own.variance)
+    known = model.without(0).variances(model.inputs[model.owner == 1])
+    assert known.max() < model.shared.variance + model.own.variance
 
 
 def test_of_candidates_as_good_the_one_nearest_to_the_teacher_is_chosen(as_seen: Seen) -> None:
@@ -228,10 +231,10 @@ def test_recorded_hands_make_people_for_tuning(tmp_path: Path) -> None:
 def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
-        monkeypatch.setattr(f"sim.experiments.people.{table}", {"tuning": value, "test": value})
-    monkeypatch.setattr("sim.experiments.people.BREAKING", BREAKING[:1])
+        monkeypatch.setattr(f"sim.experiments.people.comparison.{table}", {"tuning": value, "test": value})
+    monkeypatch.setattr("sim.experiments.people.comparison.BREAKING", BREAKING[:1])
     few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
-    monkeypatch.setattr("sim.experiments.people.METHODS", few)
+    monkeypatch.setattr("sim.experiments.people.comparison.METHODS", few)
     results = Results(tmp_path, "people", said=False)
     found = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
     mean = {name: {m: one[m]["mean"] for m in ("success", "path_rms_mm")} for name, one in found["methods"].items()}

@@ -1,9 +1,10 @@
-"""Correlations adapted to a reward (the paper, section III-B and Figure 3): letters in space that
-cost the arm's joints less and less motion, and how much of that a single number would have done.
+"""Correlations learned from a reward (the paper, section III-B and Figure 3): letters in space that
+cost the joints less motion, and the share of it that one number saves too.
 
 The paper shows one letter, one via-point and a cost that falls. Here letters and via-points are the
-sample, and what was learned is set beside three others at the same distance from the reference: the
-best of as many random Lambda, Lambda = c I with the one number c, and what learning adds to that c.
+sample, and the learned Lambda is compared with three others at the same distance from the
+reference: the best of as many random ones, Lambda = c I with one number c, and what learning adds
+to that c.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, im
 from service.core.arm.stage import Arm
 from service.core.kinematics import Kinematics
 from service.settings.config import Settings, robot_description
+from sim.experiments.catalogue import DRAWING, EXPERIMENTS
+from sim.experiments.reproduction.writing import TARGETS, write
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, equal_box, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT, DRAWING
-from sim.experiments.writing import TARGETS, write
 
 ELL, LAMBDA, SHARPNESS = 0.1, 2.0, 5.0  # the paper's ell, lambda and gamma; here over seconds and centimetres
 DURATION_S, POINTS, COMPONENTS = 10.0, 100, 8
@@ -31,7 +32,7 @@ TILT = np.radians(60)  # of the plane it is written in, against the table
 DEPTH_STD_CM = 0.8
 VIA_ROWS, VIA_STEP_CM, VIA_VARIANCE = (20, 80), 4.0, 1e-6  # where along the letter, how far from it, [cm²]
 JOINT_WEIGHTS = np.array([3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0])  # W: what moves much of the arm costs more
-SEEDS = BY_EXPERIMENT["correlation"]
+SEEDS = EXPERIMENTS["correlation"].seeds
 LETTERS, VIA_POINTS = SEEDS.evaluation["letters"], SEEDS.evaluation["points"]
 BASES, EXPLORATION, UPDATES, ROLLOUTS = 8, 0.25, 30, 12
 SPREAD = (0.25, 2.0)  # of random Lambda around 1, drawn evenly in the logarithm

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from kmp import Correlation, Gaussians, improve
-from sim.experiments.correlation import (
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reproduction.correlation import (
     BASES,
     DURATION_S,
     EXPLORATION,
@@ -25,9 +26,8 @@ from sim.experiments.correlation import (
     letter,
 )
 from sim.experiments.results import OTHER, Array, Options, Results, pyplot
-from sim.experiments.seeds import BY_EXPERIMENT
 
-SEARCHES = BY_EXPERIMENT["runs"].evaluation["searches"]
+SEARCHES = EXPERIMENTS["runs"].seeds.evaluation["searches"]
 VIA_ROW = 50  # of 100 along the letter
 
 

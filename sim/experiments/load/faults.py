@@ -1,10 +1,10 @@
-"""What happens when something fails: each fault struck for real while the tool is fast, and what it
-cost.
+"""Faults, each caused for real while the tool is fast: time to rest, path until then, and lost
+ticks.
 
-A service, its scribe and skill worker, a tracker, and the network are processes; PyBullet
-is the arm. Taken are when the service decided to stop (from its recording), when the tool came to
-rest and how far it went until then (from the arm), how far it was told to (from the commands that
-left the service), and how many ticks the recording lacks.
+Service, scribe, skill worker, tracker and network are processes; PyBullet is the arm. Measured are
+the decision to stop (from the recording), the time at which the tool came to rest and its path
+until then (from the arm), the commanded path (from the commands that left the service), and the
+ticks that the recording lacks.
 """
 
 from __future__ import annotations

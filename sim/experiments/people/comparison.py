@@ -1,8 +1,8 @@
-"""What learned skills are worth on people who did not demonstrate: ours beside its rivals.
+"""Learned skills on modelled people who did not demonstrate, ours beside rivals.
 
-All learn from the same demonstrations, are told the same places with the same errors, and are
-followed by the same core. Parameters are chosen on the people of the tuning set, of as
-many candidates for each method; the figures are those of the test set, whom nothing was chosen on.
+All methods learn from the same demonstrations, are given the same places with the same errors, and
+are followed by the same core. Parameters are chosen on the people of the tuning set, from the same
+number of candidates for each method. The figures are those of the test set.
 """
 
 from __future__ import annotations
@@ -15,12 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.core.skill.model import LEVELS
-from sim.experiments.mixtures import InteractionProMP, MixtureRegression, TaskParameterised
-from sim.experiments.recorded_people import recorded_people
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
-from sim.experiments.seeds import BY_EXPERIMENT, DRAWING, Stream
-from sim.experiments.skills import GaussianProcess, LookUp, NoDemonstrations, Service, ServiceAsPaper
-from sim.experiments.trials import (
+from sim.experiments.catalogue import DRAWING, EXPERIMENTS, Stream
+from sim.experiments.people.recorded_people import recorded_people
+from sim.experiments.people.trials import (
     FAST_MPS,
     FOR_S,
     NEAR_M,
@@ -28,18 +25,23 @@ from sim.experiments.trials import (
     SLOW_MPS,
     WITHIN_M,
     WRONG_M,
-    Method,
-    Model,
     Outcome,
     Seen,
     judge,
     seen,
 )
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.rivals.gaussian_process import GaussianProcess
+from sim.experiments.rivals.method import Method, Model
+from sim.experiments.rivals.mixtures import MixtureRegression, TaskParameterised
+from sim.experiments.rivals.places import LookUp, NoDemonstrations
+from sim.experiments.rivals.promp import InteractionProMP
+from sim.experiments.rivals.service import Service, ServiceAsPaper
 from sim.experiments.workers import shared_out
-from sim.people import Group, person
+from sim.people import Group, Places, person
 from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
 
-SEEDS = BY_EXPERIMENT["people"]
+SEEDS = EXPERIMENTS["people"].seeds
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
 DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
 PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
@@ -111,7 +113,7 @@ def _taught() -> list[Shown]:
 
 
 @functools.cache
-def _learned(method: str, candidate: int) -> Model:
+def _learned(method: str, candidate: int) -> Model[Places]:
     return METHODS[method].candidates[candidate].learn(_taught())
 
 

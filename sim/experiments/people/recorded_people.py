@@ -1,5 +1,5 @@
-"""People made of recorded hands: their reaches warped to the ways of a scene, and their tracker's
-noise as it was. For choosing parameters only.
+"""People made of recorded hands: their reaches warped to the paths of a scene, and their tracker's
+noise. Only for choosing parameters.
 
 Recordings are `.npz` files with `time_s` (T,), `left` and `right` (T, 3) [m].
 """
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from service.contract.explain import in_words
-from sim.experiments.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
+from sim.experiments.people.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
 from sim.experiments.results import Array, ExperimentError
 from sim.people import Person, Tracker, person
 from sim.sessions import SHAPE_STEPS

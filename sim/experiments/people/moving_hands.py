@@ -1,10 +1,9 @@
-"""Hands in motion, for `motion`: recorded ones, ones modelled after them, sudden stops, and the
-bench's reaches.
+"""Moving hands for `motion`: recorded ones, modelled ones, sudden stops, and the bench's reaches.
 
 Recordings are `.npz` files with `time_s` or `t` (T,) [s], `left` and `right` (T, 3) [m], NaN where
-a hand was not seen; one that never was rests. Files that differ only in what follows the last
-underscore of their names are of one person. What they hold is brought into the skill's region;
-their truth is the recording without what is too fast for a wrist.
+a hand was not seen; a hand that was never seen rests. Files whose names differ only after the last
+underscore are of one person. Recorded hands are moved into the skill's region; their truth is the
+recording without what is too fast for a wrist.
 """
 
 from __future__ import annotations

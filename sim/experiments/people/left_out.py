@@ -1,8 +1,8 @@
-"""Takes that were left out, as the service's core sees them and predicts their tool, and what is
-judged of that.
+"""Takes that were left out, as the service's core sees them and predicts their tool, and their
+judgement.
 
-Hands go sample by sample through the core's stages `intake` and `skill`, each take from a fresh
-state. Nothing is clamped: recordings lie outside of the arm's reach.
+Hands pass sample by sample through the core's stages `intake` and `skill`, each take from a fresh
+state. Targets are clamped only where a reach is given: most recordings lie outside the arm's.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from service.contract.explain import in_words
 from service.contract.records import SIDES
@@ -24,7 +23,6 @@ from service.core.codes import HANDS_KNOWN
 from service.core.controller import start_state
 from service.core.frame import Event, blank, frame_layout
 from service.core.intake.stage import Intake
-from service.core.skill.model import CHI_SQUARE
 from service.core.skill.skill import Skill
 from service.core.skill.stage import SkillStage
 from service.core.skill.tuning import UNSURE_M
@@ -33,10 +31,12 @@ from service.learning.demonstration import Demonstration
 from service.settings.config import Reach, Settings
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.results import Array, ExperimentError
+from sim.experiments.rivals.method import Observed, Predicted
 
 RATE_HZ, JUDGED_HZ = 125, 25
 LONGEST_SHIFT_S = 1.0
 FAR_M = 1e3  # the corner of a workspace that clamps nothing
+ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
 PLACE_STD_M = 0.003  # of a place that is where a take begins or ends
 
 
@@ -51,17 +51,10 @@ class LeftOut(NamedTuple):
     velocities: Array  # (T, 6) [m/s]
     tool: Array  # (T, 3) [m] the teacher's
 
-
-class Predicted(NamedTuple):
-    """Means (T, 3) [m], covariances (T, 3, 3) [m²] if any are said, where it holds and where it is
-    told to be unsure (T,), and squared Mahalanobis distances that the regions of LEVELS reach.
-    """
-
-    mean: Array
-    covariance: Array | None = None
-    held: NDArray[np.bool_] | None = None
-    unsure: NDArray[np.bool_] | None = None
-    radii: tuple[float, ...] = CHI_SQUARE
+    @property
+    def seen(self) -> Observed:
+        """The hands alone; nothing is estimated of their stillness."""
+        return Observed(self.times, self.hands, self.velocities, np.zeros((len(self.times), 2)))
 
 
 class Judged(NamedTuple):
@@ -82,31 +75,35 @@ class Judged(NamedTuple):
 
 
 @cache
-def _settings() -> Settings:
-    reach = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
+def _settings(reach: Reach) -> Settings:
     return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ, reach=reach)
 
 
 def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
     """A take, once through intake."""
-    times, moving, _ = _through_core(demonstration, None)
+    times, moving, _ = _through_core(demonstration)
     stamps = (demonstration.stamps_ns - demonstration.stamps_ns[0]) * 1e-9
     tool = np.stack([np.interp(times, stamps, column) for column in demonstration.tool[:, :3].T], axis=1)
     return LeftOut(name, group, demonstration, times, moving[:, 0], moving[:, 1], tool)
 
 
-def predicted(skill: Skill, take: LeftOut) -> Predicted:
-    """What the core predicts of a take with a skill."""
-    return _through_core(take.demonstration, skill)[2]
+def predicted(skill: Skill, take: LeftOut, *, reach: Reach | None = None) -> Predicted:
+    """The core's prediction of a take with a skill; targets are held within `reach`, if any, and
+    within the skill's workspace then.
+    """
+    return _through_core(take.demonstration, skill, reach)[2]
 
 
-def _through_core(demonstration: Demonstration, skill: Skill | None) -> tuple[Array, Array, Predicted]:
+def _through_core(
+    demonstration: Demonstration, skill: Skill | None = None, reach: Reach | None = None
+) -> tuple[Array, Array, Predicted]:
     """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and what a skill predicts.
 
     While no hands are known, it holds what it predicted last.
     """
-    settings, used = _settings(), shipped_skill() if skill is None else skill
-    used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
+    settings, used = _settings(reach or ANYWHERE), skill or shipped_skill()
+    if reach is None:
+        used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
     intake, stage, state = Intake(settings), SkillStage(settings, used), start_state(settings, used)
     frame = blank(frame_layout(len(settings.joints.names)))
     alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
@@ -160,7 +157,7 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         squares = np.einsum("ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0])
         inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
     lengths = np.linalg.norm(errors, axis=1)
-    held, unsure, wrong = said.held, said.unsure, lengths > UNSURE_M
+    held, unsure, wrong = said.held, said.uncertain, lengths > UNSURE_M
     return Judged(
         count,
         float(np.sum(errors**2)),

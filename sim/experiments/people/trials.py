@@ -1,14 +1,14 @@
-"""One session of a person with one skill: hands as a tracker sees them through the service's core,
-whose arm does as it is told; and what is judged of it.
+"""Sessions of a person with a skill, and their judgement: hands as a tracker sees them pass through
+the service's core, whose arm moves exactly as commanded.
 
-All in process at one rate, the same for every skill.
+All run in process at one rate, the same for every skill.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,11 +22,12 @@ from service.core.skill.skill import Skill
 from service.files.shipped import shipped_skill
 from service.settings.config import Settings
 from sim.closed_loop import START_NS, hand_event
-from sim.experiments.open_loop import Said, along_hands, controller, frames, rival
+from sim.experiments.open_loop import controller, frames
 from sim.experiments.results import Array
-from sim.people import Places
+from sim.experiments.rivals.as_skill import Said, along_hands, rival
+from sim.experiments.rivals.method import DependsOn, Mask, Observed, Placed, Predicted
 from sim.scene import TOOL_FROM_HAND
-from sim.sessions import Session, Shown
+from sim.sessions import Session
 from sim.teach import places_of
 
 RATE_HZ = 125
@@ -37,45 +38,6 @@ SMOOTHED = 5  # ticks over which a target's velocity is taken where a rival has 
 LONGEST_DELAY_S = 0.6
 KEPT = 0.05  # share of the time falsely followed up to which the way was kept
 SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # until when it must be held; after it the hands' estimates are coming back
-Mask = NDArray[np.bool_]
-
-
-class Predicted(NamedTuple):
-    """Means (T, 3) [m], covariances (T, 3, 3) [m²], and whether each is far from the data (T,)."""
-
-    mean: Array
-    covariance: Array
-    far: Mask
-
-
-class Placed(Protocol):
-    """A rival that was told the places of a scene."""
-
-    @property
-    def memoryless(self) -> bool:
-        """Whether a prediction depends on the hands of its moment alone, and how they rest."""
-
-    def predict(self, hands: Array, rest: Array) -> Predicted:
-        """The tool for both hands (T, 6) [m] that rest so much (T, 2), one row a tick, in the order
-        of time.
-        """
-
-    def mean(self, hands: Array, rest: Array) -> Array:
-        """The means alone (T, 3) [m]; asked of what is memoryless."""
-
-
-class Model(Protocol):
-    """What was learned from demonstrations."""
-
-    def place(self, places: Places) -> Placed | Skill:
-        """The rival, or a skill of the service, in a scene whose places are perceived so."""
-
-
-class Method(Protocol):
-    """A way to learn, with its parameters."""
-
-    def learn(self, demonstrations: Sequence[Shown]) -> Model:
-        """The model of demonstrations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +175,8 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
     if isinstance(placed, Skill):
         return frames(placed, one.ticks, settings())
     predicted, motion = _moving(placed, one)
-    now = 0
+    assert predicted.covariance is not None
+    covariance, held, now = predicted.covariance, predicted.held, 0
 
     def counted() -> Iterator[Tick]:
         nonlocal now
@@ -223,7 +186,7 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
 
     skill = rival(
         shipped_skill(),
-        lambda *moving: Said(motion[now], predicted.covariance[now], bool(predicted.far[now])),
+        lambda *moving: Said(motion[now], covariance[now], held is not None and bool(held[now])),
         via_points=places_of(one.session.told),
     )
     return frames(skill, counted(), settings())
@@ -238,11 +201,12 @@ def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
     s, v, a = one.estimates.transpose(1, 0, 2)
     if placed is None:
         count, as_told = len(one.times), replace(one.session, places=one.session.told)
-        predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.zeros(count, bool))
+        predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)))
     else:
-        predicted = placed.predict(s, one.rest)
-        if placed.memoryless:
-            return predicted, along_hands(lambda hands: placed.mean(hands, one.rest), s, v, a)
+        seen = Observed(one.times, s, v, one.rest)
+        predicted = placed.predict(seen)
+        if placed.depends_on is DependsOn.HANDS:
+            return predicted, along_hands(lambda hands: placed.mean(seen._replace(hands=hands)), s, v, a)
     before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
     velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
     return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reproduction.writing import DURATION_S, TARGETS, TIMES, recorded, write
 from sim.experiments.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.writing import DURATION_S, TARGETS, TIMES, recorded, write
 
 ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
-SEEDS = BY_EXPERIMENT["letters"]
+SEEDS = EXPERIMENTS["letters"].seeds
 COMPONENTS, SEED = 8, SEEDS.method
 WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
@@ -81,21 +82,55 @@ def adapted(letter: Letter, case: Case) -> KMP:
     return letter.primitive.adapt(case.times[:, None], desired, tolerance=TOLERANCE_S)
 
 
+class Line(NamedTuple):
+    """A letter's trajectory (200, 2) [cm] by some method, for a case."""
+
+    letter: Letter
+    case: Case
+    points: Array
+
+    @property
+    def misses(self) -> Array:
+        """Distances (V,) [cm] from the desired points at their times."""
+        at = [int(np.argmin(np.abs(TIMES - t))) for t in self.case.times]
+        return np.asarray(np.linalg.norm(self.points[at] - self.case.points, axis=1))
+
+    def measured(self) -> dict[str, float]:
+        """Largest miss, and distances from the demonstrations' mean, by name."""
+        off = np.linalg.norm(self.points - self.letter.demonstrations.mean(axis=0), axis=1)
+        away = off[elsewhere(self.case)]
+        return {
+            "miss_cm": float(self.misses.max()),
+            "rms_deviation_elsewhere_cm": _rms(away),
+            "largest_deviation_elsewhere_cm": float(away.max()),
+            "rms_deviation_cm": _rms(off),
+        }
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
 def elsewhere(case: Case) -> Any:
-    """Which of the 200 times are far from every desired point."""
+    """True for those of the 200 times that are far from every desired point."""
     return np.abs(TIMES[:, None] - case.times).min(axis=1) > NEAR_S
 
 
-def gathered(options: Options) -> dict[str, dict[str, Array]]:
-    """The demonstrations of each set of letters: the model's, and the recorded ones where a folder
-    is given.
-    """
+def by_kmp(letter: Letter, case: Case) -> Array:
+    """The trajectory (200, 2) [cm] of the adapted primitive."""
+    return adapted(letter, case).mean(TIMES[:, None])
+
+
+def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
+    """The letters of each set: the model's, and the recorded ones where a folder is given."""
     some = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
     sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in some}}
     if options.letters is not None:
         real = recorded(options.letters)
         sets["recorded"] = {name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]}
-    return sets
+    found = {name: [learned(*one) for one in letters.items()] for name, letters in sets.items()}
+    results.say(", ".join(f"{len(rows)} letters learned ({name})" for name, rows in found.items()))
+    return found
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -108,10 +143,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "unit": "cm",
     }
     stream = results.recording()
-    sets: dict[str, list[Letter]] = {}
-    for name, letters in gathered(options).items():
-        rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
-        results.say(f"{len(rows)} letters learned ({name})")
+    sets = gathered(results, options)
+    for name, rows in sets.items():
         numbers[name] = {row.name: [_measured(row, case) for case in cases(row)] for row in rows}
         flat = [one for per in numbers[name].values() for one in per]
         numbers[f"{name}_summary"] = {
@@ -120,11 +153,14 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             "largest_deviation_elsewhere_cm": max(one["largest_elsewhere_cm"] for one in flat),
             "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
         }
-        sets[SETS[name]] = rows
         for row in rows:
-            _record(stream, row, name)
+            path, strips = f"/{name}/{row.name}", list(row.demonstrations * (1, -1))
+            lines = rr.LineStrips2D(strips, colors=[rgb(REFERENCE)], radii=[0.03])
+            stream.log(f"{path}/demonstrations", lines, static=True)
+            for number, case in enumerate(cases(row)):
+                record(stream, path, number, {"adapted": (by_kmp(row, case), ADAPTED)}, case)
     stream.disconnect()
-    _draw(results, sets)
+    _draw(results, {SETS[name]: rows for name, rows in sets.items()})
     return numbers
 
 
@@ -134,9 +170,33 @@ def _measured(letter: Letter, case: Case) -> dict[str, Any]:
     return {
         "case": case.name,
         "miss_cm": float(np.linalg.norm(primitive.mean(case.times[:, None]) - case.points, axis=1).max()),
-        "rms_elsewhere_cm": float(np.sqrt(np.mean(away**2))),
+        "rms_elsewhere_cm": _rms(away),
         "largest_elsewhere_cm": float(away.max()),
     }
+
+
+def record(
+    stream: rr.RecordingStream, path: str, number: int, lines: Mapping[str, tuple[Array, str]], case: Case
+) -> None:
+    """Logs the trajectories of a case, by name with their colours, and its desired points."""
+    stream.set_time("case", sequence=number)
+    for name, (line, colour) in lines.items():  # Rerun's y axis points down
+        stream.log(f"{path}/{name}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08]))
+    stream.log(f"{path}/desired", rr.Points2D(case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))
+
+
+def draw_lines(axes: Any, letter: Letter, case: Case, lines: Mapping[str, tuple[Array, str]], mark: str) -> None:
+    """Draws the mean of the demonstrations, trajectories by label with their colours, and desired
+    points in the colour `mark`.
+    """
+    mean = letter.demonstrations.mean(axis=0)
+    axes.plot(*mean.T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations")
+    for label, (line, colour) in lines.items():
+        axes.plot(*line.T, color=colour, lw=1.5, label=label)
+    axes.plot(*case.points.T, "o", mfc="none", mec=mark, mew=1.7, ms=7, label="desired points")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title(letter.name, loc="left", fontweight="bold", fontsize=9)
+    axes.tick_params(labelsize=7)
 
 
 def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
@@ -186,22 +246,8 @@ def _draw_letter(row: Any, letter: Letter) -> None:
         ellipse(row[0], mean, covariance, facecolor=ADAPTED, edgecolor=ADAPTED, alpha=0.35)
     for axes, case in zip(row[1:], cases(letter), strict=True):
         axes.plot(*letter.reference.T, "--", color=REFERENCE, lw=0.9)
-        axes.plot(*adapted(letter, case).mean(TIMES[:, None]).T, color=ADAPTED, lw=1.3)
+        axes.plot(*by_kmp(letter, case).T, color=ADAPTED, lw=1.3)
         axes.plot(*case.points.T, "o", mfc="none", mec=DESIRED, mew=1.4, ms=5, clip_on=False)
     x, y = _middle(letter)
     for axes in row:
         axes.set(xlim=(x - HALF_CM, x + HALF_CM), ylim=(y - HALF_CM, y + HALF_CM))
-
-
-def _record(stream: rr.RecordingStream, letter: Letter, name: str) -> None:
-    path = f"/{name}/{letter.name}"
-    stream.log(
-        f"{path}/demonstrations",
-        rr.LineStrips2D(list(letter.demonstrations * (1, -1)), colors=[rgb(REFERENCE)], radii=[0.03]),
-        static=True,
-    )
-    for number, case in enumerate(cases(letter)):
-        stream.set_time("case", sequence=number)
-        line = adapted(letter, case).mean(TIMES[:, None]) * (1, -1)  # Rerun's y axis points down
-        stream.log(f"{path}/adapted", rr.LineStrips2D([line], colors=[rgb(ADAPTED)], radii=[0.08]))
-        stream.log(f"{path}/desired", rr.Points2D(case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))

@@ -1,5 +1,5 @@
-"""The closed loop in real time: the service as a process of its own, the bench beside it, Zenoh
-between them.
+"""The closed loop in real time: the service as a process of its own, the bench beside it, connected
+by Zenoh.
 """
 
 from __future__ import annotations

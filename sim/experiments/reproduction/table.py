@@ -13,13 +13,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kmp import Gaussians
-from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
-from sim.experiments.promp import conditioned
-from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, ExperimentError, Options, Results, pyplot
-from sim.experiments.writing import DURATION_S, TIMES
+from sim.experiments.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered
+from sim.experiments.reproduction.promp import conditioned
+from sim.experiments.reproduction.writing import DURATION_S, TIMES
+from sim.experiments.results import ADAPTED, DESIRED, OTHER, Array, ExperimentError, Options, Results, pyplot
 
 WEIGHTS = 20  # of the DMP, for each of x and y: as many as ProMP has basis functions
-METHODS = {"kmp": ADAPTED, "promp": OTHER, "dmp": "#009E73", "gmm": DESIRED}
+METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}
 SHOWN = ("B", "G")
 
 Trajectory: TypeAlias = Callable[[Letter, Case], Array]
@@ -29,28 +29,23 @@ Trajectory: TypeAlias = Callable[[Letter, Case], Array]
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     methods: dict[str, Trajectory] = {
-        "kmp": lambda letter, case: adapted(letter, case).mean(TIMES[:, None]),
+        "kmp": by_kmp,
         "promp": conditioned,
         "dmp": configured,
         "gmm": lambda letter, _: letter.reference,
     }
     numbers: dict[str, Any] = {"unit": "cm", "dmp_weights_per_output": WEIGHTS}
-    shown: list[tuple[Letter, dict[str, Array]]] = []
-    for name, letters in gathered(options).items():
-        rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
-        found = {
-            who: [(row, case, method(row, case)) for row in rows for case in cases(row)]
-            for who, method in methods.items()
-        }
-        numbers[SETS[name]] = {who: _summary(lines) for who, lines in found.items()}
-        numbers[SETS[name]]["inside_95_percent"] = _coverage(rows)
-        results.say(f"{len(rows)} letters ({name})")
-        last = [n for n, (_, case, _) in enumerate(found["kmp"]) if len(case.times) == 3]
-        shown += [
-            (found["kmp"][n][0], {who: lines[n][2] for who, lines in found.items()} | {"": found["kmp"][n][1].points})
-            for n in last
-            if found["kmp"][n][0].name in SHOWN or len(last) < len(SHOWN)
+    shown: list[dict[str, Line]] = []
+    for name, rows in gathered(results, options).items():
+        found = [
+            {who: Line(row, case, method(row, case)) for who, method in methods.items()}
+            for row in rows
+            for case in cases(row)
         ]
+        numbers[SETS[name]] = {who: _summary([one[who] for one in found]) for who in methods}
+        numbers[SETS[name]]["inside_95_percent"] = _coverage(rows)
+        last = [one for one in found if len(one["kmp"].case.times) == 3]
+        shown += [one for one in last if one["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
     _draw(results, shown)
     return numbers
 
@@ -72,19 +67,17 @@ def configured(letter: Letter, case: Case) -> Array:
     return np.column_stack([np.interp(TIMES, times, one) for one in line.T])
 
 
-def _summary(lines: list[tuple[Letter, Case, Array]]) -> dict[str, float]:
+def _summary(lines: list[Line]) -> dict[str, float]:
     """The largest misses of start, via-point and end, the mean rms deviation elsewhere [cm]."""
     misses: dict[str, list[float]] = {"start": [], "via": [], "end": []}
-    away = []
-    for letter, case, line in lines:
-        for t, point in zip(case.times, case.points, strict=True):
-            kind = {TIMES[0]: "start", TIMES[-1]: "end"}.get(t, "via")
-            misses[kind].append(float(np.linalg.norm(line[int(np.argmin(np.abs(TIMES - t)))] - point)))
-        off = np.linalg.norm(line - letter.demonstrations.mean(axis=0), axis=1)[elsewhere(case)]
-        away.append(float(np.sqrt(np.mean(off**2))))
+    for line in lines:
+        for t, miss in zip(line.case.times, line.misses, strict=True):
+            misses[{TIMES[0]: "start", TIMES[-1]: "end"}.get(t, "via")].append(float(miss))
     return {
         **{f"largest_miss_of_{kind}_cm": max(values) for kind, values in misses.items()},
-        "mean_rms_deviation_elsewhere_cm": float(np.mean(away)),
+        "mean_rms_deviation_elsewhere_cm": float(
+            np.mean([line.measured()["rms_deviation_elsewhere_cm"] for line in lines])
+        ),
     }
 
 
@@ -110,24 +103,11 @@ def _inside(row: Letter, predicted: Gaussians) -> float:
     return float(np.mean(squares < 5.991))  # chi-square of two degrees of freedom
 
 
-def _draw(results: Results, shown: list[tuple[Letter, dict[str, Array]]]) -> None:
-    plt = pyplot()
-    figure, grid = plt.subplots(1, len(shown), figsize=(2.6 * len(shown), 3.2), squeeze=False)
-    for axes, (letter, lines) in zip(grid[0], shown, strict=True):
-        axes.plot(
-            *letter.demonstrations.mean(axis=0).T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations"
-        )
-        for who, colour in METHODS.items():
-            axes.plot(
-                *lines[who].T,
-                color=colour,
-                lw=1.4,
-                label={"gmm": "GMM"}.get(who, who.upper().replace("PROMP", "ProMP")),
-            )
-        axes.plot(*lines[""].T, "o", mfc="none", mec="black", mew=1.6, ms=7, label="desired points")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_title(letter.name, loc="left", fontweight="bold", fontsize=9)
-        axes.tick_params(labelsize=7)
+def _draw(results: Results, shown: list[dict[str, Line]]) -> None:
+    figure, grid = pyplot().subplots(1, len(shown), figsize=(2.6 * len(shown), 3.2), squeeze=False)
+    for axes, one in zip(grid[0], shown, strict=True):
+        lines = {label: (one[who].points, colour) for who, (label, colour) in METHODS.items()}
+        draw_lines(axes, one["kmp"].letter, one["kmp"].case, lines, "black")
     grid[0][0].set_ylabel("cm")
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure)

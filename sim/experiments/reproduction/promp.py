@@ -5,21 +5,20 @@ input's dimension grows.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
-from sim.experiments.letters import SETS, Case, Letter, adapted, cases, elsewhere, gathered, learned
-from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, Options, Results, pyplot, rgb
-from sim.experiments.rivals import RIDGE, learned_promp
-from sim.experiments.seeds import BY_EXPERIMENT
-from sim.experiments.writing import DURATION_S, TIMES
+from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered, record
+from sim.experiments.reproduction.writing import DURATION_S, TIMES
+from sim.experiments.results import ADAPTED, DESIRED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.rivals.promp import BASES, RIDGE, learned_promp
 
-BASES = 20  # for each of x and y
 COLUMNS = 5  # of the figure
+COLOURS = {"kmp": ADAPTED, "promp": OTHER}
 STYLES = (
     ("o-", ADAPTED),
     ("x-", DESIRED),
@@ -40,7 +39,7 @@ ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
 SAMPLE_DEVIATION = 0.003  # of a sample as a reference point: lambda Sigma is about WEIGHT_RIDGE
 WEIGHT_RIDGE = 1e-6  # the functions are known without noise
-FUNCTIONS = BY_EXPERIMENT["promp"].evaluation["functions"]  # times and errors are averaged over them
+FUNCTIONS = EXPERIMENTS["promp"].seeds.evaluation["functions"]  # times and errors are averaged over them
 OUTPUTS = 3
 
 
@@ -49,18 +48,23 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     numbers: dict[str, Any] = {"unit": "cm", "promp_bases_per_output": BASES, "promp_ridge": RIDGE}
     stream = results.recording()
     sets: dict[str, Drawn] = {}
-    for name, letters in gathered(options).items():
-        rows = [learned(letter, demonstrations) for letter, demonstrations in letters.items()]
-        results.say(f"{len(rows)} letters learned ({name})")
+    for name, rows in gathered(results, options).items():
         found = {row.name: [_compared(row, case) for case in cases(row)] for row in rows}
-        numbers[name] = {letter: [one.numbers() for one in per] for letter, per in found.items()}
+        numbers[name] = {letter: [_numbers(one) for one in per] for letter, per in found.items()}
+        flat = [one for per in found.values() for one in per]
+        bare = [Line(row, case, conditioned(row, case, ridge=0.0)) for row in rows for case in cases(row)]
         numbers[f"{name}_summary"] = {
-            **_summary([one for per in found.values() for one in per]),
-            "promp_without_ridge": _bare(rows),
+            **_summary(flat),
+            "promp_without_ridge": {
+                "largest_miss_cm": max(one.measured()["miss_cm"] for one in bare),
+                "mean_rms_deviation_elsewhere_cm": _mean(bare, "rms_deviation_elsewhere_cm"),
+            },
         }
-        sets[SETS[name]] = (rows, found)
-        for row in rows:
-            _record(stream, row, found[row.name], name)
+        sets[SETS[name]] = found
+        for letter, per in found.items():
+            for number, both in enumerate(per):
+                lines = {who: (line.points, COLOURS[who]) for who, line in both.items()}
+                record(stream, f"/{name}/{letter}", number, lines, both["kmp"].case)
     stream.disconnect()
     _draw_letters(results, sets)
     functions = FUNCTIONS.share(options.share)
@@ -71,45 +75,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-class Compared(NamedTuple):
-    """One adaptation by both: trajectories (200, 2) [cm], and for each its miss and its deviations
-    [cm].
-    """
-
-    case: Case
-    kmp: Array
-    promp: Array
-    miss: tuple[float, float]
-    deviation: tuple[float, float]  # rms from the mean of the demonstrations, far from the desired points
-    largest: tuple[float, float]  # the same, the largest
-    everywhere: tuple[float, float]  # rms from it, everywhere
-
-    def numbers(self) -> dict[str, Any]:
-        """By name."""
-        names = ("miss_cm", "rms_deviation_elsewhere_cm", "largest_deviation_elsewhere_cm", "rms_deviation_cm")
-        values = (self.miss, self.deviation, self.largest, self.everywhere)
-        return {"case": self.case.name, **{n: {"kmp": v[0], "promp": v[1]} for n, v in zip(names, values, strict=True)}}
-
-
-def _compared(letter: Letter, case: Case) -> Compared:
-    kmp, other = adapted(letter, case).mean(TIMES[:, None]), conditioned(letter, case, ridge=RIDGE)
-    misses, deviations, largest, everywhere = zip(*(_off(letter, case, line) for line in (kmp, other)), strict=True)
-    return Compared(case, kmp, other, misses, deviations, largest, everywhere)
-
-
-def _off(letter: Letter, case: Case, line: Array) -> tuple[float, float, float, float]:
-    """The largest miss of a trajectory (200, 2) at the desired points; far from those its rms and
-    its largest deviation from the demonstrations' mean, and everywhere its rms [cm].
-    """
-    at = [int(np.argmin(np.abs(TIMES - t))) for t in case.times]
-    miss = np.linalg.norm(line[at] - case.points, axis=1).max()
-    off = np.linalg.norm(line - letter.demonstrations.mean(axis=0), axis=1)
-    away = off[elsewhere(case)]
-    return float(miss), float(np.sqrt(np.mean(away**2))), float(away.max()), float(np.sqrt(np.mean(off**2)))
-
-
-Drawn: TypeAlias = tuple[list[Letter], dict[str, list[Compared]]]
-"""The letters of a set, and what was found for each."""
+Both: TypeAlias = dict[str, Line]
+"""One case by both methods."""
+Drawn: TypeAlias = dict[str, list[Both]]
+"""The cases of each letter of a set."""
 
 
 def conditioned(letter: Letter, case: Case, *, ridge: float = RIDGE) -> Array:
@@ -122,32 +91,35 @@ def conditioned(letter: Letter, case: Case, *, ridge: float = RIDGE) -> Array:
     return np.asarray(primitive.mean_trajectory(TIMES.copy()))
 
 
-def _bare(letters: list[Letter]) -> dict[str, float]:
-    """ProMP with the covariance of its weights as the demonstrations leave it: largest miss, mean
-    rms deviation elsewhere [cm].
-    """
-    found = [
-        _off(letter, case, conditioned(letter, case, ridge=0.0))[:2] for letter in letters for case in cases(letter)
-    ]
-    misses, deviations = zip(*found, strict=True)
-    return {"largest_miss_cm": max(misses), "mean_rms_deviation_elsewhere_cm": float(np.mean(deviations))}
+def _compared(letter: Letter, case: Case) -> Both:
+    return {"kmp": Line(letter, case, by_kmp(letter, case)), "promp": Line(letter, case, conditioned(letter, case))}
 
 
-def _summary(rows: list[Compared]) -> dict[str, Any]:
-    nearer = sum(one.deviation[0] < one.deviation[1] for one in rows)
-    return {
+def _numbers(both: Both) -> dict[str, Any]:
+    found = {who: line.measured() for who, line in both.items()}
+    return {"case": both["kmp"].case.name, **{n: {who: one[n] for who, one in found.items()} for n in found["kmp"]}}
+
+
+def _mean(lines: Sequence[Line], name: str) -> float:
+    return float(np.mean([line.measured()[name] for line in lines]))
+
+
+def _summary(rows: list[Both]) -> dict[str, Any]:
+    def off(both: Both, who: str) -> float:
+        return both[who].measured()["rms_deviation_elsewhere_cm"]
+
+    summary: dict[str, Any] = {
         "adaptations": len(rows),
-        "kmp_leaves_the_rest_better_alone": nearer,
-    } | {
-        who: {
-            "largest_miss_cm": max(one.miss[i] for one in rows),
-            "mean_rms_deviation_elsewhere_cm": float(np.mean([one.deviation[i] for one in rows])),
-            "mean_largest_deviation_elsewhere_cm": float(np.mean([one.largest[i] for one in rows])),
-            "largest_deviation_elsewhere_cm": max(one.largest[i] for one in rows),
-            "mean_rms_deviation_cm": float(np.mean([one.everywhere[i] for one in rows])),
-        }
-        for i, who in enumerate(("kmp", "promp"))
+        "kmp_leaves_the_rest_better_alone": sum(off(both, "kmp") < off(both, "promp") for both in rows),
     }
+    for who in COLOURS:
+        lines = [both[who] for both in rows]
+        summary[who] = {
+            "largest_miss_cm": max(line.measured()["miss_cm"] for line in lines),
+            "largest_deviation_elsewhere_cm": max(line.measured()["largest_deviation_elsewhere_cm"] for line in lines),
+            **{f"mean_{name}": _mean(lines, name) for name in lines[0].measured() if name != "miss_cm"},
+        }
+    return summary
 
 
 class Grown(NamedTuple):
@@ -299,22 +271,17 @@ def _function(inputs: int, random: np.random.Generator) -> Any:
 
 def _draw_letters(results: Results, sets: dict[str, Drawn]) -> None:
     plt = pyplot()
-    lines = {name: -(-len(rows) // COLUMNS) for name, (rows, _) in sets.items()}
+    lines = {name: -(-len(found) // COLUMNS) for name, found in sets.items()}
     figure = plt.figure(figsize=(9.5, 0.3 + 2.05 * sum(lines.values())))
     blocks = np.atleast_1d(figure.subfigures(len(sets), 1, height_ratios=list(lines.values()), squeeze=True))
-    for block, (name, (rows, found)) in zip(blocks, sets.items(), strict=True):
+    for block, (name, found) in zip(blocks, sets.items(), strict=True):
         grid = block.subplots(lines[name], COLUMNS, squeeze=False)
         block.supylabel(f"{name} [cm]", fontsize=9)
-        for axes, letter in zip(grid.flat, rows, strict=False):
-            one, mean = found[letter.name][2], letter.demonstrations.mean(axis=0)
-            axes.plot(*mean.T, "--", color=REFERENCE, lw=1.1, label="mean of the demonstrations")
-            axes.plot(*one.promp.T, color=OTHER, lw=1.8, label="ProMP")
-            axes.plot(*one.kmp.T, color=ADAPTED, lw=1.3, label="KMP")
-            axes.plot(*one.case.points.T, "o", mfc="none", mec=DESIRED, mew=1.8, ms=7, label="desired points")
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.set_title(letter.name, loc="left", fontweight="bold", fontsize=9)
-            axes.tick_params(labelsize=7)
-        for axes in grid.flat[len(rows) :]:
+        for axes, (*_, last) in zip(grid.flat, found.values(), strict=False):
+            letter, case, _ = last["kmp"]
+            shown = {label: (last[who].points, COLOURS[who]) for label, who in (("ProMP", "promp"), ("KMP", "kmp"))}
+            draw_lines(axes, letter, case, shown, DESIRED)
+        for axes in grid.flat[len(found) :]:
             axes.set_axis_off()
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
@@ -358,15 +325,3 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     )
     figure.legend(*functions.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure, "dimensions")
-
-
-def _record(stream: rr.RecordingStream, letter: Letter, rows: list[Compared], name: str) -> None:
-    for number, one in enumerate(rows):
-        stream.set_time("case", sequence=number)
-        for who, line, colour in (("kmp", one.kmp, ADAPTED), ("promp", one.promp, OTHER)):
-            stream.log(
-                f"/{name}/{letter.name}/{who}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08])
-            )
-        stream.log(
-            f"/{name}/{letter.name}/desired", rr.Points2D(one.case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3])
-        )

@@ -1,5 +1,5 @@
-"""What no linear filter can better: the best causal ones for some hands, fitted to these very
-hands, without limits and arm.
+"""The best causal linear filters for given hands, fitted to these very hands, without limits and
+arm: a bound for all linear filters.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.core.skill.skill import Skill
-from sim.experiments.moving_hands import PERIOD_S, Moving
+from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
 REACH_S = 0.5  # of the filters into the past

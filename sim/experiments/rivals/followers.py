@@ -1,7 +1,6 @@
-"""What follows moving hands in `motion`: the service's own core, and what it competes with, at the
-same limits.
+"""Followers of moving hands in `motion`: the service's own core, and rivals at the same limits.
 
-All go through the same skill, inverse kinematics and joint limiter; only what lies between differs.
+All use the same skill, inverse kinematics and joint limiter; only what lies between differs.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from service.core.separation.tuning import FARTHEST_REPORTED_M
 from service.core.skill.skill import Skill
 from service.settings.config import Settings, robot_description
 from sim.closed_loop import START_NS, hand_event
-from sim.experiments.moving_hands import PERIOD_S, Moving
 from sim.experiments.open_loop import frames, targets
+from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
 SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it ...

@@ -1,0 +1,1 @@
+"""The service as processes of its own: in real time, and when parts of it fail."""
