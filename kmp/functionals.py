@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, numbers
-from kmp.immutable import Immutable, frozen
+from kmp.arrays.checks import Array, numbers
+from kmp.arrays.immutable import Immutable, frozen
 
 
 class Derivatives(NamedTuple):

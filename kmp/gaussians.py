@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
-from kmp.immutable import Immutable, frozen
-from kmp.linear_algebra import symmetric
+from kmp.arrays.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import symmetric
 
 _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance meant to be symmetric
 _EXACT = 1e-200  # [unit^2] the variance that stands for an exact output

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, check_some, numbers, positive, real
+from kmp.arrays.checks import Array, check_some, numbers, positive, real
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Derivatives, Functionals
-from kmp.immutable import Immutable, frozen
 
 
 class Kernel(Protocol):

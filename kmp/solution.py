@@ -7,12 +7,12 @@ from typing import Literal, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import Array
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
-from kmp.hyperparameters import Hyperparameters
 from kmp.kernel import between, variances
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 
 BLOCK = 256  # queries at once
 _RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still

@@ -9,9 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from kmp.checks import Array, positive
+from kmp.arrays.checks import Array, positive
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Derivatives
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import directed
 
 

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from kmp.checks import Array
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bounds
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, check_resolved
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, ViaPointMissed
+from kmp.arrays.checks import Array, ViaPointMissed
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.immutable import Immutable, frozen
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
 _PAIR = 2  # points, at least, have a distance

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
 
 _MACHINE = float(np.finfo(np.float64).eps)
 
