@@ -268,8 +268,7 @@ class Dense(Immutable):
             o, gone = kernel.channels * self.apart, self.base.database.functionals.take(self.gone)
             taken = _Taken.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
             there = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
-            wide = np.asarray(np.kron(there, np.eye(self.apart)), dtype=np.float64)
-            border = taken.forth(shared, columns, wide)
+            border = taken.forth(shared, columns, kron_identity(there, self.apart))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), taken), info
 

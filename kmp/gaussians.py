@@ -117,6 +117,8 @@ class Gaussians(Immutable):
         """All distributions of the parts, in order. Raises ValueError if O differs."""
         for i, part in enumerate(parts_of("parts", parts)):
             check_gaussians(f"parts[{i}]", part, parts[0].outputs if i else None)
+        if len(some := [part for part in parts if len(part)]) == 1:
+            return some[0]
         return unchecked(
             np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
         )

@@ -203,11 +203,7 @@ class _System:
 
     def _wide(self, matrix: Array) -> Array:
         """x (x) I of size D, of the rows and columns of channels."""
-        d = self.fold.reference.outputs // self.kernel.channels
-        wide = np.zeros((len(matrix), d, matrix.shape[1], d))
-        for i in range(d):
-            wide[:, i, :, i] = matrix
-        return wide.reshape(len(matrix) * d, -1)
+        return kron_identity(matrix, self.fold.reference.outputs // self.kernel.channels)
 
 
 def _negative_log_likelihood(residual: Array, covariance: Array) -> float:

@@ -15,6 +15,7 @@ from kmp.arrays.checks import Array, ViaPointMissed
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
+from kmp.kernel import Kernel, variances
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
 _PAIR = 2  # points, at least, have a distance
@@ -43,6 +44,8 @@ class Database(Immutable):
     Where a point is a derivative along a direction, of that derivative.
     """
 
+    _not_pickled = frozenset({"_known_shares"})
+
     functionals: Functionals  # N
     reference: Gaussians  # N
 
@@ -53,6 +56,20 @@ class Database(Immutable):
     def inputs(self) -> Array:
         """(N, I) where the points are."""
         return self.functionals.inputs
+
+    def least_shares(self, kernel: Kernel) -> Array:
+        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel.
+
+        Of S^-1 Sigma_n S^-1, where S^2 is the diagonal of k(s_n, s_n). The last kernel's are kept.
+        """
+        known: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
+        if known is None or known[0] is not kernel:
+            repeats = self.reference.outputs // kernel.channels
+            scale = np.sqrt(variances(kernel, self.functionals)).repeat(repeats, axis=1)
+            covariance = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+            known = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
+            self.__dict__["_known_shares"] = known
+        return known[1]
 
     def since(self, first: int) -> Database:
         """The points from that one on."""
