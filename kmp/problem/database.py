@@ -146,8 +146,8 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
     missed = []
     for c in range(channels):
         block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
-        white = np.linalg.solve(np.linalg.cholesky(block), residual[:, c, :, None])
-        deviations = np.linalg.norm(white, axis=(1, 2))
+        pull = np.linalg.solve(block, residual[:, c, :, None])[:, :, 0]
+        deviations = np.sqrt(np.vecdot(residual[:, c], pull))
         for n in np.flatnonzero((distance[:, c] > _WORTH_SAYING) & (deviations > _MISSED)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
