@@ -9,23 +9,44 @@ Robot Motor Skills, ICRA 2019; the covariance is from their Kernelized Movement 
 Symbols: s an input (I,), xi an output (O,), (s_n, mu_n, Sigma_n) the N reference points, k the
 kernel with parameter ell, K its matrix (N, N), lambda the weight of the penalty, alpha (N, O) the
 fitted weights.
+
+The method, in the order in which it computes:
+
+* `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
+* `kernel`, `time_kernels`: k between `functionals`, the values and derivatives of the output.
+* `problem/`: the reference database with its via-points, and the hyper-parameters.
+* `solution`: the solved problem as a protocol. `dense` solves equation (9), `low_rank/` the cost
+  (4) on features of the kernel; `representation` chooses between them.
+* `query`, `loops/`: equation (8) and its derivatives for one query.
+* `predictor`, `primitive`: the class `KMP`.
+
+Beyond the method: `selection` and `criteria/` choose hyper-parameters; `references/` makes
+references in other ways; `orientation`, `constraints`, `plot`, `estimator`; `storage` and
+`named_arrays` write files.
 """
 
+import sys
 import typing
 
-from kmp.affine_mean import AffineMean
-from kmp.checks import RankReached, ViaPointMissed
+from kmp.arrays.checks import RankReached, ViaPointMissed
 from kmp.constraints import LinearConstraints
-from kmp.correlation import Correlation, Improvement, improve
-from kmp.gaussian_process import gaussian_process_reference
 from kmp.gaussians import Gaussians
-from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
+from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP
 from kmp.predictor import Uncertainty
 from kmp.primitive import KMP
+from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction
-from kmp.references import CoordinateFrame, LocalKMP, superposed
+from kmp.references import (
+    CoordinateFrame,
+    Correlation,
+    Improvement,
+    LocalKMP,
+    gaussian_process_reference,
+    improve,
+    superposed,
+)
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
@@ -63,6 +84,19 @@ __all__ = [
     "save",
     "superposed",
 ]
+
+# Pickles of earlier versions name modules that have moved.
+_MOVED_MODULES = {
+    "affine_mean": "problem.hyperparameters",
+    "compiled_query": "loops.query",
+    "correlation": "references.correlation",
+    "database": "problem.database",
+    "gmm": "mixture",
+    "hyperparameters": "problem.hyperparameters",
+    "inner": "predictor",
+    "inverse_cholesky": "arrays.inverse_cholesky",
+}
+sys.modules.update({f"kmp.{old}": sys.modules[f"kmp.{new}"] for old, new in _MOVED_MODULES.items()})
 
 
 def __getattr__(name: str) -> typing.Any:

@@ -14,13 +14,13 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import Array, check_kind, numbers
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array, check_kind, numbers
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, mean_of
 
 _VIOLATION = 1e-9  # of a constraint [unit of the outputs], at most, where its normal has norm 1

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
-from kmp.inverse_cholesky import InverseCholeskyFactor
 from kmp.kernel import between
-from kmp.linear_algebra import kron_identity
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, check_resolved
 
 _SHARED = 0.75  # of the points: where fewer come before the first change, a border costs more than a fit
@@ -268,8 +268,7 @@ class Dense(Immutable):
             o, gone = kernel.channels * self.apart, self.base.database.functionals.take(self.gone)
             taken = _Taken.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
             there = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
-            wide = np.asarray(np.kron(there, np.eye(self.apart)), dtype=np.float64)
-            border = taken.forth(shared, columns, wide)
+            border = taken.forth(shared, columns, kron_identity(there, self.apart))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), taken), info
 

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from kmp.checks import Array, brief, positive, squared, whole
+from kmp.arrays.checks import Array, brief, positive, squared, whole
 from kmp.gaussians import Gaussians
-from kmp.gmm import GaussianMixture
 from kmp.kernel import GaussianKernel
+from kmp.mixture import GaussianMixture
 from kmp.primitive import KMP
 
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, numbers
-from kmp.immutable import Immutable, frozen
+from kmp.arrays.checks import Array, numbers
+from kmp.arrays.immutable import Immutable, frozen
 
 
 class Derivatives(NamedTuple):
@@ -44,6 +44,8 @@ class Functionals(Immutable):
     @staticmethod
     def concatenated(parts: Sequence[Functionals]) -> Functionals:
         """All functionals of the parts, in order."""
+        if len(some := [part for part in parts if len(part)]) == 1:
+            return some[0]
         inputs = frozen(np.concatenate([part.inputs for part in parts]))
         if all(part.directions is None for part in parts):
             return Functionals(inputs)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
-from kmp.immutable import Immutable, frozen
-from kmp.linear_algebra import symmetric
+from kmp.arrays.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import symmetric
 
 _SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance meant to be symmetric
 _EXACT = 1e-200  # [unit^2] the variance that stands for an exact output
@@ -117,6 +117,8 @@ class Gaussians(Immutable):
         """All distributions of the parts, in order. Raises ValueError if O differs."""
         for i, part in enumerate(parts_of("parts", parts)):
             check_gaussians(f"parts[{i}]", part, parts[0].outputs if i else None)
+        if len(some := [part for part in parts if len(part)]) == 1:
+            return some[0]
         return unchecked(
             np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
         )

@@ -9,16 +9,16 @@ row is the kernel derived.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, check_some, numbers, positive, real
+from kmp.arrays.checks import Array, check_some, numbers, positive, real
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Derivatives, Functionals
-from kmp.immutable import Immutable, frozen
 
 
 class Kernel(Protocol):
@@ -142,9 +142,9 @@ class GaussianKernel(Immutable):
             )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
-        if np.ndim(self.ell):
-            return 1.0, frozen(np.sqrt(self.ell))
-        return float(self.ell), frozen(np.ones(inputs))
+        if isinstance(self.ell, float):
+            return self.ell, unstretched(inputs)
+        return 1.0, frozen(np.sqrt(self.ell))
 
     def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
         scale, stretch = self.coordinates(a.shape[1])
@@ -210,6 +210,12 @@ class GaussianKernel(Immutable):
         rows, along = derivatives
         bend[rows] -= values[rows] * (4 * scale) * (along @ direction) * slope[rows]
         return np.asarray(bend @ weights)
+
+
+@cache
+def unstretched(inputs: int) -> Array:
+    """The stretch (I,) of coordinates that are the inputs themselves: ones."""
+    return frozen(np.ones(inputs))
 
 
 def directed(along: Array | None, stretch: Array) -> tuple[NDArray[np.intp], Array]:

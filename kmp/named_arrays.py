@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.affine_mean import AffineMean
-from kmp.checks import brief, check_kind, check_shape, numbers, real
+from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
+from kmp.arrays.immutable import frozen
 from kmp.constraints import Constrained, LinearConstraints
-from kmp.database import Changes, Database
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import frozen
-from kmp.inner import Inner
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.low_rank import LowRank
+from kmp.predictor import Inner
 from kmp.primitive import KMP
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 

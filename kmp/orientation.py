@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_finite, not_negative, numbers, real
+from kmp.arrays.checks import Array, check_finite, not_negative, numbers, real
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances, unchecked
-from kmp.immutable import Immutable, frozen
-from kmp.linear_algebra import symmetric
 from kmp.primitive import KMP, checked_primitive
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding

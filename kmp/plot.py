@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, brief, check_kind, numbers, parts_of, whole
+from kmp.arrays.checks import Array, brief, check_kind, numbers, parts_of, whole
 from kmp.gaussians import Gaussians
 
 if TYPE_CHECKING:

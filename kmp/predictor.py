@@ -12,19 +12,50 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.affine_mean import AffineMean
-from kmp.checks import Array, check_finite, check_shape, real, seeded, whole
+from kmp.arrays.checks import Array, check_finite, check_shape, real, seeded, whole
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
-from kmp.immutable import Immutable, frozen
-from kmp.inner import Inner
 from kmp.kernel import Kernel, between
-from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
+from kmp.loops.query import CompiledQuery
 from kmp.low_rank import Features
-from kmp.query import MotionPrediction
-from kmp.solution import BLOCK, least_variances, mean_at
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import AffineMean
+from kmp.query import MotionPrediction, Query
+from kmp.solution import BLOCK, Solution, least_variances, mean_at
 
 _RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Inner(Immutable):
+    """The inside of a primitive: its solution, its changes, and the arrays of a single query.
+
+    For the package itself, its tests and those who extend it; it may change in any version.
+    `KMP.inner` is the only way to it.
+    """
+
+    solution: Solution
+    changes: Changes
+    count: int
+    """N of the covariance: the points of the base."""
+
+    @classmethod
+    def of_base(cls, solution: Solution) -> Inner:
+        """The inside of a primitive that nothing was changed in."""
+        database: Database = solution.database
+        return cls(solution, database.unchanged(), len(database))
+
+    @cached_property
+    def query(self) -> Query:
+        """Arrays of a single query, in the layout that the compiled loops read."""
+        return Query.of(self.solution, self.count)
+
+    @cached_property
+    def compiled_query(self) -> CompiledQuery | None:
+        """The same as compiled loops, where Numba is installed and knows the kernel; else None."""
+        return CompiledQuery.of(self.query)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

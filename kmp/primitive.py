@@ -14,8 +14,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.affine_mean import AffineMean
-from kmp.checks import (
+from kmp.arrays.checks import (
     Array,
     brief,
     check_kind,
@@ -28,20 +27,19 @@ from kmp.checks import (
     squared,
     whole,
 )
+from kmp.arrays.immutable import frozen
 from kmp.constraints import Constrained, LinearConstraints
-from kmp.database import Changes, Database, warn_of_missed
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import frozen
-from kmp.inner import Inner
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
 from kmp.plot import Plotted, Points, Shown
-from kmp.predictor import Predictor
+from kmp.predictor import Inner, Predictor
+from kmp.problem.database import Changes, Database, warn_of_missed
+from kmp.problem.hyperparameters import AffineMean, Hyperparameters
+from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
-from kmp.solving import LARGE, solved
 
 _REACH_STEPS = 300  # distances at which a via-point's effect is looked at
 _FREE = 1e6  # [unit of the outputs / unit of the inputs] the deviation of a rate that may be any

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Derivatives, Functionals
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel, Kernel, between
-from kmp.linear_algebra import nearest_positive_semidefinite
 from kmp.solution import Solution
 
 

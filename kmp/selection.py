@@ -14,16 +14,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
-from kmp.database import Database
-from kmp.folds import Fold
+from kmp.arrays.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.criteria.folds import Fold
+from kmp.criteria.likelihood import most_likely
 from kmp.functionals import Functionals
-from kmp.gmm import GaussianMixture, mixture_of
-from kmp.hyperparameters import checked_kernel
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel, Kernel
-from kmp.likelihood import most_likely
+from kmp.mixture import GaussianMixture, mixture_of
 from kmp.primitive import KMP
+from kmp.problem.database import Database
+from kmp.problem.hyperparameters import checked_kernel
 from kmp.time_kernels import VelocityKernel
 
 _ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # over twice the variance of the inputs

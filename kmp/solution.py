@@ -7,12 +7,12 @@ from typing import Literal, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import Array
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
-from kmp.hyperparameters import Hyperparameters
 from kmp.kernel import between, variances
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 
 BLOCK = 256  # queries at once
 _RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
@@ -123,7 +123,7 @@ def check_resolved(
     the message names is for that lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
-    least = penalty * _least_shares(parameters, points)
+    least = penalty * points.least_shares(parameters.kernel)
     for n in np.flatnonzero(least < _RESOLVED)[:1]:
         enough = penalty * _RESOLVED / max(least[n], 1e-300)
         smaller = min(parameters.lambda_mean, parameters.lambda_covariance) if both else penalty
@@ -140,7 +140,7 @@ def check_resolved(
 def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
     """True if both lambda Sigma are above the rounding of k(s, s)."""
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
-    return bool((penalty * _least_shares(parameters, points) >= _RESOLVED).all())
+    return bool((penalty * points.least_shares(parameters.kernel) >= _RESOLVED).all())
 
 
 def least_variances(parameters: Hyperparameters, points: Functionals, penalty: float) -> Array:
@@ -160,10 +160,3 @@ def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussian
     covariance[n, o, :] = covariance[n, :, o] = 0.0
     covariance[n, o, o] = least[n, o]
     return unchecked(normals.mean, covariance)
-
-
-def _least_shares(parameters: Hyperparameters, points: Database) -> Array:
-    """The least eigenvalue (N,) of each Sigma, as a share of k(s, s) of its channel."""
-    scale = np.sqrt(variances(parameters.kernel, points.functionals)).repeat(parameters.channel_outputs, axis=1)
-    covariance = points.reference.covariance / (scale[:, :, None] * scale[:, None, :])
-    return np.asarray(np.linalg.eigvalsh(covariance)[:, 0])

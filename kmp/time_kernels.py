@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from kmp.checks import Array, positive
+from kmp.arrays.checks import Array, positive
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Derivatives
-from kmp.immutable import Immutable, frozen
-from kmp.kernel import directed
+from kmp.kernel import directed, unstretched
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class VelocityKernel(_OneInput):
             )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
-        return self.ell, frozen(np.ones(inputs))
+        return self.ell, unstretched(inputs)
 
     @staticmethod
     def values(offsets: Array, scale: float) -> Array:

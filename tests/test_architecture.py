@@ -40,7 +40,7 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
             "service/core/intake/stage.py": "import time",
             "service/contract/cdr.py": "import numpy",
             "service/learning/learn.py": "import mcap",
-            "kmp/gmm.py": "import msgspec",
+            "kmp/mixture.py": "import msgspec",
         },
         {
             "the core has no clock and no input or output",
@@ -56,7 +56,7 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
             "service/scribe/scribe.py": "from service.daemon.clock import Deadlines",
             "service/daemon/clock.py": "from service.cli.usage import UsageError",
             "service/core/skill/skill.py": "from service.learning.learn import learn",
-            "kmp/gmm.py": "from service.settings.config import Settings",
+            "kmp/mixture.py": "from service.settings.config import Settings",
             "service/settings/config.py": "from sim.scene import Scene",
         },
         {

@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from kmp.checks import Array
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bounds
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, check_resolved
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Conditioned(Immutable):
     root of the tolerance. The members are those of `Solution`.
     """
 
-    _not_pickled = frozenset({"database"})
+    _not_pickled = frozenset({"database", "_added_points", "_lifted", "_neglected"})
 
     base: LowRank
     changes: Changes
@@ -142,6 +143,21 @@ class Conditioned(Immutable):
     def _covariance_system(self) -> _System:
         return self._system("lambda_covariance", self.base.covariance_factor)
 
+    @cached_property
+    def _added_points(self) -> Database:
+        return Database(self.changes.functionals, self.changes.points)
+
+    @cached_property
+    def _lifted(self) -> Array:
+        """z (x) I (r D, U O) of the U points."""
+        return kron_identity(self._z, self.base.w.shape[1])
+
+    @cached_property
+    def _neglected(self) -> Array:
+        """The kernel between the V points added, less what the features explain (V C, V C)."""
+        points, z = self.changes.functionals, self._z[:, : self._added_columns]
+        return between(self.hyperparameters.kernel, points, points) - z.T @ z
+
     def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
         m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
@@ -160,23 +176,15 @@ class Conditioned(Immutable):
         return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
     def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
-        parameters, added = self.hyperparameters, Database(self.changes.functionals, self.changes.points)
-        check_resolved(
-            parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name, both=True
-        )
+        parameters, count = self.hyperparameters, len(self._points)
+        first = len(self.base.database) - len(self.changes.replaced)
+        check_resolved(parameters, self._added_points, first=first, name=name, both=True)
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
-        (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
-        first = self._added_columns
-        lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
-        left = (
-            between(parameters.kernel, added.functionals, added.functionals) - self._z[:, :first].T @ self._z[:, :first]
-        )
-        for i in range(d):
-            lifted[:, i, :, i] = self._z
-            residual[:first, i, :first, i] = left
-        cross, _ = lapack.dtrtrs(base_factor, lifted.reshape(r * d, -1), lower=1)
-        matrix = penalty * (cross.T @ cross) + residual.reshape(columns * d, columns * d)
-        blocks = matrix.reshape(count, -1, count, columns * d // count)
+        cross, _ = lapack.dtrtrs(base_factor, self._lifted, lower=1)
+        matrix = penalty * (cross.T @ cross)
+        neglected = kron_identity(self._neglected, self.base.w.shape[1])
+        matrix[: len(neglected), : len(neglected)] += neglected
+        blocks = matrix.reshape(count, -1, count, len(matrix) // count)
         points = np.arange(count)
         sign = np.where(points < self._added, penalty, -penalty)
         blocks[points, :, points, :] += sign[:, None, None] * self._points.reference.covariance

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel, between, variances
 
 BLOCK = 8192  # inputs at once, which bounds the memory

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from kmp.checks import Array, brief, numbers
-from kmp.database import Changes, Database
+from kmp.arrays.checks import Array, brief, numbers
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
-from kmp.hyperparameters import Hyperparameters
-from kmp.immutable import Immutable, frozen
-from kmp.inverse_cholesky import InverseCholeskyFactor
-from kmp.linear_algebra import kron_identity
 from kmp.low_rank.conditioned import Conditioned
 from kmp.low_rank.error_bound import error_bounds
 from kmp.low_rank.features import BLOCK, KEPT, Features
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, check_resolved
 
 RANK = 400

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from kmp.compiled import compiled
-from kmp.compiled_mean import exponentials
+from kmp.loops.mean import exponentials
 from support.paths import ROOT
 
 numba = pytest.importorskip("numba")
@@ -58,7 +58,7 @@ compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
 s = random.normal(size=(37, 3))
 query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
-from kmp.compiled_query import CompiledQuery
+from kmp.loops.query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))
 print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex())

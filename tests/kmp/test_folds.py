@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kmp import GaussianKernel, Gaussians, VelocityKernel
-from kmp.folds import Fold
+from kmp.criteria.folds import Fold
 
 
 def fold(dimensions, outputs, rates=False):

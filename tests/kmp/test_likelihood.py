@@ -6,9 +6,9 @@ from scipy.stats import multivariate_normal
 
 import kmp
 from kmp import GaussianKernel, Gaussians, VelocityKernel
-from kmp.database import Database
+from kmp.criteria.likelihood import negative_log_likelihood, with_ell
 from kmp.functionals import Functionals
-from kmp.likelihood import negative_log_likelihood, with_ell
+from kmp.problem.database import Database
 from support.shown_skills import driven_by_hands, over_time
 
 

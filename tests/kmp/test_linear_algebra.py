@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kmp.inverse_cholesky import InverseCholeskyFactor
-from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite, symmetric
+from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
+from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite, symmetric
 
 
 def test_products_with_the_identity_are_those_of_numpy():

@@ -191,7 +191,7 @@ def test_what_is_too_much_to_keep_is_made_again_and_gives_the_same(monkeypatch):
     before = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
     monkeypatch.setattr("kmp.low_rank.solution.KEPT", 0)
     monkeypatch.setattr("kmp.low_rank.features.KEPT", 0)
-    monkeypatch.setattr("kmp.database.DISTANCES", 1)
+    monkeypatch.setattr("kmp.problem.database.DISTANCES", 1)
     after = both(0)[1].adapt(*points(0, 3), tolerance=0.3)
     assert np.array_equal(before.inner.changes.replaced, after.inner.changes.replaced)
     assert np.array_equal(before.weights, after.weights)

@@ -43,7 +43,7 @@ def moving(skill, seed=1):
 
 
 def test_one_call_gives_what_the_others_give_bit_for_bit(skill, monkeypatch):
-    monkeypatch.setattr("kmp.compiled_query.AVAILABLE", False)  # as where Numba is not installed
+    monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as where Numba is not installed
     s, v, a = moving(skill)
     found, one = skill.predict_motion(s, v, a), skill.predict(s[None])
     assert np.array_equal(found.mean, skill.mean(s[None])[0])

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel, named_arrays
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.dense import Dense
-from kmp.inner import Inner
-from kmp.linear_algebra import kron_identity
 from kmp.low_rank import LowRank
 from kmp.low_rank.conditioned import Conditioned
+from kmp.predictor import Inner
 from kmp.solution import Solution, mean_at
 
 S = np.random.default_rng(0).normal(size=(40, 2))

@@ -13,8 +13,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
-from kmp.immutable import Immutable, frozen
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Vector
 from service.core.intake.hand_estimator import STILL

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP
-from kmp.immutable import Immutable, frozen
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from kmp.kernel_row import add_weighted
+from kmp.loops.kernel_row import add_weighted
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, check_kind, check_shape, numbers, positive, real, seeded, squared, whole
+from kmp.arrays.checks import Array, check_kind, check_shape, numbers, positive, real, seeded, squared, whole
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.gaussians import Gaussians
-from kmp.immutable import Immutable, frozen
 from kmp.primitive import KMP, checked_primitive
 
 Reward = Callable[[Array], float]

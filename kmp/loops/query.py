@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.compiled import AVAILABLE, compiled
-from kmp.compiled_mean import means, slopes, table_of
 from kmp.dense import Dense
 from kmp.functionals import Derivatives
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import GaussianKernel
-from kmp.kernel_row import kernel_value
-from kmp.linear_algebra import nearest_positive_semidefinite
+from kmp.loops.kernel_row import kernel_value
+from kmp.loops.mean import means, slopes, table_of
 from kmp.query import MotionPrediction, Query
 
 MEANS = 4  # rows of a motion's output before its Jacobian: mean, velocity, acceleration, curvature

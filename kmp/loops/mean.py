@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
 from kmp.compiled import compiled
 
 LANES = 4

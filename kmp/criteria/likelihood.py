@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from kmp.checks import Array
-from kmp.database import Database
+from kmp.arrays.checks import Array
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.kernel import GaussianKernel, Kernel, between
-from kmp.linear_algebra import kron_identity
+from kmp.problem.database import Database
 from kmp.time_kernels import VelocityKernel
 
 _STARTS = (0.1, 1.0, 10.0)  # times the first ell: the likelihood has more than one peak

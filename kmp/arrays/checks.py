@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.immutable import frozen
+from kmp.arrays.immutable import frozen
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -11,50 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of, real
-from kmp.gaussians import Gaussians, check_gaussians, check_pairs, fused_mean
-from kmp.gmm import GaussianMixture
-from kmp.hyperparameters import checked_kernel
-from kmp.immutable import Immutable
+from kmp.arrays.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of
+from kmp.arrays.immutable import Immutable
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.kernel import Kernel
-from kmp.linear_algebra import symmetric
+from kmp.mixture import GaussianMixture
 from kmp.plot import Plotted, Points, Shown
 from kmp.primitive import KMP, checked_primitive
-
-
-def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussians:
-    """The reference that L references over the same N inputs agree on, by their priorities.
-
-    Priorities (L,) or (L, N) have the sum 1: Sigma = (sum_l (Sigma_l / g_l)^-1)^-1,
-    mu = Sigma sum_l (Sigma_l / g_l)^-1 mu_l. A reference of priority 0 has no say; priorities that
-    change along the inputs blend from one reference to the next. IJRR 2019, superposition.
-
-    Raises ValueError if there is no reference, shapes do not agree, or a priority is below 0 or
-    their sum is not 1.
-    """
-    for i, reference in enumerate(parts_of("references", references)):
-        check_gaussians(f"references[{i}]", reference)
-    n, outputs = references[0].mean.shape
-    for i, other in enumerate(references):
-        if other.mean.shape != (n, outputs):
-            raise ValueError(f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed.")
-    g = _priorities(priorities, len(references), n)
-    inverses = [np.linalg.inv(one.covariance) for one in references]
-    precisions = [weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)]
-    covariance = np.linalg.inv(np.sum(precisions, axis=0))
-    return Gaussians(fused_mean(covariance, precisions, references), symmetric(covariance))
-
-
-def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
-    """The priorities (L, N) or (L, 1), checked."""
-    given = real("priorities", priorities)
-    g = numbers("priorities", given[:, None] if given.ndim == 1 else given, count, "N")
-    if g.shape[1] not in {1, n}:
-        raise ValueError(f"priorities: shape {given.shape} given, ({count},) or {(count, n)} needed.")
-    least, total = g.min(), g.sum(axis=0)
-    if least < 0 or np.abs(total - 1).max() > 1e-6:
-        raise ValueError(f"priorities: from {least:g}, of sum {total[0]:g} given; needed are sums of 1, none below 0.")
-    return g
+from kmp.problem.hyperparameters import checked_kernel
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -6,11 +6,11 @@ import warnings
 
 import numpy as np
 
-from kmp.checks import RankReached
-from kmp.database import Database
+from kmp.arrays.checks import RankReached
 from kmp.dense import Dense
-from kmp.hyperparameters import Hyperparameters
 from kmp.low_rank import Features, LowRank
+from kmp.problem.database import Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
 
 _TINY = 450  # numbers N O up to which the dense solution takes a millisecond at most

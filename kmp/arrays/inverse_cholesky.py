@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import lapack
 
-from kmp.checks import Array
-from kmp.immutable import Immutable, frozen
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable, frozen
 
 _BANDS = 4  # with 4, five eighths of the square are kept
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.checks import Array, check_finite, check_some, checked_demonstrations, numbers, positive, whole
+from kmp.arrays.checks import Array, check_finite, check_some, checked_demonstrations, numbers, positive, whole
+from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
-from kmp.linear_algebra import symmetric
 
 _SIGNAL = 1e-3, 1e3  # variance of the function, over the outputs'
 _LENGTH = 1e-2, 1e3  # along an input, over the inputs' deviation

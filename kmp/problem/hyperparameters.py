@@ -8,11 +8,34 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.affine_mean import AffineMean
-from kmp.checks import Array, brief, check_shape, numbers, positive
+from kmp.arrays.checks import Array, brief, check_shape, numbers, positive
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
-from kmp.immutable import Immutable, frozen
 from kmp.kernel import Kernel
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AffineMean(Immutable):
+    """matrix @ s + offset at an input s (I,): linear regression, or a straight way over time.
+
+    matrix (O, I) [unit of the outputs / unit of the inputs], offset (O,) [unit of the outputs].
+    Read-only. Far from the data it extrapolates, where a constant would stay. Raises ValueError if
+    shapes do not agree or a number is not finite.
+    """
+
+    matrix: Array
+    offset: Array
+
+    def __post_init__(self) -> None:
+        matrix = numbers("prior_mean.matrix", self.matrix, "O", "I")
+        offset = numbers("prior_mean.offset", self.offset, "O")
+        if len(matrix) != len(offset):
+            raise ValueError(
+                f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} given, "
+                f"(O, I) and (O,) needed."
+            )
+        object.__setattr__(self, "matrix", matrix)
+        object.__setattr__(self, "offset", offset)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

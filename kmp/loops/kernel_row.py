@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
 from kmp.compiled import compiled
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from kmp.checks import Array, ViaPointMissed
+from kmp.arrays.checks import Array, ViaPointMissed
+from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.immutable import Immutable, frozen
+from kmp.kernel import Kernel, variances
 
 DISTANCES = 10_000_000  # from via-points to reference points, at once
 _PAIR = 2  # points, at least, have a distance
@@ -43,6 +44,8 @@ class Database(Immutable):
     Where a point is a derivative along a direction, of that derivative.
     """
 
+    _not_pickled = frozenset({"_known_shares"})
+
     functionals: Functionals  # N
     reference: Gaussians  # N
 
@@ -53,6 +56,20 @@ class Database(Immutable):
     def inputs(self) -> Array:
         """(N, I) where the points are."""
         return self.functionals.inputs
+
+    def least_shares(self, kernel: Kernel) -> Array:
+        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel.
+
+        Of S^-1 Sigma_n S^-1, where S^2 is the diagonal of k(s_n, s_n). The last kernel's are kept.
+        """
+        known: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
+        if known is None or known[0] is not kernel:
+            repeats = self.reference.outputs // kernel.channels
+            scale = np.sqrt(variances(kernel, self.functionals)).repeat(repeats, axis=1)
+            covariance = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+            known = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
+            self.__dict__["_known_shares"] = known
+        return known[1]
 
     def since(self, first: int) -> Database:
         """The points from that one on."""
@@ -129,8 +146,8 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
     missed = []
     for c in range(channels):
         block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
-        white = np.linalg.solve(np.linalg.cholesky(block), residual[:, c, :, None])
-        deviations = np.linalg.norm(white, axis=(1, 2))
+        pull = np.linalg.solve(block, residual[:, c, :, None])[:, :, 0]
+        deviations = np.sqrt(np.vecdot(residual[:, c], pull))
         for n in np.flatnonzero((distance[:, c] > _WORTH_SAYING) & (deviations > _MISSED)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:

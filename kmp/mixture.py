@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.checks import Array, brief, check_finite, check_some, numbers, positive, seeded, whole
+from kmp.arrays.checks import Array, brief, check_finite, check_some, numbers, positive, seeded, whole
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
-from kmp.immutable import Immutable, frozen
-from kmp.linear_algebra import symmetric
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
-from kmp.checks import Array
+from kmp.arrays.checks import Array
 
 _MACHINE = float(np.finfo(np.float64).eps)
 
@@ -16,10 +16,10 @@ def symmetric(matrices: Array) -> Array:
 
 
 def kron_identity(blocks: Array, copies: int) -> Array:
-    """The Kronecker products x (x) I (..., C D, C D) of x (..., C, C), I of size D = `copies`."""
-    c = blocks.shape[-1]
+    """The Kronecker products x (x) I (..., A D, B D) of x (..., A, B), I of size D = `copies`."""
+    *stacked, rows, columns = blocks.shape
     wide = blocks[..., :, None, :, None] * np.eye(copies)[:, None, :]
-    return np.asarray(wide.reshape(*blocks.shape[:-2], c * copies, c * copies))
+    return np.asarray(wide.reshape(*stacked, rows * copies, columns * copies))
 
 
 def nearest_positive_semidefinite(covariance: Array) -> Array:

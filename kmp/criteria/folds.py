@@ -14,15 +14,15 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack
 
-from kmp.checks import Array
-from kmp.database import Database
+from kmp.arrays.checks import Array
+from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.hyperparameters import Hyperparameters
 from kmp.kernel import Kernel, between
-from kmp.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.low_rank import Features
 from kmp.primitive import KMP
+from kmp.problem.database import Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import check_resolved
 
 _FEW = 0.25  # of the points: more features than that cost more than they save
@@ -203,11 +203,7 @@ class _System:
 
     def _wide(self, matrix: Array) -> Array:
         """x (x) I of size D, of the rows and columns of channels."""
-        d = self.fold.reference.outputs // self.kernel.channels
-        wide = np.zeros((len(matrix), d, matrix.shape[1], d))
-        for i in range(d):
-            wide[:, i, :, i] = matrix
-        return wide.reshape(len(matrix) * d, -1)
+        return kron_identity(matrix, self.fold.reference.outputs // self.kernel.channels)
 
 
 def _negative_log_likelihood(residual: Array, covariance: Array) -> float:

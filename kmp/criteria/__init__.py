@@ -1,0 +1,1 @@
+"""Criteria by which `learn` chooses hyper-parameters: left-out errors, or the likelihood."""
