@@ -22,6 +22,17 @@ class Known(enum.IntFlag):
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
 
 
+class Alternation(enum.IntEnum):
+    """Orders in which two sources may report one hand, over four samples. Bit i is the source of
+    sample i, counted from the newest.
+    """
+
+    SECOND_NEWEST = 0b0010  # the second-newest sample is of the other source
+    THIRD_NEWEST = 0b0100  # the third-newest sample is of the other source
+    INNER_PAIR = 0b0110  # two of the other source, between two of the first one
+    EVERY_OTHER = 0b0101  # the sources take turns
+
+
 class Start(enum.IntEnum):
     """Posture at which the arm's motion starts."""
 
@@ -57,6 +68,8 @@ HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Known.HANDS), int(Known.ARM_HEARD), int(
 CONTESTED, UNSEEN = int(Known.CONTESTED), (int(Known.LEFT_UNSEEN), int(Known.RIGHT_UNSEEN))
 ARM_INSIDE, ONE_HAND = int(Known.ARM_INSIDE), int(Known.ONE_HAND)
 STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Known.STAGE_AMBIGUOUS), int(Known.UNSEEN_HAND_NEEDED)
+SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
+ALTERNATIONS = tuple(int(order) for order in Alternation)
 STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
 READY, RETURNING = int(ArmReady.READY), int(ArmReady.RETURNING)
 NOTICED, HELD = int(Stuck.NOTICED), int(Stuck.HELD)

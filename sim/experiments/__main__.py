@@ -94,6 +94,9 @@ def parser() -> argparse.ArgumentParser:
         "--arm", default="wam", help="of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     )
     p.add_argument(
+        "--numbers", metavar="NAME", default="", help="of `sensitivity`: a stage of the core, or one of its numbers"
+    )
+    p.add_argument(
         "--redraw",
         action="store_true",
         help="draw the figures of the numbers in DIR/NAME.json again, without measuring anew",
@@ -146,7 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
     if args.workers < 1:
         p.error(f"--workers {args.workers}: 1 or more accepted")
-    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm, args.numbers)
     wanted = jobs(args.name, options)
     if args.name.endswith(OF_OTHERS) and args.hands is None and not args.redraw:
         p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")

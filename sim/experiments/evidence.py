@@ -92,6 +92,9 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "the tool turns the glass to the eyes: orientation predicted with the position, and followed", ALL
     ),
     "demonstrations": Experiment("error against the number of demonstrations", ("learning", "kmp")),
+    "sensitivity": Experiment(
+        "what changes if a tuned number of the core is halved or doubled, beside the noise of each figure", ALL
+    ),
 }
 
 

@@ -120,4 +120,17 @@ BY_EXPERIMENT: dict[str, Seeds] = {
         tuning=TUNED_SCENES,
         learned={"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))},
     ),
+    "sensitivity": Seeds(
+        {},
+        tuning={  # four seeds of each session
+            "people": Stream("moving hands", 0, range(300, 304)),
+            "stops": Stream("sudden stop", 0, range(300, 304)),
+            "disturbed": Stream("disturbed hands", 5, range(4)),
+            "calm": Stream("calm hands", 6, range(4)),
+            "hands": Stream("hands", 0, range(300, 304)),
+            "scenes": Stream("random scene", 2026, range(300, 304)),
+            "made": Stream("made task three", 2, range(30, 42)),
+        },
+        learned=_SHIPPED,
+    ),
 }

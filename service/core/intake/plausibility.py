@@ -27,6 +27,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import slot
 from service.core.intake.tuning import (
@@ -41,7 +42,6 @@ from service.core.intake.tuning import (
     SOURCES_APART_M,
     SWAPPED_M,
     SWAPPED_MPS,
-    TO_AND_FRO_PATTERNS,
 )
 
 
@@ -163,25 +163,26 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
     """True if four samples alternate between two positions: a new one (3,) [m], and the three
     before it, whose newest has number `order`. Their intervals may be uneven.
 
-    For one of the TO_AND_FRO_PATTERNS, which assign the samples to two sources, samples of
-    different sources are at least SOURCES_APART_M apart, and those of one source differ by at most
+    For one of the ALTERNATIONS, which assign the samples to two sources, samples of different
+    sources are at least SOURCES_APART_M apart, and those of one source differ by at most
     SOURCE_SPREAD_SHARE of the smallest distance between the sources. A pattern with one sample of
     the second source also requires that this source was seen before (`_returns`).
     """
     samples = np.empty((4, 3))
     samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
-    for places in TO_AND_FRO_PATTERNS:
+    for sources in ALTERNATIONS:
         within, apart = 0.0, np.inf
         for i in range(4):
             for j in range(i):
                 square = 0.0
                 for axis in range(3):
                     square += (samples[i, axis] - samples[j, axis]) ** 2
-                if (places >> i) & 1 == (places >> j) & 1:
+                if (sources >> i) & 1 == (sources >> j) & 1:
                     within = max(within, square)
                 else:
                     apart = min(apart, square)
         if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
-            odd = 1 if places == 0b0010 else 2 if places == 0b0100 else 0  # index of the second source's only sample
+            # index of the second source's only sample; 0 if it has two
+            odd = 1 if sources == SECOND_NEWEST else 2 if sources == THIRD_NEWEST else 0
             return odd == 0 or _returns(states, side, order + odd - 1, samples[odd] - samples[0])
     return False

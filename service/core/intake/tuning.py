@@ -61,7 +61,6 @@ SOURCES_APART_M = 0.012  # smallest distance between the positions that two sour
 SOURCE_SPREAD_SHARE = 0.4  # largest scatter of one source's samples / distance between the sources
 OFFSET_TOLERANCE_M = 0.03  # offsets of a source agree within OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * elapsed time
 OFFSET_CHANGE_MPS = 0.5  # speed at which the offset may change
-TO_AND_FRO_PATTERNS = (0b0010, 0b0100, 0b0110, 0b0101)  # bit i: source of sample i, counted from the newest
 RETURN_SAMPLES = 12  # a source three times as slow as the other returns twice within this number of samples
 TO_AND_FRO_S = 0.08  # a hand with two sources alternates between them within this time
 TO_AND_FRO_MPS2 = 50.0  # [m/s²] below this acceleration, a single hand could have moved like that

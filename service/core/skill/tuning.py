@@ -44,7 +44,6 @@ MOTION_STEP_S = 0.02  # step of the differences along the hands' motion
 CALM_MPS = 0.2  # a slower hand trembles: its velocity does not predict its motion
 MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration
 MAX_TARGET_M = 1e3  # targets are clipped to this distance
-MAX_SKILL_DISTANCE_M = 10.0  # largest distance of anything in a skill's file from the base plate
 PULL_SHARPNESS_PER_M2 = 50.0  # [1/m²] k: a via-point moves the tool with the weight exp(-k |hands - its hands|²)
 LEAST_PULL_VARIANCE_SHARE = 1e-6  # added variance, so that exact via-points remain solvable
 
