@@ -31,7 +31,6 @@ from service.core.codes import (
     WRONG,
 )
 from service.core.decision.stage import Decision
-from service.core.decision.tuning import INSIDE_M
 from service.core.frame import (
     Event,
     Frame,
@@ -49,6 +48,7 @@ from service.core.intake.stage import Intake
 from service.core.kinematics import Kinematics
 from service.core.limiter.stage import LimiterStage
 from service.core.separation.stage import Separation
+from service.core.separation.tuning import CAPSULE_EXCESS_M
 from service.core.setpoint.stage import SetpointStage
 from service.core.skill.model import Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
@@ -191,7 +191,7 @@ class Controller:
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if state["arm_ready"] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > INSIDE_M)
+            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > CAPSULE_EXCESS_M)
         starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])

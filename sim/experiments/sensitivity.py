@@ -15,6 +15,7 @@ from service.process import one_blas_thread  # noqa: F401
 # isort: split
 import argparse
 import ast
+import copy
 import functools
 import importlib
 import json
@@ -61,9 +62,9 @@ ROOM = 1024  # float64 values for which there is memory
 
 EACH = 4  # seeds of a session: the first one is measured at all values, the others give the noise
 
-_values = np.zeros(ROOM)
-_marks = np.zeros(ROOM, np.uint8)
-_VALUES_AT, _MARKS_AT = _values.ctypes.data, _marks.ctypes.data
+values = np.zeros(ROOM)
+marks = np.zeros(ROOM, np.uint8)
+_VALUES_AT, _MARKS_AT = values.ctypes.data, marks.ctypes.data
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -116,10 +117,9 @@ class Number(NamedTuple):
 
     def read(self) -> ast.expr:
         """Expression that reads it from memory."""
-        if np.ndim(self.value):
-            return ast.parse(f"_memory.row({self.at}, {self.size})", mode="eval").body
-        kind = "count" if isinstance(self.value, int) else "number"
-        return ast.parse(f"_memory.{kind}({self.at})", mode="eval").body
+        kind = "row" if np.ndim(self.value) else "count" if isinstance(self.value, int) else "number"
+        more = f", {self.size}" if np.ndim(self.value) else ""
+        return ast.parse(f"_memory.{kind}({self.at}{more})", mode="eval").body
 
     def changed(self, factor: float) -> Any:
         """The number times a factor; a count is rounded and differs by at least 1."""
@@ -128,31 +128,65 @@ class Number(NamedTuple):
         return max(self.value + 1, round(self.value * factor)) if factor > 1 else min(self.value - 1, self.value // 2)
 
 
-def numbers() -> dict[str, Number]:
-    """All tuned numbers of the core, by key."""
-    found: dict[str, Number] = {}
+class Tuning(NamedTuple):
+    """The tuned numbers of the core by key, and for each name the expression that reads it: a name
+    whose value names others is no number of its own, but a formula of them.
+    """
+
+    numbers: dict[str, Number]
+    reads: dict[str, ast.expr]
+
+
+def tuning() -> Tuning:
+    """All names of the stages' `tuning.py`."""
+    found, modules = Tuning({}, {}), {}
     at = 0
     for stage in STAGES:
-        for name, value in vars(importlib.import_module(f"service.core.{stage}.tuning")).items():
-            if name.isupper() and np.asarray(value).dtype.kind in "if":
-                one = Number(stage, name, value, at)
-                found[one.key], at = one, at + one.size
+        module = importlib.import_module(f"service.core.{stage}.tuning")
+        modules[stage] = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+        for name, formula in _assigned(modules[stage]):
+            if not _named(formula):
+                one = Number(stage, name, getattr(module, name), at)
+                found.numbers[one.key], found.reads[one.key], at = one, one.read(), at + one.size
+    for stage, tree in modules.items():
+        replace = _Reads(f"{stage}/tuning.py", found.reads, stage, inside=True)
+        for node in tree.body:
+            replace.visit(node) if isinstance(node, ast.ImportFrom) else None
+        for name, formula in _assigned(tree):
+            if _named(formula):
+                found.reads[f"{stage}.{name}"] = replace.visit(formula)
     return found
+
+
+def numbers() -> dict[str, Number]:
+    """The tuned numbers of the core, by key."""
+    return tuning().numbers
+
+
+def _assigned(tree: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            yield node.targets[0].id, node.value
+
+
+def _named(formula: ast.expr) -> bool:
+    """True if a value names other numbers."""
+    return any(isinstance(node, ast.Name) and node.id.isupper() for node in ast.walk(formula))
 
 
 class _Reads(ast.NodeTransformer):
     """Replace the numbers that a module imports by reads from memory."""
 
-    def __init__(self, path: str, known: Mapping[str, Number]) -> None:
-        self._path, self._known, self._inside = path, known, False
-        self._named: dict[str, Number] = {}
+    def __init__(self, path: str, reads: Mapping[str, ast.expr], stage: str = "", *, inside: bool = False) -> None:
+        """`stage` is that of a `tuning.py`, whose own names are replaced too."""
+        self._path, self._reads, self._inside = path, reads, inside
+        self._named = {key.split(".")[1]: read for key, read in reads.items() if key.split(".")[0] == stage}
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
         module = (node.module or "").split(".")
         if module[:2] == ["service", "core"] and module[-1] == "tuning":
             for one in node.names:
-                if (key := f"{module[2]}.{one.name}") in self._known:
-                    self._named[one.asname or one.name] = self._known[key]
+                self._named[one.asname or one.name] = self._reads[f"{module[2]}.{one.name}"]
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
@@ -167,17 +201,17 @@ class _Reads(ast.NodeTransformer):
             return node
         if not self._inside:
             raise ImportError(f"{self._path}:{node.lineno}: {node.id} is read outside of a function")
-        return ast.copy_location(self._named[node.id].read(), node)
+        return ast.copy_location(copy.deepcopy(self._named[node.id]), node)
 
 
 class _Loader(SourceFileLoader):
     """Loader of a module of the service that reads its numbers from memory."""
 
-    known: Mapping[str, Number] = {}
+    reads: Mapping[str, ast.expr] = {}
 
     def get_code(self, fullname: str) -> Any:
         path = self.get_filename(fullname)
-        tree = _Reads(path, self.known).visit(ast.parse(self.get_data(path)))
+        tree = _Reads(path, self.reads).visit(ast.parse(self.get_data(path)))
         return compile(ast.fix_missing_locations(tree), path, "exec")
 
     def exec_module(self, module: ModuleType) -> None:
@@ -190,8 +224,8 @@ class ReadsNumbers(MetaPathFinder):
     memory.
     """
 
-    def __init__(self, known: Mapping[str, Number]) -> None:
-        _Loader.known = known
+    def __init__(self, reads: Mapping[str, ast.expr]) -> None:
+        _Loader.reads = reads
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
         """Specification of a module of the service; None for any other."""
@@ -203,17 +237,19 @@ class ReadsNumbers(MetaPathFinder):
         return spec
 
 
-def begin(known: Mapping[str, Number]) -> None:
-    """Write all numbers to memory, and have the service read them from there."""
+def begin() -> dict[str, Number]:
+    """Write all numbers to memory, and have the service read them from there. Returns them."""
+    known, reads = tuning()
     loaded = [name for name in sys.modules if name.startswith("service.core.") and name.count(".") > 2]
     if early := [name for name in loaded if not name.endswith(".tuning")]:
         raise ImportError(f"imported before its numbers could be replaced: {', '.join(early)}")
     for one in known.values():
-        _values[one.at : one.at + one.size] = one.value
+        values[one.at : one.at + one.size] = one.value
     import kmp.compiled
 
     kmp.compiled.compiled = numba.njit  # Numba's caches on disk have the numbers in the code
-    sys.meta_path.insert(0, ReadsNumbers(known))
+    sys.meta_path.insert(0, ReadsNumbers(reads))
+    return known
 
 
 def forget() -> None:
@@ -391,9 +427,9 @@ def at_tuned_values(known: Mapping[str, Number], all_sessions: Mapping[str, Sess
     """Measure all sessions with all seeds."""
     out = Known({}, {}, {}, {})
     for name, session in all_sessions.items():
-        _marks[:] = 0
+        marks[:] = 0
         found, began = [session(0)], time.monotonic()
-        out.reads[name] = [key for key, one in known.items() if _marks[one.at]]
+        out.reads[name] = [key for key, one in known.items() if marks[one.at]]
         found += [session(seed) for seed in range(1, 1 if name == "golden" else EACH)]
         out.seconds[name] = (time.monotonic() - began) / max(1, len(found) - 1)
         out.figures[name] = found[0]
@@ -429,7 +465,7 @@ def in_fork(work: Callable[[], Any]) -> Callable[[], Any]:
 
 def at_other_value(one: Number, value: Any, known: Known, all_sessions: Mapping[str, Session]) -> Figures:
     """Figures of the sessions that read a number, at another value; runs in a fork."""
-    _values[one.at : one.at + one.size] = value
+    values[one.at : one.at + one.size] = value
     forget()
     out: Figures = {}
     for name, session in all_sessions.items():
@@ -442,8 +478,7 @@ def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
     """Measure numbers one after the other: first all figures at the tuned values, then a row a
     number. With two workers, both values of a number are measured at the same time.
     """
-    known = numbers()
-    begin(known)
+    known = begin()
     all_sessions = sessions()
     here = at_tuned_values(known, all_sessions)
     yield {"tuned": here._asdict()}

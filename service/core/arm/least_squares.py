@@ -16,16 +16,8 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.tuning import (
-    BOUND_ROUNDS,
-    CONSTRAINT_ROUNDS,
-    LEAST_BOUND_GAIN,
-    LEAST_EXCESS,
-    LEAST_FORCE,
-    LEAST_PIVOT,
-    LEAST_SLOPE,
-)
 from service.core.frame import Vector
+from service.core.numerics import BOUND_ROUNDS, CONSTRAINT_ROUNDS, LEAST_SLOPE, ROUNDING, TOLERANCE
 
 
 @compiled
@@ -38,7 +30,7 @@ def factorise(tasks: Vector, damping: float, root: Vector) -> None:
                 total += tasks[i, k] * tasks[j, k]
             for k in range(j):
                 total -= root[i, k] * root[j, k]
-            root[i, j] = math.sqrt(max(total, LEAST_PIVOT)) if i == j else total / root[j, j]
+            root[i, j] = math.sqrt(max(total, ROUNDING)) if i == j else total / root[j, j]
 
 
 @compiled
@@ -115,7 +107,7 @@ def least_squares(
             rest[i] = -wanted[i]
             for j in range(joints):
                 rest[i] += tasks[i, j] * result[j]
-        leaving, most = -1, LEAST_BOUND_GAIN  # the bound with the steepest descent to its inside
+        leaving, most = -1, ROUNDING  # the bound with the steepest descent to its inside
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
@@ -176,10 +168,10 @@ def keep_under(
 
     Returns True if x had to be changed.
     """
-    if _farthest(bounds, rows, limits, x, LEAST_EXCESS) < 0:
+    if _farthest(bounds, rows, limits, x, TOLERANCE) < 0:
         return False
     _solve_under(tasks, wanted, posture, damping, bounds, rows, limits, x)
-    if len(limits) and limits.min() < 0.0 and _farthest(bounds, rows, limits, x, LEAST_EXCESS) >= 0:
+    if len(limits) and limits.min() < 0.0 and _farthest(bounds, rows, limits, x, TOLERANCE) >= 0:
         least = np.maximum(limits, 0.0)
         _solve_under(tasks, wanted, posture, damping, bounds, rows, least, x)
     share = _share_within(bounds, rows, limits, x)
@@ -221,7 +213,7 @@ def _solve_under(
     entering, pushed = -1, 0.0
     for _ in range(CONSTRAINT_ROUNDS):
         if entering < 0:
-            entering, pushed = _farthest(bounds, rows, limits, x, 0.1 * LEAST_EXCESS), 0.0
+            entering, pushed = _farthest(bounds, rows, limits, x, 0.1 * TOLERANCE), 0.0
             if entering < 0:
                 break
         limit = _constraint(entering, bounds, rows, limits, normal)
@@ -235,7 +227,7 @@ def _solve_under(
             beyond += normal[j] * x[j]
             slope += normal[j] * way[j]
         for k in range(size):
-            if yielding[k] > LEAST_FORCE and force[k] < step * yielding[k]:
+            if yielding[k] > ROUNDING and force[k] < step * yielding[k]:
                 leaving, step = k, force[k] / yielding[k]
         if slope > LEAST_SLOPE and size < joints and beyond <= step * slope:
             leaving, step = -1, beyond / slope
@@ -264,14 +256,14 @@ def _share_within(bounds: Vector, rows: Vector, limits: Vector, x: Vector) -> fl
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]
-        if abs(x[j]) > abs(bound) + LEAST_EXCESS:
+        if abs(x[j]) > abs(bound) + TOLERANCE:
             share = min(share, bound / x[j])
     for k in range(len(limits)):
         along = 0.0
         for j in range(len(x)):
             along += rows[k, j] * x[j]
         limit = max(limits[k], 0.0)
-        if along > limit + LEAST_EXCESS:
+        if along > limit + TOLERANCE:
             share = min(share, limit / along)
     return share
 
@@ -337,7 +329,7 @@ def _yield_to(way: Vector, normals: Vector, moved: Vector, size: int, out: Vecto
                 total += normals[a, j] * moved[b, j]
             for k in range(b):
                 total -= root[a, k] * root[b, k]
-            root[a, b] = math.sqrt(max(total, LEAST_PIVOT)) if a == b else total / root[b, b]
+            root[a, b] = math.sqrt(max(total, ROUNDING)) if a == b else total / root[b, b]
     substitute(root, right)
     for a in range(size):
         out[a] = right[a]

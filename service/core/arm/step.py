@@ -16,14 +16,13 @@ from service.core.arm.least_squares import solve
 from service.core.arm.tuning import (
     FAR_SPEED_MPS,
     IDLE_BRAKE_SHARE,
-    MAX_ERROR_M,
     NEAR_LIMIT_RAD,
     POSTURE_GAIN_PER_S,
     POSTURE_SPEED_RADPS,
-    SPEED_ROUNDING_MPS,
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
+from service.core.numerics import MAX_ERROR_M, ROUNDING
 
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
@@ -209,7 +208,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
         for order in range(2):
             out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
-    return said | SPEED if excess > 1.0 + SPEED_ROUNDING_MPS else said
+    return said | SPEED if excess > 1.0 + ROUNDING else said
 
 
 @compiled

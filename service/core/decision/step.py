@@ -45,7 +45,6 @@ from service.core.decision.tuning import (
     PROGRESS_SPEED_SHARE,
     STUCK_GAP_M,
     STUCK_S,
-    STUCK_TARGET_M,
     TOO_FAST_S,
     WAY_TIMEOUT_S,
 )
@@ -173,7 +172,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
     and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
     anew; so they are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved by
-    more than STUCK_TARGET_M.
+    more than that.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
@@ -195,7 +194,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
         least = FREED_SHARE * state.stuck_gap
     else:
         least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * given.max_speed * STUCK_S)
-    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_TARGET_M:
+    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_GAP_M:
         state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
         return 0
     return NOTICED if passed_s >= STUCK_S else 0

@@ -30,15 +30,14 @@ from service.core.intake.tuning import (
     LONE_SAMPLE_S,
     MAX_LATE_S,
     MAX_NOISE_M,
-    MAX_STAMP_DIFFERENCE_NS,
-    MODE_INTENSITIES,
+    MODE_INTENSITIES_M2PS5,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     REAPPEARED_VARIANCE_SHARE,
     STILLNESS_FALL_S,
     STILLNESS_LOWPASS_S,
-    TICK_ROUNDING,
 )
+from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from service.settings.config import HandSettings
 
 STILL = np.ones(2)  # stillness of two hands that rest
@@ -227,7 +226,7 @@ def _response_s(states: Records, period_s: float) -> float:
         if more > 0:
             passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
             each_s = min(passed * period_s / more, MAX_LATE_S)
-            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES[CHANGE])
+            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES_M2PS5[CHANGE])
     return float(np.rint(slowest ** (1.0 / 6.0) * ROUND_TO) / ROUND_TO)
 
 

@@ -21,7 +21,8 @@ from service.core.frame import Record, Records, Vector
 from service.core.intake import KEPT
 from service.core.intake.hand_estimator import BELIEVED, filter_in, look_ahead, order_of, seconds_after, slot
 from service.core.intake.mode_filter import advance
-from service.core.intake.tuning import LONE_SAMPLE_S, TICK_ROUNDING
+from service.core.intake.tuning import LONE_SAMPLE_S
+from service.core.numerics import TICK_ROUNDING
 
 
 @compiled

@@ -11,7 +11,8 @@ from service.core.codes import FAULT
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of
 from service.core.kinematics import tool_speed_after
-from service.core.limiter.tuning import INSIDE_LIMIT_SHARE, LARGEST_USABLE, LEAST_CHANGE_RADPS, STOP_SAMPLES
+from service.core.limiter.tuning import STOP_SAMPLES
+from service.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING
 from service.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited
@@ -124,7 +125,7 @@ def common_share(state: Vector, parameters: Records) -> float:
     for i in range(state.shape[1]):
         way, change = state[3, i] - state[1, i], INSIDE_LIMIT_SHARE * dt * given.max_jerk[i]
         a = state[2, i] if way >= 0.0 else -state[2, i]
-        way = max(abs(way), LEAST_CHANGE_RADPS)
+        way = max(abs(way), ROUNDING)
         least = max(least, (a - change) * dt / way)
         most = min(most, min(a + change, INSIDE_LIMIT_SHARE * given.max_acceleration[i]) * dt / way)
         bend, left = way / (2.0 * change * dt), max(1.0 - 0.5 * dt * a / way, 0.0)

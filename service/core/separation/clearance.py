@@ -7,9 +7,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
-from service.core.separation.tuning import FARTHEST_REPORTED_M
+from service.core.separation import FARTHEST_REPORTED_M
 
-PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s`, `clearance` and `room`
+PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s` and `clearance`
 NEAR_HAND, NEAR_ITSELF = -1, -2  # the nearest object, if it is not a box; boxes are numbered from 0
 NOBODY = np.empty((0, 3))  # no hands
 

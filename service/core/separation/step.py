@@ -9,12 +9,12 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
+from service.core.separation import FARTHEST_REPORTED_M
 from service.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from service.core.separation.tuning import (
     BRAKE_RAMP_S,
     CLEARANCE_GAIN_PER_S,
     CONTACT_MARGIN_M,
-    FARTHEST_REPORTED_M,
     HAND_ACCELERATION_FADE_S,
     LOOKAHEAD_S,
     PLANNED_BRAKE_SHARE,
@@ -194,7 +194,7 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
     """
     given = parameters[0]
     brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
-    planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.room[rule])
+    planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.planned_margin)
     return max(PLANNED_BRAKE_SHARE * least, planned) + PLANNED_BRAKE_SHARE * braked
 
 

@@ -26,11 +26,10 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
+from service.core.numerics import ROUNDING, TOLERANCE
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.tuning import (
-    BOUND_ROUNDING_M,
     HULL_MARGIN_M,
-    ON_BOUND_M,
     RETURN_SHARE,
     STOP_SECANT_TOLERANCE_M,
     STOP_SECANTS,
@@ -167,11 +166,11 @@ def take_safe(
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
             if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
                 continue
-            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + ON_BOUND_M:
+            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + TOLERANCE:
                 stays = False
                 continue
             here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
-            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + BOUND_ROUNDING_M:
+            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + ROUNDING:
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
                 mixed = True
     if mixed:  # an axis was replaced, so the norms over all axes are checked again
@@ -201,8 +200,8 @@ def _fall_back(
     [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which one counts.
     """
     max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
-    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND_M
-    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND_M - low
+    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + TOLERANCE
+    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > TOLERANCE - low
     if over and under:  # the stop ends beyond both bounds
         over = setpoint[1, axis] > 0.0
         under = not over

@@ -9,12 +9,11 @@ from scipy.linalg import solve_continuous_are
 
 from service.core.frame import Vector
 from service.core.joint_limits import acceleration_rate
+from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
 from service.core.setpoint.tuning import (
     ACCELERATION_REVERSION_PER_S,
-    GAIN_DECIMALS,
     GAP_STOPPED_M,
     GAP_WAITING_M,
-    SLOWEST_PER_S,
     STIFFEST_PER_M,
     TRACKER_LOOP_SHARE,
     TRACKER_RATE_SHARE,

@@ -18,13 +18,13 @@ from kmp.immutable import Immutable, frozen
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Vector
 from service.core.intake.hand_estimator import STILL
+from service.core.numerics import MAX_TARGET_M
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import delayed
 from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
-from service.core.skill.tuning import MAX_TARGET_M
 from service.settings.config import Reach
 
 NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
