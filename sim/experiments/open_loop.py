@@ -19,7 +19,7 @@ from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Known, Prediction, Skill, clamp
+from service.core.skill.skill import Earlier, Prediction, Skill, clamp
 from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2, MOTION_STEP_S
 from service.settings.config import Settings, robot_description
 from sim.experiments.results import Array
@@ -90,7 +90,7 @@ class Rival(Skill):
         accelerations: Array,
         stillness: Array = STILL,
         *,
-        before: Known | None = None,
+        before: Earlier | None = None,
         past: Array | None = None,
         turns: Array | None = None,
         belief: Array | None = None,

@@ -95,7 +95,7 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
-            kept_speed=CONSTRAINED_SPEED_MPS,
+            constrained_speed=CONSTRAINED_SPEED_MPS,
             max_tool_speed=TOOL_SPEED_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
             position_gain=min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * rate),

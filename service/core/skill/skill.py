@@ -125,7 +125,7 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 UNTOLD = np.empty((0, 18))  # orientation of hands if it is not known
 MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
 """All types of models."""
-Known: TypeAlias = tuple[Vector, Vector, float]
+Earlier: TypeAlias = tuple[Vector, Vector, float]
 """Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], and closure of the gripper, as
 predicted at the newest sample of a hand."""
 
@@ -138,7 +138,7 @@ class Prediction(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²] of the model, before the calibration by `Regions`
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
-    torn: float  # probability that the tool belongs elsewhere, in another stage
+    ambiguity: float  # probability that the tool belongs elsewhere, in another stage
     turn: Turn
     closure: float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 
@@ -174,7 +174,7 @@ class Skill(Immutable):
         accelerations: Vector,
         stillness: Vector = STILL,
         *,
-        before: Known | None = None,
+        before: Earlier | None = None,
         past: Vector | None = None,
         turns: Vector | None = None,
         belief: Vector | None = None,
