@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import jinja2
+import numpy as np
 import pytest
 
 import kmp
@@ -23,6 +24,12 @@ from support.paths import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings") for path in folder.glob("*.md"))
+UNITS = ("_M", "_M2", "_M3", "_S", "_S2", "_RAD", "_RADPS", "_MPS", "_MPS2", "_M2PS5", "_PER_S", "_PER_S2", "_PER_M")
+UNITS += ("_PER_M2", "_SHARE", "_SHARES", "_SAMPLES", "_STDS", "_WEIGHT", "_POWER", "_ODDS", "_PROBABILITY", "_SPEEDS")
+DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a primitive's inputs
+    *("MODE_PRIOR", "TREMOR_DAMPING", "MAX_INNOVATION", "STAGE_DISTANCE", "STAGE_DISTANCE_BESIDE", "REST_SHARPNESS"),
+    *("ERROR_WIDTH", "GRIPPER_OPEN_BELOW", "STOP_SECANTS", "PLANNED_BRAKE_LIMITS", "MAX_SQUARED_DEVIATION"),
+}
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `service.client`, for the service's own programs
 
@@ -42,10 +49,20 @@ def written_by(name: str) -> str:
     return str(program(name).page())
 
 
-@pytest.mark.parametrize("name", ["settings", "command-line"])
+@pytest.mark.parametrize("name", ["settings", "command-line", "tuning"])
 def test_a_generated_page_is_up_to_date(name: str) -> None:
     writer = f"{name.replace('-', '_')}_page"
     assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), f"run `python docs/{writer}.py`"
+
+
+def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
+    page = program("tuning_page")
+    comments = {stage: page.told(stage) for stage in page.STAGES}
+    for one in page.tuning().numbers.values():
+        words = comments[one.stage][one.name]
+        assert words.meaning, one.key
+        assert words.low <= np.min(one.value) <= np.max(one.value) <= words.high, one.key
+        assert one.name.endswith(UNITS) or one.name in DIMENSIONLESS, one.key
 
 
 def test_the_page_on_the_command_line_has_every_command_and_option() -> None:

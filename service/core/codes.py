@@ -7,7 +7,7 @@ import enum
 from service.contract.records import Mode, Reason
 
 
-class Known(enum.IntFlag):
+class Condition(enum.IntFlag):
     """Conditions of hands, arm and task that hold at a tick."""
 
     HANDS = 1  # both hands are seen
@@ -20,6 +20,17 @@ class Known(enum.IntFlag):
     ONE_HAND = 128  # the leading hand is seen; the second hand was never seen, or has disappeared
     STAGE_AMBIGUOUS = 256  # the stage of the task is not known
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
+
+
+class Alternation(enum.IntEnum):
+    """Orders in which two sources may report one hand, over four samples. Bit i is the source of
+    sample i, counted from the newest.
+    """
+
+    SECOND_NEWEST = 0b0010  # the second-newest sample is of the other source
+    THIRD_NEWEST = 0b0100  # the third-newest sample is of the other source
+    INNER_PAIR = 0b0110  # two of the other source, between two of the first one
+    EVERY_OTHER = 0b0101  # the sources take turns
 
 
 class Start(enum.IntEnum):
@@ -48,19 +59,44 @@ class SetpointStep(enum.IntEnum):
 
     PLANNED = 1  # the tracker's jerk was reduced to keep a bound
     STOPPED = 2  # the setpoint began its stop
-    WRONG = 3  # a bound was broken
+    BROKEN = 3  # a bound was broken; the setpoint did not move
+
+
+class SetpointBound(enum.IntEnum):
+    """Bound that a step of the setpoint has broken."""
+
+    NONE = 0
+    NOT_FINITE = 1
+    SPEED = 2
+    ACCELERATION = 3
+    JERK = 4
+    POSITION = 5
+
+
+class ClockTrust(enum.IntEnum):
+    """Trust in a tracker's clock."""
+
+    LEARNING = 0  # its first window is not over
+    DOUBTED = 1  # the minimum delays of the last two windows differ
+    TRUSTED = 2  # they agree
 
 
 # The same codes as plain integers: compiled functions need them, and in Python each access to a
 # member of an enumeration takes a microsecond.
-HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Known.HANDS), int(Known.ARM_HEARD), int(Known.ARM_STILL)
-CONTESTED, UNSEEN = int(Known.CONTESTED), (int(Known.LEFT_UNSEEN), int(Known.RIGHT_UNSEEN))
-ARM_INSIDE, ONE_HAND = int(Known.ARM_INSIDE), int(Known.ONE_HAND)
-STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Known.STAGE_AMBIGUOUS), int(Known.UNSEEN_HAND_NEEDED)
+HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Condition.HANDS), int(Condition.ARM_HEARD), int(Condition.ARM_STILL)
+CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
+ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
+STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.STAGE_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
+SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
+ALTERNATIONS = tuple(int(order) for order in Alternation)
 STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
 READY, RETURNING = int(ArmReady.READY), int(ArmReady.RETURNING)
 NOTICED, HELD = int(Stuck.NOTICED), int(Stuck.HELD)
-PLANNED, STOPPED, WRONG = int(SetpointStep.PLANNED), int(SetpointStep.STOPPED), int(SetpointStep.WRONG)
+PLANNED, STOPPED, BROKEN = int(SetpointStep.PLANNED), int(SetpointStep.STOPPED), int(SetpointStep.BROKEN)
+NO_BOUND, FINITE_BOUND = int(SetpointBound.NONE), int(SetpointBound.NOT_FINITE)
+SPEED_BOUND, ACCELERATION_BOUND = int(SetpointBound.SPEED), int(SetpointBound.ACCELERATION)
+JERK_BOUND, POSITION_BOUND = int(SetpointBound.JERK), int(SetpointBound.POSITION)
+LEARNING, DOUBTED, TRUSTED = int(ClockTrust.LEARNING), int(ClockTrust.DOUBTED), int(ClockTrust.TRUSTED)
 HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)

@@ -20,6 +20,7 @@ from service.contract.records import GONE_S, Flag, Reason
 from service.core.arm.stage import Arm
 from service.core.codes import (
     ARM_INSIDE,
+    BROKEN,
     FOLLOW,
     HANDS_KNOWN,
     ONE_HAND,
@@ -28,10 +29,8 @@ from service.core.codes import (
     STARTS_MEASURED,
     UNSEEN,
     UNSEEN_HAND_NEEDED,
-    WRONG,
 )
 from service.core.decision.stage import Decision
-from service.core.decision.tuning import INSIDE_M
 from service.core.frame import (
     Event,
     Frame,
@@ -49,6 +48,7 @@ from service.core.intake.stage import Intake
 from service.core.kinematics import Kinematics
 from service.core.limiter.stage import LimiterStage
 from service.core.separation.stage import Separation
+from service.core.separation.tuning import CAPSULE_EXCESS_M
 from service.core.setpoint.stage import SetpointStage
 from service.core.skill.model import Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
@@ -134,7 +134,7 @@ class Controller:
         unseen = UNSEEN.index(side) if (side := known & sum(UNSEEN)) else None
         wanted = self._skill.step(state, frame, unseen) if known & HANDS_KNOWN else None
         if wanted is not None:
-            known |= STAGE_AMBIGUOUS * wanted.torn | UNSEEN_HAND_NEEDED * wanted.needs
+            known |= STAGE_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
         lap("skill")
         here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
@@ -151,7 +151,7 @@ class Controller:
         return unchanging
 
     def _take_in(self, tick: Tick, frame: Frame) -> int:
-        """Apply the events of a tick and advance the intake. Returns its flags of `codes.Known`.
+        """Apply the events of a tick and advance the intake. Returns its flags `codes.Condition`.
         Raises ValueError if the tick's index does not grow.
         """
         state = self._state
@@ -191,7 +191,7 @@ class Controller:
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if state["arm_ready"] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > INSIDE_M)
+            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > CAPSULE_EXCESS_M)
         starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
@@ -206,15 +206,15 @@ class Controller:
         """
         state, separation = self._state, self._separation
         met = self._setpoint.step(state, frame, wanted, here, self.skill.workspace, separation.setpoint_share)
-        if met == WRONG:
+        if met == BROKEN:
             self.decision.fail(state, frame, Reason.SETPOINT)
         lap("setpoint")
         solution = self._arm.follow(state, here, separation)
         lap("arm")
         moved = self._limiter.step(state, frame, solution.velocity, solution.acceleration, separation)
         self._here = moved.here
-        if moved.too_fast:
-            self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.too_fast)
+        if moved.excess_speed:
+            self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.excess_speed)
             frame["commanded"] = moved.moving
         flags = STUCK * (state["stuck"] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
         flags |= UNSURE * (state["unsure"] > 0) | LIMITED * (met > 0 or solution.speed_limited or moved.limited)

@@ -71,8 +71,8 @@ def fastest_stop(
             elif jerk == 0.0 and a != 0.0:
                 h = -v / a
             if 0.0 < h < lasts:
-                way = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-                low, high = min(low, way), max(high, way)
+                displacement = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
+                low, high = min(low, displacement), max(high, displacement)
         x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
         v += lasts * (a + lasts * jerk / 2.0)
         a += lasts * jerk

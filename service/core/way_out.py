@@ -183,9 +183,9 @@ class WayOut:
         `before` has the index of each node's parent.
         """
         nearest = int(np.argmin(np.abs(np.array(nodes) - toward).max(axis=1)))
-        way = toward - nodes[nearest]
-        far = float(np.abs(way).max())
-        new = toward if far <= REACH_RAD else nodes[nearest] + REACH_RAD / far * way
+        step = toward - nodes[nearest]
+        far = float(np.abs(step).max())
+        new = toward if far <= REACH_RAD else nodes[nearest] + REACH_RAD / far * step
         if not self._is_free(nodes[nearest], new, hands, least):
             return None
         nodes.append(new)

@@ -22,7 +22,7 @@ from service.contract.records import Reason
 from service.contract.requests import Status, ViaPoint, encode_json
 from service.core.controller import Controller, outgoing, run
 from service.core.frame import STAGES, Event, Frame, Outputs, Tick, blank, frame_layout, order, timed
-from service.core.separation.tuning import FARTHEST_REPORTED_M
+from service.core.separation import FARTHEST_REPORTED_M
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
 from service.daemon.braking import brake

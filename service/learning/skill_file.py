@@ -27,11 +27,11 @@ from kmp.storage import checksum
 from service.contract.explain import ExplainedError, validated
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
+from service.core.skill import MAX_SKILL_DISTANCE_M
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
-from service.core.skill.tuning import MAX_SKILL_DISTANCE_M
 
 POSED = 4  # the format of a skill that has orientation or gripper; of others it is the model's
 FORMATS = {*(number for model in MODELS for number in model.formats), POSED}

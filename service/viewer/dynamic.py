@@ -15,7 +15,7 @@ from service.contract.incidents import word
 from service.contract.records import SIDES, Flag, Mode, Reason
 from service.core.frame import STAGES, TIMING, Record
 from service.core.geometry import between_segments, off_target, place
-from service.core.separation.tuning import FARTHEST_REPORTED_M
+from service.core.separation import FARTHEST_REPORTED_M
 from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.settings import palette

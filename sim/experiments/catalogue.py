@@ -118,6 +118,19 @@ _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on reco
 _FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
 _ORDERS = {"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))}
 _HELD_OUT = {"demonstrations": Stream("demonstration", 1, range(21, 26))}
+_SENSITIVITY = Seeds(  # four seeds of each session
+    {},
+    tuning={
+        "people": Stream("moving hands", 0, range(300, 304)),
+        "stops": Stream("sudden stop", 0, range(300, 304)),
+        "disturbed": Stream("disturbed hands", 5, range(4)),
+        "calm": Stream("calm hands", 6, range(4)),
+        "hands": Stream("hands", 0, range(300, 304)),
+        "scenes": Stream("random scene", 2026, range(300, 304)),
+        "made": Stream("made task three", 2, range(30, 42)),
+    },
+    learned=_SHIPPED,
+)
 
 EXPERIMENTS: Mapping[str, Experiment] = {
     "hands": Experiment("hands", ALL, Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED)),
@@ -144,4 +157,5 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "demonstrations": Experiment(
         "demonstrations", ("learning", "kmp"), Seeds(_scenes(40) | _HELD_OUT, tuning=TUNED_SCENES, learned=_ORDERS)
     ),
+    "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
 }

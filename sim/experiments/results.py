@@ -54,6 +54,7 @@ class Options:
     workers: int = 1  # processes
     share: float = 1.0  # of the full size, for a quick look
     arm: str = "wam"  # of `faults` and `motion`: one of the shipped, or a cell's settings
+    numbers: str = ""  # of `sensitivity`: a stage of the core, or one of its numbers; empty: all
 
 
 @dataclass

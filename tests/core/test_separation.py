@@ -21,11 +21,12 @@ from service.core.frame import Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from service.core.kinematics import Kinematics
 from service.core.limiter.stage import LimiterStage
+from service.core.separation import TABLE_DEPTH_M
 from service.core.separation.body import Body, body_of
 from service.core.separation.clearance import NEAR_ITSELF, NOBODY
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
-from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS, TABLE_DEPTH_M
+from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS
 from service.core.skill.skill import Skill
 from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted

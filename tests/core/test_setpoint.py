@@ -168,7 +168,7 @@ def test_a_setpoint_outside_the_workspace_waits_for_a_tool_that_cannot_come() ->
     start = here.position + np.array([0.21, 0.0, 0.0])
     box = np.array([start + np.array([0.05, -1.0, -1.0]), start + 1.0])
     SetpointGenerator(Settings()).begin(state, at_rest(start))
-    wanted = Wanted(target, state["orientation"], np.zeros(3), 0.0, torn=False, needs=False)
+    wanted = Wanted(target, state["orientation"], np.zeros(3), 0.0, is_ambiguous=False, needs_unseen_hand=False)
     for _ in range(1000):
         stage.step(state, frame, wanted, here, box, 1.0)
     np.testing.assert_allclose(state["setpoint"][0], start, atol=1e-3)
@@ -218,9 +218,9 @@ def test_a_setpoint_that_passed_a_bound_is_found() -> None:
     for what, row, value in (("speed", 1, 0.9), ("acceleration", 2, 10.1), ("jerk", 2, 1.0), ("position", 0, 9.0)):
         state["setpoint"] = before
         state["setpoint"][row, 0] = value
-        assert generator.why_wrong(state, before, BOX) == what
+        assert generator.name_of_broken_bound(state, before, BOX) == what
     state["setpoint"][0, 0] = np.nan
-    assert generator.why_wrong(state, before, BOX) == "not finite"
+    assert generator.name_of_broken_bound(state, before, BOX) == "not finite"
 
 
 # --- stops ------------------------------------------------------------

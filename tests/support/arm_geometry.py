@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.core.frame import Vector
+from service.core.separation import TABLE_DEPTH_M
 from service.core.separation.body import body_of
-from service.core.separation.tuning import TABLE_DEPTH_M
 from service.settings.config import Settings
 from service.settings.urdf import Urdf
 

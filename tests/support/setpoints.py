@@ -41,6 +41,6 @@ def driven(
     for target in targets:
         before = state["setpoint"].copy()
         said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
-        assert generator.why_wrong(state, before, BOX) == ""
+        assert generator.name_of_broken_bound(state, before, BOX) == ""
         out.append(state["setpoint"].copy())
     return np.array(out), np.array(said)

@@ -16,16 +16,8 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.arm.tuning import (
-    BOUND_ROUNDS,
-    CONSTRAINT_ROUNDS,
-    LEAST_BOUND_GAIN,
-    LEAST_EXCESS,
-    LEAST_FORCE,
-    LEAST_PIVOT,
-    LEAST_SLOPE,
-)
 from service.core.frame import Vector
+from service.core.numerics import BOUND_ROUNDS, CONSTRAINT_ROUNDS, LEAST_SLOPE, ROUNDING, TOLERANCE
 
 
 @compiled
@@ -38,7 +30,7 @@ def factorise(tasks: Vector, damping: float, root: Vector) -> None:
                 total += tasks[i, k] * tasks[j, k]
             for k in range(j):
                 total -= root[i, k] * root[j, k]
-            root[i, j] = math.sqrt(max(total, LEAST_PIVOT)) if i == j else total / root[j, j]
+            root[i, j] = math.sqrt(max(total, ROUNDING)) if i == j else total / root[j, j]
 
 
 @compiled
@@ -115,7 +107,7 @@ def least_squares(
             rest[i] = -wanted[i]
             for j in range(joints):
                 rest[i] += tasks[i, j] * result[j]
-        leaving, most = -1, LEAST_BOUND_GAIN  # the bound with the steepest descent to its inside
+        leaving, most = -1, ROUNDING  # the bound with the steepest descent to its inside
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
@@ -176,12 +168,12 @@ def keep_under(
 
     Returns True if x had to be changed.
     """
-    if _farthest(bounds, rows, limits, x, LEAST_EXCESS) < 0:
+    if _farthest(bounds, rows, limits, x, TOLERANCE) < 0:
         return False
-    _solve_under(tasks, wanted, posture, damping, bounds, rows, limits, x)
-    if len(limits) and limits.min() < 0.0 and _farthest(bounds, rows, limits, x, LEAST_EXCESS) >= 0:
+    _solve_with_rows(tasks, wanted, posture, damping, bounds, rows, limits, x)
+    if len(limits) and limits.min() < 0.0 and _farthest(bounds, rows, limits, x, TOLERANCE) >= 0:
         least = np.maximum(limits, 0.0)
-        _solve_under(tasks, wanted, posture, damping, bounds, rows, least, x)
+        _solve_with_rows(tasks, wanted, posture, damping, bounds, rows, least, x)
     share = _share_within(bounds, rows, limits, x)
     for j in range(len(x)):
         x[j] = min(max(share * x[j], bounds[0, j]), bounds[1, j])
@@ -189,7 +181,7 @@ def keep_under(
 
 
 @compiled
-def _solve_under(
+def _solve_with_rows(
     tasks: Vector,
     wanted: Vector,
     posture: Vector,
@@ -201,61 +193,68 @@ def _solve_under(
 ) -> None:
     """Solve the problem of the module, bounds as further rows, by a dual active-set method.
 
-    The method is that of Goldfarb and Idnani (Mathematical Programming 27, 1983): it starts from
-    the minimum without constraints, and adds the most violated one in each round. If not all can be
-    kept, it ends where it could not proceed.
+    The method is that of Goldfarb and Idnani (Mathematical Programming 27, 1983). It starts from
+    the minimum without constraints. In each round, the most violated constraint `entering` gets a
+    growing multiplier, which moves x along -direction and changes the multipliers of the active
+    constraints by -decrease. The step ends
+
+    * where the entering constraint is met (a full step): it becomes active; or
+    * where an active multiplier falls to 0 (a partial step): that constraint, `leaving`, is
+      dropped, and the entering one continues in the next round.
+
+    If neither is possible, not all constraints can be kept, and x remains where it is.
     """
     joints = len(x)
-    turned, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
+    transposed, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
     for j in range(joints):
         x[j] = damping * posture[j]
         for i in range(len(wanted)):
-            turned[j, i] = tasks[i, j]
+            transposed[j, i] = tasks[i, j]
             x[j] += tasks[i, j] * wanted[i]
-    factorise(turned, damping, root)
+    factorise(transposed, damping, root)
     substitute(root, x)
-    # active constraints: numbers, normals, normals times the inverse Hessian, multipliers
-    met, size, force = np.empty(joints, np.int64), 0, np.zeros(joints)
-    normals, moved = np.zeros((joints, joints)), np.zeros((joints, joints))
-    normal, way, yielding = np.empty(joints), np.empty(joints), np.empty(joints)
-    entering, pushed = -1, 0.0
+    # active constraints: multipliers, normals, and images, the normals times the inverse Hessian
+    active, multiplier, normals = 0, np.zeros(joints), np.zeros((joints, joints))
+    images = np.zeros((joints, joints))
+    normal, direction, decrease = np.empty(joints), np.empty(joints), np.empty(joints)
+    entering, entering_multiplier = -1, 0.0
     for _ in range(CONSTRAINT_ROUNDS):
         if entering < 0:
-            entering, pushed = _farthest(bounds, rows, limits, x, 0.1 * LEAST_EXCESS), 0.0
+            entering, entering_multiplier = _farthest(bounds, rows, limits, x, 0.1 * TOLERANCE), 0.0
             if entering < 0:
                 break
         limit = _constraint(entering, bounds, rows, limits, normal)
-        way[:] = normal
-        substitute(root, way)
-        _yield_to(way, normals, moved, size, yielding)
-        beyond, slope, leaving, step = -limit, 0.0, -1, math.inf
+        direction[:] = normal
+        substitute(root, direction)
+        _multiplier_decrease(direction, normals, images, active, decrease)
+        excess, slope, leaving, step = -limit, 0.0, -1, math.inf
         for j in range(joints):
-            for k in range(size):
-                way[j] -= yielding[k] * moved[k, j]
-            beyond += normal[j] * x[j]
-            slope += normal[j] * way[j]
-        for k in range(size):
-            if yielding[k] > LEAST_FORCE and force[k] < step * yielding[k]:
-                leaving, step = k, force[k] / yielding[k]
-        if slope > LEAST_SLOPE and size < joints and beyond <= step * slope:
-            leaving, step = -1, beyond / slope
+            for k in range(active):
+                direction[j] -= decrease[k] * images[k, j]
+            excess += normal[j] * x[j]
+            slope += normal[j] * direction[j]
+        for k in range(active):
+            if decrease[k] > ROUNDING and multiplier[k] < step * decrease[k]:
+                leaving, step = k, multiplier[k] / decrease[k]
+        if slope > LEAST_SLOPE and active < joints and excess <= step * slope:
+            leaving, step = -1, excess / slope
         elif leaving < 0:
             break  # not all constraints can be kept, or the rest is rounding
         if slope > LEAST_SLOPE:
             for j in range(joints):
-                x[j] -= step * way[j]
-        pushed += step
-        for k in range(size):
-            force[k] -= step * yielding[k]
+                x[j] -= step * direction[j]
+        entering_multiplier += step
+        for k in range(active):
+            multiplier[k] -= step * decrease[k]
         if leaving < 0:
-            met[size], normals[size], force[size] = entering, normal, pushed
-            moved[size] = normal
-            substitute(root, moved[size])
-            size, entering = size + 1, -1
+            normals[active], multiplier[active] = normal, entering_multiplier
+            images[active] = normal
+            substitute(root, images[active])
+            active, entering = active + 1, -1
         else:
-            size -= 1
-            for k in range(leaving, size):
-                met[k], force[k], normals[k], moved[k] = met[k + 1], force[k + 1], normals[k + 1], moved[k + 1]
+            active -= 1
+            for k in range(leaving, active):
+                multiplier[k], normals[k], images[k] = multiplier[k + 1], normals[k + 1], images[k + 1]
 
 
 @compiled
@@ -264,14 +263,14 @@ def _share_within(bounds: Vector, rows: Vector, limits: Vector, x: Vector) -> fl
     share = 1.0
     for j in range(len(x)):
         bound = bounds[1, j] if x[j] > 0.0 else bounds[0, j]
-        if abs(x[j]) > abs(bound) + LEAST_EXCESS:
+        if abs(x[j]) > abs(bound) + TOLERANCE:
             share = min(share, bound / x[j])
     for k in range(len(limits)):
         along = 0.0
         for j in range(len(x)):
             along += rows[k, j] * x[j]
         limit = max(limits[k], 0.0)
-        if along > limit + LEAST_EXCESS:
+        if along > limit + TOLERANCE:
             share = min(share, limit / along)
     return share
 
@@ -317,27 +316,27 @@ def _constraint(number: int, bounds: Vector, rows: Vector, limits: Vector, norma
 
 
 @compiled
-def _yield_to(way: Vector, normals: Vector, moved: Vector, size: int, out: Vector) -> None:
-    """Write into out (size,) the change of the active multipliers per unit of the entering one.
+def _multiplier_decrease(direction: Vector, normals: Vector, images: Vector, active: int, out: Vector) -> None:
+    """Write into out (active,) the change of the active multipliers per unit of the entering one.
 
-    With the active normals A (size, J), their images M = A H^-1, the direction `way` = H^-1 n of
-    the entering normal n, and H = tasks^T tasks + damping I:
+    With the active normals A (active, J), their images M = A H^-1, the direction H^-1 n of the
+    entering normal n, and H = tasks^T tasks + damping I:
 
-        out = (A M^T)^-1 A way
+        out = (A M^T)^-1 A direction
     """
-    root = np.empty((size, size))
-    right = np.empty(size)
-    for a in range(size):
+    root = np.empty((active, active))
+    right = np.empty(active)
+    for a in range(active):
         right[a] = 0.0
-        for j in range(len(way)):
-            right[a] += normals[a, j] * way[j]
+        for j in range(len(direction)):
+            right[a] += normals[a, j] * direction[j]
         for b in range(a + 1):
             total = 0.0
-            for j in range(len(way)):
-                total += normals[a, j] * moved[b, j]
+            for j in range(len(direction)):
+                total += normals[a, j] * images[b, j]
             for k in range(b):
                 total -= root[a, k] * root[b, k]
-            root[a, b] = math.sqrt(max(total, LEAST_PIVOT)) if a == b else total / root[b, b]
+            root[a, b] = math.sqrt(max(total, ROUNDING)) if a == b else total / root[b, b]
     substitute(root, right)
-    for a in range(size):
+    for a in range(active):
         out[a] = right[a]

@@ -15,11 +15,9 @@ from service.core.arm.tuning import (
     CONSTRAINED_SPEED_MPS,
     DAMPING_M2,
     FAR_DAMPING_S2,
-    MAX_JOINT_RAD,
     PLANNED_LIMIT_SHARES,
     POSITION_GAIN_PER_S,
     POSITION_GAIN_RATE_SHARE,
-    REFERENCE_REACH_M,
     SINGULAR_DAMPING_M2,
     SINGULAR_VOLUME_M3,
     SPARING_POWER,
@@ -33,8 +31,9 @@ from service.core.frame import Record, Vector, as_array, parameters, structured
 from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
+from service.core.numerics import MAX_JOINT_RAD
 from service.core.separation.stage import Separation
-from service.settings.config import Settings
+from service.settings.config import Reach, Settings
 from service.settings.urdf import Urdf
 
 
@@ -80,7 +79,7 @@ class Arm:
         tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
         self._tool = self._model.addFrame(tool)
         self._data = self._model.createData()
-        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / REFERENCE_REACH_M
+        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / Reach().outer
         closing = closing or Closing(
             CLOSING_BRAKE_SHARE * settings.tool.stop_acceleration, min(top, CLOSING_SPEED_MPS), FAR_DAMPING_S2
         )
@@ -96,7 +95,7 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
-            kept_speed=CONSTRAINED_SPEED_MPS,
+            constrained_speed=CONSTRAINED_SPEED_MPS,
             max_tool_speed=TOOL_SPEED_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
             position_gain=min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * rate),

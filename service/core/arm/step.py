@@ -16,14 +16,13 @@ from service.core.arm.least_squares import solve
 from service.core.arm.tuning import (
     FAR_SPEED_MPS,
     IDLE_BRAKE_SHARE,
-    MAX_ERROR_M,
     NEAR_LIMIT_RAD,
     POSTURE_GAIN_PER_S,
     POSTURE_SPEED_RADPS,
-    SPEED_ROUNDING_MPS,
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
+from service.core.numerics import MAX_ERROR_M, ROUNDING
 
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
@@ -130,7 +129,8 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         rate  = min(sqrt(2 B (|e| - B / 2g²)), closing_speed) / |e|       otherwise
 
     If a row changed the solution, the programme is solved again with more damping, by
-    singular_damping m / (m + kept_speed²), where m = |v - T x|² in the first three rows of T.
+    singular_damping m / (m + constrained_speed²), where m = |v - T x|² in the first three rows of
+    T.
 
     If no row changed it, and the joints cannot reach it soon (`_can_have`), `_turn_less` moves it
     toward the solution of the first three rows alone, in which idle joints brake.
@@ -164,11 +164,11 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     for i in range(count_of_tasks - 3):
         for k in range(3):
             wanted[3 + i] += arm.turn_lever * here.rotation[k, i] * turn[k]
-    said, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
+    flags, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
         if min(low, high) < NEAR_LIMIT_RAD * arm.per_rad[j]:
-            said |= NEAR
+            flags |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
         off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED_RADPS * arm.per_rad[j]
@@ -183,11 +183,11 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         for j in range(joints):
             rows[k, j] = constraints[k].row[j] * scale[j]
     velocity = out[0]
-    kept = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
-    if kept:
-        said |= SEPARATED
+    is_constrained = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
+    if is_constrained:
+        flags |= SEPARATED
         missing = _missing(scaled, wanted, velocity)
-        damping += arm.singular_damping * missing / (missing + arm.kept_speed * arm.kept_speed)
+        damping += arm.singular_damping * missing / (missing + arm.constrained_speed * arm.constrained_speed)
         solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
     near = _can_have(arms, goals, velocity)
     scaled[3:], wanted[3:] = 0.0, 0.0
@@ -197,7 +197,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
             brake = IDLE_BRAKE_SHARE * arm.period_s * arm.acceleration[j]
             home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
-        if not kept:  # a mixture of two solutions need not keep the rows as well as the first one
+        if not is_constrained:  # a mixture of two solutions need not keep the rows as well as the first one
             _turn_less(arms, goals, velocity, free)
     excess = _excess(arms, velocity)
     wanted[:3], home[:] = goal.acceleration, 0.0
@@ -209,7 +209,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
         for order in range(2):
             out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
-    return said | SPEED if excess > 1.0 + SPEED_ROUNDING_MPS else said
+    return flags | SPEED if excess > 1.0 + ROUNDING else flags
 
 
 @compiled

@@ -41,7 +41,8 @@ class Decision:
 
     def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
         """Determine mode and reason of this tick from the arm's kinematics `here` (1,) and `known`,
-        flags of `codes.Known`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if the arm starts.
+        flags of `codes.Condition`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if the arm
+        starts.
 
         `gate_m` [m] is compared with the skill's `threshold` [m]; it is NaN if the skill predicts
         nothing.

@@ -45,7 +45,6 @@ from service.core.decision.tuning import (
     PROGRESS_SPEED_SHARE,
     STUCK_GAP_M,
     STUCK_S,
-    STUCK_TARGET_M,
     TOO_FAST_S,
     WAY_TIMEOUT_S,
 )
@@ -125,8 +124,8 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
     """
-    state, given, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & ARM_INSIDE
-    if given.is_assumed:
+    state, config, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & ARM_INSIDE
+    if config.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
         return starts, NONE, -1.0, -1.0
@@ -151,14 +150,14 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
         if moving:
             state.stuck_tick = state.tick
-        if not inside or (state.tick - state.stuck_tick) * given.period_s > FREED_TIMEOUT_S:
+        if not inside or (state.tick - state.stuck_tick) * config.period_s > FREED_TIMEOUT_S:
             state.arm_ready, state.leaves = READY, 0
     error, speed = measured_error(states, heres, parameters)
-    if error > given.max_error_rad:
+    if error > config.max_error_rad:
         return 0, ARM_ERROR, error, speed
-    if speed <= given.fault_speed:
+    if speed <= config.fault_speed:
         state.slow_tick = state.tick
-    fault = TOOL_SPEED if (state.tick - state.slow_tick) * given.period_s > TOO_FAST_S else NONE
+    fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > TOO_FAST_S else NONE
     return 0, fault, error, speed
 
 
@@ -173,19 +172,19 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
     and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
     anew; so they are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved by
-    more than STUCK_TARGET_M.
+    more than that.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
     ANOTHER_TARGET_M.
     """
-    state, frame, tool, given = states[0], frames[0], heres[0].position, parameters[0]
+    state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
     gap = moved = 0.0
     for i in range(3):
         gap += (frame.target[i] - tool[i]) ** 2
         moved += (frame.target[i] - state.stuck_target[i]) ** 2
     gap, moved = math.sqrt(gap), math.sqrt(moved)
-    passed_s = (state.tick - state.stuck_tick) * given.period_s
+    passed_s = (state.tick - state.stuck_tick) * config.period_s
     if state.way_next < state.way_count and passed_s < WAY_TIMEOUT_S:
         return HELD
     if state.stuck == HELD and not state.way_count and moved < ANOTHER_TARGET_M:
@@ -194,8 +193,8 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     if state.stuck == NOTICED:
         least = FREED_SHARE * state.stuck_gap
     else:
-        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * given.max_speed * STUCK_S)
-    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_TARGET_M:
+        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * config.max_speed * STUCK_S)
+    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_GAP_M:
         state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
         return 0
     return NOTICED if passed_s >= STUCK_S else 0

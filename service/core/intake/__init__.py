@@ -53,7 +53,7 @@ STATE = (
     Field("measured_velocities", "float64", (PER_JOINT,)),
     Field("kept_late", "int32", (2, KEPT)),  # ticks between making and arrival of each sample
     Field("rejected", "uint32", (len(Cause),)),  # rejected samples by cause, since start
-    Field("clock", "uint8", (2,)),  # LEARNING, DOUBTED or BELIEVED: trust in a tracker's clock
+    Field("clock", "uint8", (2,)),  # `codes.ClockTrust`: trust in a tracker's clock
     Field("kept_restarts", "uint8", (2, KEPT)),  # 1: the filter started anew with this sample
     Field("other_returns", "uint8", (2,)),  # 1: the newest sample that jumped is of a second source
     Field("jump_is_swap", "uint8", (2,)),  # 1: the hand jumped to where the other one had been

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 
 from service.contract.incidents import figures
 from service.core.intake.stage import UNIT_M
-from service.core.intake.tuning import MAX_HAND_DISTANCE_M, PLAUSIBLE_DISTANCES_M
+from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+
+PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the base plate, in the unit that was meant
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:

@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.codes import DOUBTED, LEARNING, TRUSTED
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
 from service.core.intake import KEPT, MODES
@@ -30,15 +31,14 @@ from service.core.intake.tuning import (
     LONE_SAMPLE_S,
     MAX_LATE_S,
     MAX_NOISE_M,
-    MAX_STAMP_DIFFERENCE_NS,
-    MODE_INTENSITIES,
+    MODE_INTENSITIES_M2PS5,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     REAPPEARED_VARIANCE_SHARE,
     STILLNESS_FALL_S,
     STILLNESS_LOWPASS_S,
-    TICK_ROUNDING,
 )
+from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from service.settings.config import HandSettings
 
 STILL = np.ones(2)  # stillness of two hands that rest
@@ -81,9 +81,6 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
             stillness[side] = stillness_after(velocity[side], changes, speed, lowpass[side], stillness[side])
         row[:] = stillness
     return out
-
-
-LEARNING, DOUBTED, BELIEVED = 0, 1, 2  # a tracker's clock: in its first window, not trusted, trusted
 
 
 class HandEstimator:
@@ -227,7 +224,7 @@ def _response_s(states: Records, period_s: float) -> float:
         if more > 0:
             passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
             each_s = min(passed * period_s / more, MAX_LATE_S)
-            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES[CHANGE])
+            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES_M2PS5[CHANGE])
     return float(np.rint(slowest ** (1.0 / 6.0) * ROUND_TO) / ROUND_TO)
 
 
@@ -275,7 +272,7 @@ def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> in
     """Whole ticks by which a sample's delay exceeds the smaller minimum delay of the last two
     windows, at most MAX_LATE_S; 0 while the tracker's clock is not trusted.
     """
-    if states[0].clock[side] != BELIEVED:
+    if states[0].clock[side] != TRUSTED:
         return 0
     late_s = max(_later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s))
     return int(min(max(late_s, 0.0), MAX_LATE_S) / period_s + TICK_ROUNDING)
@@ -300,7 +297,7 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
     elif (state.tick - state.clock_tick[side]) * period_s >= DELAY_WINDOW_S:
         apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
         steady = abs(apart_s) <= DELAY_TOLERANCE_S and state.clock[side] != LEARNING
-        state.clock[side] = BELIEVED if steady else DOUBTED
+        state.clock[side] = TRUSTED if steady else DOUBTED
         stamps[1], ticks[1] = stamps[0], ticks[0]
         stamps[0], ticks[0] = stamp_ns, state.tick
         state.clock_tick[side] = state.tick

@@ -17,11 +17,13 @@ from __future__ import annotations
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.codes import TRUSTED
 from service.core.frame import Record, Records, Vector
 from service.core.intake import KEPT
-from service.core.intake.hand_estimator import BELIEVED, filter_in, look_ahead, order_of, seconds_after, slot
+from service.core.intake.hand_estimator import filter_in, look_ahead, order_of, seconds_after, slot
 from service.core.intake.mode_filter import advance
-from service.core.intake.tuning import LONE_SAMPLE_S, TICK_ROUNDING
+from service.core.intake.tuning import LONE_SAMPLE_S
+from service.core.numerics import TICK_ROUNDING
 
 
 @compiled
@@ -36,7 +38,7 @@ def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, 
     tick = state.tick - late
     if order > 0:
         behind = slot(states, side, order - 1)
-        if state.clock[side] != BELIEVED:
+        if state.clock[side] != TRUSTED:
             passed_s = seconds_after(state.kept_stamps_ns[side, slot(states, side, 0)], stamp_ns)
             tick = state.kept_ticks[side, slot(states, side, 0)] - int(passed_s / period_s + TICK_ROUNDING)
         tick = min(tick, state.kept_ticks[side, behind])
@@ -110,7 +112,7 @@ def take_late(
     ones are then filtered in the order of their stamps, and the filter is advanced to the current
     tick. If the sample `restarts` the filter (a confirmed jump), it starts from this sample alone.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     order, kept = order_of(states, side, stamp_ns), state.kept[side]
     means, covariances = state.mode_means[side], state.mode_covariances[side]
     if kept > 0:
@@ -124,7 +126,7 @@ def take_late(
         anew = first or state.kept_restarts[side, at] > 0
         if not anew:
             _move_on(means, covariances, models, ticks)
-        filter_in(states, side, at, LONE_SAMPLE_S if first else ticks * given.period_s, anew)
+        filter_in(states, side, at, LONE_SAMPLE_S if first else ticks * config.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _move_on(means, covariances, models, ticks)
     look_ahead(states, models, side)
@@ -154,7 +156,7 @@ def lateness_ms(state: Record, side: int, period_s: float) -> tuple[float, float
     """Delay of a hand's retained samples above the minimum delay, mean and 95th percentile [ms];
     None while the tracker's clock is not trusted.
     """
-    if state["clock"][side] != BELIEVED or not state["kept"][side]:
+    if state["clock"][side] != TRUSTED or not state["kept"][side]:
         return None
     newest = (int(state["kept_newest"][side]) - np.arange(int(state["kept"][side]))) % KEPT
     late_ms = 1e3 * period_s * state["kept_late"][side][newest]

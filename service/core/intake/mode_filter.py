@@ -34,7 +34,6 @@ from service.core.intake.tuning import (
     MAX_TREMOR_M,
     MODE_PRIOR,
     MODE_SWITCH_RATES_PER_S,
-    PROBABILITY_ROUND_TO,
     REST_ACCELERATION_STD_MPS2,
     REST_MAX_SPEED_MPS,
     REST_SPEED_STD_MPS,
@@ -43,6 +42,7 @@ from service.core.intake.tuning import (
     TREMOR_RATE_PER_S,
     TREMOR_STDS_M,
 )
+from service.core.numerics import PROBABILITY_ROUND_TO
 
 
 @compiled

@@ -8,9 +8,9 @@ and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each o
     dy = w dt,   dw = (-ω² y - 2 ζ ω w) dt + sqrt(4 ζ ω³ σ²) dW2
 
 Velocity and acceleration revert to zero by k_v (MODE_VELOCITY_REVERSIONS_PER_S2) and k_a
-(MODE_ACCELERATION_REVERSIONS_PER_S); q is MODE_INTENSITIES [m²/s⁵]. These three and the tremor's
-stationary standard deviation σ (TREMOR_STDS_M) differ between the modes; ω = TREMOR_RATE_PER_S and
-ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
+(MODE_ACCELERATION_REVERSIONS_PER_S); q is MODE_INTENSITIES_M2PS5 [m²/s⁵]. These three and the
+tremor's stationary standard deviation σ (TREMOR_STDS_M) differ between the modes; ω =
+TREMOR_RATE_PER_S and ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
 
 The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
 sample, a hand that reaches or changes keeps its velocity while its acceleration fades. The
@@ -29,7 +29,7 @@ from service.core.intake import MODES, STATES
 from service.core.intake.tuning import (
     ACCELERATION_FADE_PER_S,
     MODE_ACCELERATION_REVERSIONS_PER_S,
-    MODE_INTENSITIES,
+    MODE_INTENSITIES_M2PS5,
     MODE_VELOCITY_REVERSIONS_PER_S2,
     TREMOR_DAMPING,
     TREMOR_RATE_PER_S,
@@ -82,7 +82,7 @@ def model(interval_s: float) -> tuple[Vector, Vector]:
         moves, driving = _over(
             _motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], MODE_ACCELERATION_REVERSIONS_PER_S[mode]), interval_s
         )
-        transition[mode, motion, motion], noise[mode, motion, motion] = moves, MODE_INTENSITIES[mode] * driving
+        transition[mode, motion, motion], noise[mode, motion, motion] = moves, MODE_INTENSITIES_M2PS5[mode] * driving
         transition[mode, tremor, tremor] = trembles
         noise[mode, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S**3 * TREMOR_STDS_M[mode] ** 2 * driven
     return transition, noise

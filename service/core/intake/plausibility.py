@@ -27,6 +27,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import slot
 from service.core.intake.tuning import (
@@ -41,7 +42,6 @@ from service.core.intake.tuning import (
     SOURCES_APART_M,
     SWAPPED_M,
     SWAPPED_MPS,
-    TO_AND_FRO_PATTERNS,
 )
 
 
@@ -54,11 +54,13 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
     `stale_ticks` old. Between the two, a sample was accepted; in a row of successive jumps, the
     decision about the first one holds for all.
     """
-    state, given, offset = states[0], parameters[0], position - expected
+    state, config, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
-    far = _distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * given.period_s
+    far = (
+        _distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * config.period_s
+    )
     in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
-    returns = passed < given.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
+    returns = passed < config.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
     state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
     state.other_offset[side, :], state.other_returns[side] = offset, returns
     return bool(returns)
@@ -72,14 +74,14 @@ def is_swapped(states: Records, parameters: Records, side: int, position: Vector
     After a silence shorter than `swapped_s`, the sample is the other hand's if it is where that one
     was (`_is_at_other`). Later samples that continue it are rejected until `swapped_s` has passed.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
-    if is_swap and (state.tick - state.jump_first_tick[side]) * given.period_s >= given.swapped_s:
+    if is_swap and (state.tick - state.jump_first_tick[side]) * config.period_s >= config.swapped_s:
         return False
     if is_swap and _goes_on(states, parameters, side, position):
         return True
     silent = state.tick - seen
-    lately = given.stale_ticks <= silent and silent * given.period_s < given.swapped_s
+    lately = config.stale_ticks <= silent and silent * config.period_s < config.swapped_s
     return bool(seen >= 0 and lately and _is_at_other(states, parameters, side, position))
 
 
@@ -91,7 +93,7 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     Accepted are at least CONFIRMED_SAMPLES samples that agree over CONFIRMED_S; over `swapped_s` if
     the hand jumped to where the other one was, and that one has not been seen since.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
         state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
     state.jumped_to[side, :] = position
@@ -101,8 +103,8 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     unseen = state.hand_ticks[1 - side] < first
     if count > 1 and unseen and _is_at_other(states, parameters, side, position):
         state.jump_is_swap[side] = 1
-    enough_s = given.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
-    return bool(count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * given.period_s >= enough_s)
+    enough_s = config.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
+    return bool(count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * config.period_s >= enough_s)
 
 
 @compiled
@@ -113,10 +115,10 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     Near is within SWAPPED_M + SWAPPED_MPS * the time since the other hand was seen, at most
     `swapped_s`.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * given.period_s, given.swapped_s)
+    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * config.period_s, config.swapped_s)
     return bool(seen >= 0 and _distance(position, there) < min(near, 0.5 * _distance(here, there)))
 
 
@@ -125,10 +127,10 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
     """True if a sample (3,) [m] agrees with the newest sample that jumped: it is less than
     `stale_ticks` later and within AGREE_M + AGREE_MPS * elapsed time.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * given.period_s
-    return bool(passed < given.stale_ticks and near)
+    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * config.period_s
+    return bool(passed < config.stale_ticks and near)
 
 
 @compiled
@@ -163,25 +165,26 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
     """True if four samples alternate between two positions: a new one (3,) [m], and the three
     before it, whose newest has number `order`. Their intervals may be uneven.
 
-    For one of the TO_AND_FRO_PATTERNS, which assign the samples to two sources, samples of
-    different sources are at least SOURCES_APART_M apart, and those of one source differ by at most
+    For one of the ALTERNATIONS, which assign the samples to two sources, samples of different
+    sources are at least SOURCES_APART_M apart, and those of one source differ by at most
     SOURCE_SPREAD_SHARE of the smallest distance between the sources. A pattern with one sample of
     the second source also requires that this source was seen before (`_returns`).
     """
     samples = np.empty((4, 3))
     samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
-    for places in TO_AND_FRO_PATTERNS:
+    for sources in ALTERNATIONS:
         within, apart = 0.0, np.inf
         for i in range(4):
             for j in range(i):
                 square = 0.0
                 for axis in range(3):
                     square += (samples[i, axis] - samples[j, axis]) ** 2
-                if (places >> i) & 1 == (places >> j) & 1:
+                if (sources >> i) & 1 == (sources >> j) & 1:
                     within = max(within, square)
                 else:
                     apart = min(apart, square)
         if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
-            odd = 1 if places == 0b0010 else 2 if places == 0b0100 else 0  # index of the second source's only sample
+            # index of the second source's only sample; 0 if it has two
+            odd = 1 if sources == SECOND_NEWEST else 2 if sources == THIRD_NEWEST else 0
             return odd == 0 or _returns(states, side, order + odd - 1, samples[odd] - samples[0])
     return False

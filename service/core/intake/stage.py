@@ -100,7 +100,7 @@ class Intake:
 
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
         """Advance the state by some ticks and take the samples in. Returns the flags of
-        `codes.Known` that `step.report` lists.
+        `codes.Condition` that `step.report` lists.
         """
         self.advance(state, ticks)
         for event in samples:

@@ -108,8 +108,8 @@ def has_jumped(
 
     `interval_s` is the time since the sample from which p was predicted.
     """
-    state, given = states[0], parameters[0]
-    gate = max(given.jump + given.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
+    state, config = states[0], parameters[0]
+    gate = max(config.jump + config.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
     off = 0.0
     for axis in range(3):
         off += (position[axis] - expected[axis]) ** 2
@@ -140,10 +140,10 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     """Store a sample of the arm's joints (J,) [rad, rad/s] in the state; compiled part of
     `Intake.take_arm`. Returns the cause for which it was rejected, or -1.
     """
-    state, given = states[0], parameters[0]
+    state, config = states[0], parameters[0]
     passed = state.tick - state.arm_tick
-    passed_s, silent_s = passed * given.period_s, given.silent_ticks * given.period_s
-    fresh = state.arm_tick >= 0 and passed < given.silent_ticks
+    passed_s, silent_s = passed * config.period_s, config.silent_ticks * config.period_s
+    fresh = state.arm_tick >= 0 and passed < config.silent_ticks
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
         return NOT_FINITE
@@ -156,8 +156,8 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     if near:
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
-        jumped = fresh and off > JOINT_JUMP_RAD + given.joint_jump_speed * passed_s
-        note(states, ARM, jumped, given.period_s)
+        jumped = fresh and off > JOINT_JUMP_RAD + config.joint_jump_speed * passed_s
+        note(states, ARM, jumped, config.period_s)
         if jumped and cause < 0:
             cause = JUMPED
     if near and (moved > ARM_STILL_RAD or not fresh):
@@ -188,7 +188,7 @@ def take_hand(
     `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
     `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
-    state, given, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
+    state, config, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
     for k in range(4):
         norm += turn[k] * turn[k]
     for i in range(3):
@@ -196,7 +196,7 @@ def take_hand(
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
-    stale_ticks, period_s = given.stale_ticks, given.period_s
+    stale_ticks, period_s = config.stale_ticks, config.period_s
     since = state.tick - state.hand_ticks[side]
     fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
     jumped, cause, order, made = False, -1, 0, state.tick
@@ -210,7 +210,7 @@ def take_hand(
         newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
         cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, MAX_LATE_S)
         if cause < 0:
-            if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, given.unseen_ticks)):
+            if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, config.unseen_ticks)):
                 state.kept[side] = 0
             elif fresh and stamp_ns < newest_ns:
                 order = order_of(states, side, stamp_ns)
@@ -259,10 +259,10 @@ def take_hand(
 
 @compiled
 def report(states: Records, frames: Records, parameters: Records) -> int:
-    """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Known` that
-    the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL, CONTESTED.
+    """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Condition`
+    that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL, CONTESTED.
     """
-    frame, state, given = frames[0], states[0], parameters[0]
+    frame, state, config = frames[0], states[0], parameters[0]
     left, right = state.hand_ticks[0], state.hand_ticks[1]
     if left == right:
         frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
@@ -275,13 +275,13 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
     known, least, most = 0, frame.hand_ages.min(), frame.hand_ages.max()
-    if 0 <= least < given.stale_ticks and most < given.unseen_ticks:
+    if 0 <= least < config.stale_ticks and most < config.unseen_ticks:
         known = HANDS_KNOWN
-        if most >= given.stale_ticks:
+        if most >= config.stale_ticks:
             known |= UNSEEN[0 if frame.hand_ages[0] == most else 1]
-    if state.arm_tick >= 0 and state.tick - state.arm_tick < given.silent_ticks:
+    if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
         known |= ARM_HEARD
-        if state.tick - state.arm_still_tick >= given.still_ticks:
+        if state.tick - state.arm_still_tick >= config.still_ticks:
             known |= ARM_STILL
     contested = is_contested(states, state.reason == TWO_SOURCES)
     return known | CONTESTED if contested else known

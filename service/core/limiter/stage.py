@@ -172,14 +172,14 @@ class Moved(NamedTuple):
     """Result of a step of the stage.
 
     `here`: kinematics at the new joints. `limited`: a limit kept the joints from the wanted
-    velocities. `separated`: this limit was separation. `too_fast`: speed of the tool [m/s] if it
-    exceeds max_speed, else 0. `moving`: the joints moved before the step.
+    velocities. `separated`: this limit was separation. `excess_speed`: speed of the tool
+    [m/s] if it exceeds max_speed, else 0. `moving`: the joints moved before the step.
     """
 
     here: Kinematics
     limited: bool
     separated: bool
-    too_fast: float
+    excess_speed: float
     moving: bool
 
 
@@ -206,7 +206,7 @@ class LimiterStage:
 
         If the tool would come too near its speed limit, in the step or in the stop after it, the
         joints stop. If the tool exceeds its limit in this stop, its speed is reported as
-        `too_fast`.
+        `excess_speed`.
         """
         q, dq, ddq = state["joints"]
         moved = self._limiter.step(q, dq, ddq, wanted, ramp)
@@ -220,14 +220,14 @@ class LimiterStage:
                 other = self._limiter.step(q, dq, ddq, separation.less(dq, moved[1:3]))
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
-        here, too_fast = self._arm.at(moved.position), 0.0
-        if self._comes_to(moved, here) > STOP_SPEED_SHARE * self._max_speed:
+        here, excess_speed = self._arm.at(moved.position), 0.0
+        if self._largest_speed_in_stop(moved, here) > STOP_SPEED_SHARE * self._max_speed:
             moved, limited = self._limiter.stop(q, dq, ddq), True
             here = self._arm.at(moved.position)
             speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
-            too_fast = speed if speed > self._max_speed else 0.0
+            excess_speed = speed if speed > self._max_speed else 0.0
         moving = take(as_array(state), as_array(frame), here.record, *moved[:3])
-        return Moved(here, limited, separated, too_fast, moving)
+        return Moved(here, limited, separated, excess_speed, moving)
 
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
         """Move the joints one period further in a stop.
@@ -243,13 +243,13 @@ class LimiterStage:
             other = self._limiter.step(q, dq, ddq, self._still)
             if separation.excess(*other[1:3]) < excess:
                 there = self._arm.at(other.position)
-                speed = self._comes_to(other, there)
-                if speed <= self._max_speed or speed <= self._comes_to(moved, here):
+                speed = self._largest_speed_in_stop(other, there)
+                if speed <= self._max_speed or speed <= self._largest_speed_in_stop(moved, here):
                     moved, here = other, there
         moving = take(as_array(state), as_array(frame), here.record, *moved[:3])
-        return Moved(here, limited=False, separated=False, too_fast=0.0, moving=moving)
+        return Moved(here, limited=False, separated=False, excess_speed=0.0, moving=moving)
 
-    def _comes_to(self, moved: Limited, here: Kinematics) -> float:
+    def _largest_speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
         """Largest speed [m/s] of the tool if the joints stop after the step `moved`.
 
         The stop is sampled only if the tool may exceed its limit there:

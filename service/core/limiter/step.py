@@ -11,7 +11,8 @@ from service.core.codes import FAULT
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of
 from service.core.kinematics import tool_speed_after
-from service.core.limiter.tuning import INSIDE_LIMIT_SHARE, LARGEST_USABLE, LEAST_CHANGE_RADPS, STOP_SAMPLES
+from service.core.limiter.tuning import STOP_SAMPLES
+from service.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING
 from service.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited
@@ -43,43 +44,44 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
         lowest  = max(-max_velocity, approach_gain min(lower - q, 0))
         highest = min( max_velocity, approach_gain max(upper - q, 0))
         aim     = u, limited to lowest ... highest
-        ramp    = r, limited to ± min(max_acceleration, sqrt(2 max_jerk room))
+        ramp    = r, limited to ± min(max_acceleration, sqrt(2 max_jerk margin))
         a' = (aim - v) / dt,    jerk = (a' - a) / dt
         v' = v + dt (a + a') / 2
         q' = q + dt v + dt² (a / 3 + a' / 6)
 
-    room is the distance of aim from `highest` (from `lowest` for a negative ramp). `wanted` (2, J)
-    receives aim and ramp; `moved` (3, J) receives q', v', a', or NaN where jerk, acceleration,
-    speed, or the speed once a' has been brought to 0, exceed a limit (CHASED). Outside of the
-    position limits that speed must point inward. A NaN among u or r requests a stop of all joints.
+    margin is the distance [rad/s] of aim from `highest` (from `lowest` for a negative ramp).
+    `wanted` (2, J) receives aim and ramp; `moved` (3, J) receives q', v', a', or NaN where jerk,
+    acceleration, speed, or the speed once a' has been brought to 0, exceed a limit (CHASED).
+    Outside of the position limits that speed must point inward. A NaN among u or r requests a stop
+    of all joints.
 
     A smooth input passes without lag: on a ramp, a' = a and v' = aim. A time-optimal profile that
     ends without acceleration would lag behind it by acceleration² / 2 jerk.
     """
-    given, met, stopping = parameters[0], 0, False
-    dt = given.period_s
+    config, met, stopping = parameters[0], 0, False
+    dt = config.period_s
     for i in range(len(velocity)):
         stopping = stopping or math.isnan(velocity[i]) or math.isnan(wanted[1, i])
     for i in range(len(velocity)):
         q, v, a = state[0, i], state[1, i], state[2, i]
-        top, max_jerk = given.max_velocity[i], given.max_jerk[i]
-        highest = min(top, given.approach_gain[i] * max(given.upper[i] - q, 0.0))
-        lowest = max(-top, given.approach_gain[i] * min(given.lower[i] - q, 0.0))
+        top, max_jerk = config.max_velocity[i], config.max_jerk[i]
+        highest = min(top, config.approach_gain[i] * max(config.upper[i] - q, 0.0))
+        lowest = max(-top, config.approach_gain[i] * min(config.lower[i] - q, 0.0))
         aim = 0.0 if stopping else min(max(velocity[i], lowest), highest)
         if aim != velocity[i]:
             met |= BOUNDED
         ramp = 0.0 if stopping else wanted[1, i]
-        room = aim - lowest if ramp < 0.0 else highest - aim
-        most = min(INSIDE_LIMIT_SHARE * given.max_acceleration[i], math.sqrt(2.0 * max_jerk * room))
+        margin = aim - lowest if ramp < 0.0 else highest - aim
+        most = min(INSIDE_LIMIT_SHARE * config.max_acceleration[i], math.sqrt(2.0 * max_jerk * margin))
         wanted[0, i], wanted[1, i] = aim, min(max(ramp, -most), most)
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
         crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # speed once the acceleration is 0
-        outside = int(q > given.upper[i]) - int(q < given.lower[i])
+        outside = int(q > config.upper[i]) - int(q < config.lower[i])
         if (
             outside * crest <= 0.0
             and abs(acceleration - a) <= max_jerk * dt
-            and abs(acceleration) <= given.max_acceleration[i]
+            and abs(acceleration) <= config.max_acceleration[i]
             and max(abs(v_then), abs(crest)) <= top
         ):
             moved[0, i] = q + dt * (v + dt * (a / 3.0 + acceleration / 6.0))
@@ -97,11 +99,11 @@ def forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
     The velocity counts at the end of the period, on average over it, and once the acceleration has
     been brought to 0.
     """
-    given, found = parameters[0], False
+    config, found = parameters[0], False
     for i in range(moved.shape[1]):
-        v, a, on_the_way = moved[1, i], moved[2, i], (moved[0, i] - state[0, i]) / given.period_s
-        crest = v + a * abs(a) / (2.0 * given.max_jerk[i])
-        if max(abs(v), abs(crest), abs(on_the_way)) > given.max_velocity[i]:
+        v, a, on_the_way = moved[1, i], moved[2, i], (moved[0, i] - state[0, i]) / config.period_s
+        crest = v + a * abs(a) / (2.0 * config.max_jerk[i])
+        if max(abs(v), abs(crest), abs(on_the_way)) > config.max_velocity[i]:
             found = True
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
     return found
@@ -119,16 +121,16 @@ def common_share(state: Vector, parameters: Records) -> float:
 
     and 0 <= share <= 1.
     """
-    given, least, most = parameters[0], 0.0, 1.0
-    dt = given.period_s
+    config, least, most = parameters[0], 0.0, 1.0
+    dt = config.period_s
     for i in range(state.shape[1]):
-        way, change = state[3, i] - state[1, i], INSIDE_LIMIT_SHARE * dt * given.max_jerk[i]
-        a = state[2, i] if way >= 0.0 else -state[2, i]
-        way = max(abs(way), LEAST_CHANGE_RADPS)
-        least = max(least, (a - change) * dt / way)
-        most = min(most, min(a + change, INSIDE_LIMIT_SHARE * given.max_acceleration[i]) * dt / way)
-        bend, left = way / (2.0 * change * dt), max(1.0 - 0.5 * dt * a / way, 0.0)
-        most = min(most, (math.sqrt(0.25 + 4.0 * bend * left) - 0.5) / (2.0 * bend))
+        change, jerk_change = state[3, i] - state[1, i], INSIDE_LIMIT_SHARE * dt * config.max_jerk[i]
+        a = state[2, i] if change >= 0.0 else -state[2, i]
+        change = max(abs(change), ROUNDING)
+        least = max(least, (a - jerk_change) * dt / change)
+        most = min(most, min(a + jerk_change, INSIDE_LIMIT_SHARE * config.max_acceleration[i]) * dt / change)
+        curvature, left = change / (2.0 * jerk_change * dt), max(1.0 - 0.5 * dt * a / change, 0.0)
+        most = min(most, (math.sqrt(0.25 + 4.0 * curvature * left) - 0.5) / (2.0 * curvature))
     return max(least, most) if most >= INSIDE_LIMIT_SHARE * least else -1.0
 
 
@@ -142,15 +144,15 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
 
     Returns True if no joint was replaced.
     """
-    given, safe, stop = parameters[0], True, np.empty(6)
-    dt = given.period_s
+    config, safe, stop = parameters[0], True, np.empty(6)
+    dt = config.period_s
     for i in range(moved.shape[1]):
         moved[0, i] = np.rint(moved[0, i] * ROUND_TO) / ROUND_TO
-        fastest_stop(moved[1, i], moved[2, i], given.max_acceleration[i], given.max_jerk[i], dt, stop)
-        lowest, highest = min(given.lower[i], state[0, i]), max(given.upper[i], state[0, i])
+        fastest_stop(moved[1, i], moved[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop)
+        lowest, highest = min(config.lower[i], state[0, i]), max(config.upper[i], state[0, i])
         if not (moved[0, i] + stop[3] >= lowest and moved[0, i] + stop[4] <= highest):
             safe = False
-            fastest_stop(state[1, i], state[2, i], given.max_acceleration[i], given.max_jerk[i], dt, stop)
+            fastest_stop(state[1, i], state[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop)
             moved[0, i] = np.rint((state[0, i] + stop[2]) * ROUND_TO) / ROUND_TO
             moved[1, i], moved[2, i] = stop[0], stop[1]
     return safe
@@ -174,19 +176,19 @@ def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) 
 
     The times are dense at the beginning, where the joints end their accelerations.
     """
-    given, joints = parameters[0], len(dq)
-    braking, stop, way, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
-    braking_together(dq, ddq, given.max_acceleration, given.max_jerk, braking)
+    config, joints = parameters[0], len(dq)
+    braking, stop, displacement, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
+    braking_together(dq, ddq, config.max_acceleration, config.max_jerk, braking)
     duration = most = 0.0
     for j in range(joints):
-        fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], 0.0, stop)
+        fastest_stop(dq[j], ddq[j], braking[j], config.max_jerk[j], 0.0, stop)
         duration = max(duration, stop[5])
     for sample in range(1, STOP_SAMPLES):
         for j in range(joints):
             time = duration * (sample / STOP_SAMPLES) ** 2
-            fastest_stop(dq[j], ddq[j], braking[j], given.max_jerk[j], time, stop)
-            speed[j], way[j] = stop[0], stop[2]
-        most = max(most, tool_speed_after(heres, way, speed))
+            fastest_stop(dq[j], ddq[j], braking[j], config.max_jerk[j], time, stop)
+            speed[j], displacement[j] = stop[0], stop[2]
+        most = max(most, tool_speed_after(heres, displacement, speed))
     return most
 
 

@@ -1,12 +1,17 @@
-"""Tuned and numerical constants of the limiter."""
+"""Tuned numbers of the limiter.
+
+docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+range of sensible values, and what more and less of it are expected to do. A number without that
+line follows from others.
+"""
 
 from __future__ import annotations
 
-LARGEST_USABLE = 1e6  # a state with a larger number is rejected
+# 8 to 64. More: a fast stop is found surely. Less: ticks are cheaper.
 STOP_SAMPLES = 16  # the tool's speed is checked at 15 times, which divide the stop into 16 parts
+# 0.9 to 1. More: the tool may move faster. Less: joints stop earlier.
 STOP_SPEED_SHARE = 0.99  # the joints stop when the tool's speed in a stop would exceed this share of max_speed
 # Joints end their accelerations at different times in a stop, so their motions cancel less of each
 # other: the tool gains at most this share of the sum of what they contribute (0.16 seen).
-CANCELLED_MOTION_SHARE = 0.3
-LEAST_CHANGE_RADPS = 1e-12  # a smaller change of a velocity is rounding
-INSIDE_LIMIT_SHARE = 1.0 - 1e-9  # limits are planned with this share, so that rounding does not break them
+# 0.16 to 1. More: more stops are checked. Less: ticks are cheaper.
+CANCELLED_MOTION_SHARE = 0.3  # share of the joints' contributions that may cancel

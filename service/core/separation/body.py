@@ -15,7 +15,8 @@ import numpy as np
 
 from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
-from service.core.separation.tuning import CAPSULE_EXCESS_M, CAPSULE_FITS, LEAST_TOOL_M, OWN_CLEARANCE_M, UNMOVED_M
+from service.core.numerics import CAPSULE_FITS, TOLERANCE
+from service.core.separation.tuning import CAPSULE_EXCESS_M, LEAST_TOOL_M, OWN_CLEARANCE_M
 from service.settings.config import Settings
 from service.settings.urdf import Joint, Shape, Urdf
 
@@ -88,7 +89,7 @@ def body_of(settings: Settings, description: str) -> Body:
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
             over = CAPSULE_EXCESS_M if meshes and links[j] - links[i] == 2 else 0.0
-            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > UNMOVED_M:
+            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > TOLERANCE:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 

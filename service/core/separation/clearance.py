@@ -7,9 +7,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, nearest_to_box, place, to_box
-from service.core.separation.tuning import FARTHEST_REPORTED_M
+from service.core.separation import FARTHEST_REPORTED_M
 
-PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s`, `clearance` and `room`
+PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s` and `clearance`
 NEAR_HAND, NEAR_ITSELF = -1, -2  # the nearest object, if it is not a box; boxes are numbered from 0
 NOBODY = np.empty((0, 3))  # no hands
 
@@ -22,26 +22,26 @@ def clearance(
 
     min over pairs of (distance of the capsules' axes - their radii - clearance of the rule)
     """
-    given, near, forearm = parameters[0], np.empty(9), np.empty((2, 3))
+    config, near, forearm = parameters[0], np.empty(9), np.empty((2, 3))
     placed = np.empty((len(capsules), 2, 3))
-    place(joints, given.frames, given.axes, capsules, placed)
+    place(joints, config.frames, config.axes, capsules, placed)
     least, part, thing = FARTHEST_REPORTED_M, -1, -1
-    for capsule in range(given.first, len(capsules)):
+    for capsule in range(config.first, len(capsules)):
         radius = capsules[capsule].radius
         for hand in range(len(hands)):
-            forearm[0], forearm[1] = hands[hand], hands[hand] + given.forearm
-            apart = between_segments(placed[capsule], forearm, near) - radius - given.hand_radius
-            apart -= given.clearance[PEOPLE]
+            forearm[0], forearm[1] = hands[hand], hands[hand] + config.forearm
+            apart = between_segments(placed[capsule], forearm, near) - radius - config.hand_radius
+            apart -= config.clearance[PEOPLE]
             if apart < least:
                 least, part, thing = apart, capsule, NEAR_HAND
         for box in range(len(boxes)):
             inner = nearest_to_box(placed[capsule], boxes[box])
-            apart = to_box(placed[capsule], inner, boxes[box], near) - radius - given.clearance[THINGS]
+            apart = to_box(placed[capsule], inner, boxes[box], near) - radius - config.clearance[THINGS]
             if apart < least:
                 least, part, thing = apart, capsule, box
     for pair in range(len(pairs)):
         one, other = pairs[pair]
-        apart = between_segments(placed[one], placed[other], near) - given.clearance[ITSELF]
+        apart = between_segments(placed[one], placed[other], near) - config.clearance[ITSELF]
         apart -= capsules[one].radius + capsules[other].radius
         if apart < least:
             least, part, thing = apart, other, NEAR_ITSELF

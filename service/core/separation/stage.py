@@ -20,18 +20,16 @@ import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.core.frame import Record, Records, Vector, as_array, parameters, structured
+from service.core.separation import FARTHEST_REPORTED_M, TABLE_DEPTH_M
 from service.core.separation.body import body_of, own_clearance
 from service.core.separation.clearance import NOBODY, clearance
 from service.core.separation.step import excess_of, share_of, step
 from service.core.separation.tuning import (
-    FARTHEST_REPORTED_M,
     LOOKAHEAD_S,
-    PEOPLE_PLANNED_MARGIN_M,
     PLANNED_BRAKE_LIMITS,
     PLANNED_BRAKE_SHARE,
+    PLANNED_MARGIN_M,
     PLANNED_REACTION_S,
-    TABLE_DEPTH_M,
-    THINGS_PLANNED_MARGIN_M,
 )
 from service.settings.config import Settings
 
@@ -67,7 +65,7 @@ class Separation:
             * np.minimum(brake, PLANNED_BRAKE_LIMITS * settings.tool.stop_acceleration),
             planned_reaction_s=np.maximum(reaction_s, PLANNED_REACTION_S),
             clearance=np.array([people.clearance, things.clearance, own_clearance(settings)]),
-            room=np.array([PEOPLE_PLANNED_MARGIN_M, THINGS_PLANNED_MARGIN_M, THINGS_PLANNED_MARGIN_M]),
+            planned_margin=PLANNED_MARGIN_M,
             contact_speed=float(people.contact_speed),
             unknown_speed=float(people.unknown_speed),
             unseen_s=np.array([settings.hands.stale_ms, settings.hands.unseen_ms]) / 1000,

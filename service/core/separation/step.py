@@ -9,12 +9,12 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
+from service.core.separation import FARTHEST_REPORTED_M
 from service.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from service.core.separation.tuning import (
     BRAKE_RAMP_S,
     CLEARANCE_GAIN_PER_S,
     CONTACT_MARGIN_M,
-    FARTHEST_REPORTED_M,
     HAND_ACCELERATION_FADE_S,
     LOOKAHEAD_S,
     PLANNED_BRAKE_SHARE,
@@ -84,11 +84,11 @@ def step(
 
     Only constraints that the joints can violate are kept.
     """
-    state, here, given = states[0], heres[0], parameters[0]
+    state, here, config = states[0], heres[0], parameters[0]
     joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
     later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
     now, then = placed[0], placed[1]
-    place(here.joints, given.frames, given.axes, capsules, now)
+    place(here.joints, config.frames, config.axes, capsules, now)
     nearest_m, setpoint_share = FARTHEST_REPORTED_M, 1.0
     speed_limit = capsules[0].max_speed
     for capsule in range(len(capsules)):
@@ -103,38 +103,38 @@ def step(
             variance <= UNKNOWN_VELOCITY_STD_MPS * UNKNOWN_VELOCITY_STD_MPS,
             _receives(contacts, state.hands, side),
         )
-        age_s = (state.tick - state.hand_ticks[side]) * given.period_s
+        age_s = (state.tick - state.hand_ticks[side]) * config.period_s
         # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
-        unseen_s = age_s - given.unseen_s[0] if given.unseen_s[0] < age_s < given.unseen_s[1] else 0.0
-        speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, given.unknown_speed)
+        unseen_s = age_s - config.unseen_s[0] if config.unseen_s[0] < age_s < config.unseen_s[1] else 0.0
+        speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, config.unknown_speed)
         nearer = speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
-        moment = _swiftness(state.hands[side, 1], given.tremor_speed) if known else 0.0
+        moment = _swiftness(state.hands[side, 1], config.tremor_speed) if known else 0.0
         for k in range(len(LOOKAHEAD_S) if moment > 0.0 else 1):
             ahead = moment * LOOKAHEAD_S[k]
             parts = now if k == 0 else then
             if k > 0:
                 for j in range(joints):
                     later[j] = here.joints[j] + ahead * state.joints[1, j]
-                place(later, given.frames, given.axes, capsules, then)
+                place(later, config.frames, config.axes, capsules, then)
             faster = HAND_ACCELERATION_FADE_S * (1.0 - math.exp(-ahead / HAND_ACCELERATION_FADE_S))
             for i in range(3):
                 v, a = state.hands[side, 1, i], state.hands[side, 2, i]
                 velocity[i] = v + faster * a
                 moved = ahead * v + HAND_ACCELERATION_FADE_S * (ahead - faster) * a
                 forearm[0, i] = state.hands[side, 0, i] + moved
-                forearm[1, i] = forearm[0, i] + given.forearm[i]
-            braked = given.brake[PEOPLE] * max(ahead - BRAKE_RAMP_S, 0.0)
-            for capsule in range(given.first, len(capsules)):
+                forearm[1, i] = forearm[0, i] + config.forearm[i]
+            braked = config.brake[PEOPLE] * max(ahead - BRAKE_RAMP_S, 0.0)
+            for capsule in range(config.first, len(capsules)):
                 part, constraint = capsules[capsule], constraints[count]
-                distance = between_segments(parts[capsule], forearm, near) - part.radius - given.hand_radius
+                distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
                 if k == 0:
                     nearest_m = min(nearest_m, distance)
                 distance -= nearer
                 coming = 0.0
                 for i in range(3):
                     coming -= near[6 + i] * velocity[i]
-                coming = max(coming, 0.0) + speed_up if known else given.unknown_speed
-                least = given.contact_speed if receives and part.link == joints else 0.0
+                coming = max(coming, 0.0) + speed_up if known else config.unknown_speed
+                least = config.contact_speed if receives and part.link == joints else 0.0
                 if k == 0:
                     most = max(least, _allowed(parameters, PEOPLE, distance, coming))
                     speed_limit = min(speed_limit, most)
@@ -149,8 +149,8 @@ def step(
                     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += _may_pass(constraints, count, planned, given.max_velocity)
-    for capsule in range(given.first, len(capsules)):
+                    count += _may_pass(constraints, count, planned, config.max_velocity)
+    for capsule in range(config.first, len(capsules)):
         part = capsules[capsule]
         for box in range(len(boxes)):
             inner = nearest_to_box(now[capsule], boxes[box])
@@ -164,7 +164,7 @@ def step(
                     planned = _limit(constraints, count, parameters, THINGS, distance, planned)
                     if part.link == joints:
                         setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += _may_pass(constraints, count, planned, given.max_velocity)
+                    count += _may_pass(constraints, count, planned, config.max_velocity)
     for pair in range(len(pairs)):
         one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
         distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
@@ -173,15 +173,15 @@ def step(
             _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
             _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
             planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
-            count += _may_pass(constraints, count, planned, given.max_velocity)
+            count += _may_pass(constraints, count, planned, config.max_velocity)
     return count, nearest_m, speed_limit, setpoint_share
 
 
 @compiled
 def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
     """Speed [m/s] that the rule (PEOPLE, THINGS or ITSELF) allows at this distance [m]."""
-    given = parameters[0]
-    return allowed_speed(distance, coming, given.brake[rule], given.reaction_s[rule], given.clearance[rule])
+    config = parameters[0]
+    return allowed_speed(distance, coming, config.brake[rule], config.reaction_s[rule], config.clearance[rule])
 
 
 @compiled
@@ -192,9 +192,9 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
 
     with the planned brake and reaction time, and with the planned margin added to the clearance.
     """
-    given = parameters[0]
-    brake, reaction_s = given.planned_brake[rule], given.planned_reaction_s[rule]
-    planned = allowed_speed(distance, coming, brake, reaction_s, given.clearance[rule] + given.room[rule])
+    config = parameters[0]
+    brake, reaction_s = config.planned_brake[rule], config.planned_reaction_s[rule]
+    planned = allowed_speed(distance, coming, brake, reaction_s, config.clearance[rule] + config.planned_margin)
     return max(PLANNED_BRAKE_SHARE * least, planned) + PLANNED_BRAKE_SHARE * braked
 
 
@@ -209,12 +209,12 @@ def _limit(constraints: Records, k: int, parameters: Records, rule: int, distanc
     Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
     move them at RETREAT_AUTHORITY_MPS.
     """
-    given, constraint = parameters[0], constraints[k]
-    left = distance - given.clearance[rule]
+    config, constraint = parameters[0], constraints[k]
+    left = distance - config.clearance[rule]
     slip = min(max(1.0 + left / SLIP_DEPTH_M, 0.1), 1.0) * SLIP_SPEED_MPS
     constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
     planned = min(planned, max(CLEARANCE_GAIN_PER_S * left, -RETREAT_SPEED_MPS))
-    if planned < 0.0 and not _may_pass(constraints, k, RETREAT_AUTHORITY_MPS, given.max_velocity):
+    if planned < 0.0 and not _may_pass(constraints, k, RETREAT_AUTHORITY_MPS, config.max_velocity):
         planned = 0.0
     constraint.planned = planned
     return planned

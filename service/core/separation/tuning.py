@@ -1,36 +1,52 @@
-"""Tuned and numerical constants of separation."""
+"""Tuned numbers of separation.
+
+docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+range of sensible values, and what more and less of it are expected to do. A number without that
+line follows from others.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 # Planning keeps more distance than the rule requires, so that the rule is not reached.
-PEOPLE_PLANNED_MARGIN_M = 0.01  # distance kept from people beyond the clearance
-THINGS_PLANNED_MARGIN_M = 0.01  # distance kept from things and own parts beyond the clearance
+# 0 to 0.05. More: the arm stays farther away. Less: the rule itself limits the arm.
+PLANNED_MARGIN_M = 0.01  # distance kept beyond the clearance
+# 0.4 to 1. More: the arm comes faster. Less: ramps are never too short.
 PLANNED_BRAKE_SHARE = 0.8  # share of the braking that is planned with; its ramps need the rest
+# 0.2 to 1. More: the arm comes faster. Less: braking is gentle.
 PLANNED_BRAKE_LIMITS = np.array([1.0, 0.5, 0.5])  # largest braking / tool's deceleration: people, things, own parts
+# 5e-3 to 0.1. More: the arm slows down early. Less: joints oscillate.
 PLANNED_REACTION_S = 0.02  # smallest reaction time that is planned with; joints oscillate with a shorter one
 
 # Inside of a clearance.
+# 1 to 20. More: the arm returns faster. Less: the arm returns softly.
 CLEARANCE_GAIN_PER_S = 5.0  # [1/s] planned speed = 5 /s * distance left to the clearance; negative inside
-RETREAT_SPEED_MPS = 0.02  # largest speed of the return to the clearance; twice SLIP_SPEED_MPS
+# 0.02 to 0.5. More: fewer postures return. Less: joints are strained.
 RETREAT_AUTHORITY_MPS = 0.1  # a part returns only if the joints can move it at this speed
+# 2e-3 to 0.05. More: the rule is exceeded more. Less: the arm stops for rounding.
 SLIP_SPEED_MPS = 0.01  # excess that is tolerated, as joints do not all reach their velocities at the same time
+RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # largest speed of the return to the clearance
+# 1e-4 to 5e-3. More: excess is allowed deeper inside. Less: the arm stops for rounding.
 SLIP_DEPTH_M = 0.0005  # inside a clearance the tolerated excess falls, to a tenth near this depth
 
 # Hands: what may happen until the arm reacts.
-LOOKAHEAD_S = np.array([0.0, 0.04, 0.08, 0.12, 0.16])  # times ahead at which the rule is evaluated
+# 0.02 to 0.3. More: braking hands are trusted. Less: hands are expected to go on.
 HAND_ACCELERATION_FADE_S = 0.07  # time constant with which a hand's acceleration fades
+# 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
 BRAKE_RAMP_S = 0.08  # time until a deceleration has built up, and until a hand's new velocity is measured
+LOOKAHEAD_S = 0.5 * BRAKE_RAMP_S * np.arange(5.0)  # times ahead at which the rule is evaluated
+# 0.05 to 0.5. More: new hands are trusted sooner. Less: the arm waits longer.
 UNKNOWN_VELOCITY_STD_MPS = 0.2  # a hand with a larger standard deviation is assumed to approach at `unknown_speed`
+# 1 to 20. More: the arm retreats sooner. Less: unseen hands may surprise it.
 UNSEEN_ACCELERATION_MPS2 = 5.0  # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
+# 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
 CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a via-point's radius, on each axis
 
 # The body.
-TABLE_DEPTH_M = 1.0  # the table is this thick
+# 0 to 0.03. More: the arm folds less. Less: parts come nearer.
 OWN_CLEARANCE_M = 0.01  # largest clearance between own parts; more would keep the arm from folding
+# 0 to 0.03. More: overlaps are forgiven. Less: mesh capsules collide falsely.
 CAPSULE_EXCESS_M = 0.01  # capsules around meshes exceed them by about this
-CAPSULE_FITS = 101  # number of lengths that are tried for a capsule
+# 1e-3 to 0.05. More: short tools are not protected. Less: the plate is covered twice.
 LEAST_TOOL_M = 0.01  # a tool point nearer to the plate than this needs no capsule
-UNMOVED_M = 1e-9  # a distance that varies by less between postures is constant
-FARTHEST_REPORTED_M = 3.0  # larger distances are reported as this one

@@ -25,12 +25,19 @@ from typing import TypeAlias
 import numpy as np
 
 from kmp.compiled import compiled
+from service.core.codes import (
+    ACCELERATION_BOUND,
+    FINITE_BOUND,
+    JERK_BOUND,
+    NO_BOUND,
+    POSITION_BOUND,
+    SPEED_BOUND,
+)
 from service.core.frame import Records, Vector
+from service.core.numerics import ROUNDING, TOLERANCE
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.tuning import (
-    BOUND_ROUNDING_M,
     HULL_MARGIN_M,
-    ON_BOUND_M,
     RETURN_SHARE,
     STOP_SECANT_TOLERANCE_M,
     STOP_SECANTS,
@@ -38,7 +45,6 @@ from service.core.setpoint.tuning import (
 from service.core.stops import fastest_stop
 
 Pair: TypeAlias = tuple[float, float]
-BOUNDS = ("", "not finite", "speed", "acceleration", "jerk", "position")
 
 
 @compiled
@@ -96,43 +102,44 @@ def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector)
 
 
 @compiled
-def what_is_wrong(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
-    """Index in BOUNDS of the first bound that a step from `before` breaks; 0 for none.
+def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
+    """The first SetpointBound that a step from `before` breaks; NO_BOUND if it breaks none.
 
     The setpoint and `before` are (3, 3): position, velocity, acceleration; by axis. Norms are over
     the axes, and allow for rounding:
 
-        1  a number is not finite
-        2  |v| > max(V, speed_to_come(before))
-        3  |a| > max(Â, |a before|)
-        4  |a - a before| > Ĵ period
-        5  the position is beyond `bounds`, and beyond the position before, by more than
-           V² / 2A + 1 s V, which is more than any stop from outside takes
+        NOT_FINITE    a number is not finite
+        SPEED         |v| > max(V, speed_to_come(before))
+        ACCELERATION  |a| > max(Â, |a before|)
+        JERK          |a - a before| > Ĵ period
+        POSITION      the position is beyond `bounds`, and beyond the position before, by more than
+                      V² / 2A + 1 s V, which is more than any stop from outside takes
     """
-    given = parameters[0]
-    max_speed = given.max_speed
+    config = parameters[0]
+    max_speed = config.max_speed
     if not np.isfinite(setpoint).all():
-        return 1
+        return FINITE_BOUND
     speed = now = earlier = change = 0.0
     for i in range(3):
         speed += setpoint[1, i] ** 2
         now, earlier = now + setpoint[2, i] ** 2, earlier + before[2, i] ** 2
         change += (setpoint[2, i] - before[2, i]) ** 2
-    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], given.stop_jerk, 0.0)) + 1e-9:
-        return 2
-    if math.sqrt(now) > max(given.max_acceleration, math.sqrt(earlier)) + 1e-9:
-        return 3
-    if math.sqrt(change) > (given.max_jerk + 1e-6) * given.period_s:
-        return 4
+    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9:
+        return SPEED_BOUND
+    if math.sqrt(now) > max(config.max_acceleration, math.sqrt(earlier)) + 1e-9:
+        return ACCELERATION_BOUND
+    if math.sqrt(change) > (config.max_jerk + 1e-6) * config.period_s:
+        return JERK_BOUND
     low, high = np.empty(3), np.empty(3)
-    bounds(hull, box, given.lowest, low, high)
-    farthest = 0.5 * max_speed * max_speed / given.stop_acceleration + max_speed  # no stop from outside takes more
+    bounds(hull, box, config.lowest, low, high)
+    # [m] a stop at full braking, and one second at max_speed: no stop from outside takes more
+    longest_stop = 0.5 * max_speed * max_speed / config.stop_acceleration + 1.0 * max_speed
     for i in range(3):
-        if setpoint[0, i] < min(low[i], before[0, i]) - farthest:
-            return 5
-        if setpoint[0, i] > max(high[i], before[0, i]) + farthest:
-            return 5
-    return 0
+        if setpoint[0, i] < min(low[i], before[0, i]) - longest_stop:
+            return POSITION_BOUND
+        if setpoint[0, i] > max(high[i], before[0, i]) + longest_stop:
+            return POSITION_BOUND
+    return NO_BOUND
 
 
 @compiled
@@ -154,75 +161,80 @@ def take_safe(
 
     Returns False if all axes fell back.
     """
-    given = parameters[0]
-    max_speed, max_acceleration, max_jerk = given.max_speed, given.stop_acceleration, given.stop_jerk
-    back = RETURN_SHARE * max_speed
-    dearest = 0.0
+    config = parameters[0]
+    max_speed, max_acceleration, max_jerk = config.max_speed, config.stop_acceleration, config.stop_jerk
+    return_speed = RETURN_SHARE * max_speed
+    max_joint_cost = 0.0
     for i in range(3):
         for joint in range(costs.shape[2]):
-            dearest = max(dearest, abs(costs[0, i, joint]))
-    due = back * slow / max(1.0, dearest * max_speed) * given.period_s
-    stays, mixed = True, False
+            max_joint_cost = max(max_joint_cost, abs(costs[0, i, joint]))
+    required_return_m = return_speed * slow / max(1.0, max_joint_cost * max_speed) * config.period_s
+    is_kept, is_mixed = True, False
     for i in range(3):
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
             if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
                 continue
-            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + ON_BOUND_M:
-                stays = False
+            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + TOLERANCE:
+                is_kept = False
                 continue
-            here = farthest(setpoint, i, side, max_acceleration, max_jerk, back)
-            if farthest(ahead, i, side, max_acceleration, max_jerk, back) > here - due + BOUND_ROUNDING_M:
-                _fall_back(setpoint, ahead, parameters, i, low[i], high[i], back)
-                mixed = True
-    if mixed:  # an axis was replaced, so the norms over all axes are checked again
+            here = farthest(setpoint, i, side, max_acceleration, max_jerk, return_speed)
+            if farthest(ahead, i, side, max_acceleration, max_jerk, return_speed) > here - required_return_m + ROUNDING:
+                _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
+                is_mixed = True
+    if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
         acceleration = change = 0.0
         for i in range(3):
             acceleration += ahead[2, i] ** 2
             change += (ahead[2, i] - setpoint[2, i]) ** 2
-        stays = stays and acceleration <= given.max_acceleration**2
-        stays = stays and change <= (given.max_jerk * given.period_s) ** 2
-    if stays and speed_to_come(ahead[1], ahead[2], max_jerk, back) <= max_speed:
+        is_kept = is_kept and acceleration <= config.max_acceleration**2
+        is_kept = is_kept and change <= (config.max_jerk * config.period_s) ** 2
+    if is_kept and speed_to_come(ahead[1], ahead[2], max_jerk, return_speed) <= max_speed:
         setpoint[:] = ahead
         return True
-    if speed_to_come(setpoint[1], setpoint[2], max_jerk, back) > max_speed:
-        back = 0.0  # following began too fast: all axes brake first
+    if speed_to_come(setpoint[1], setpoint[2], max_jerk, return_speed) > max_speed:
+        return_speed = 0.0  # following began too fast: all axes brake first
     for i in range(3):
-        _fall_back(setpoint, setpoint, parameters, i, low[i], high[i], back)
+        _fall_back(setpoint, setpoint, parameters, i, low[i], high[i], return_speed)
     return False
 
 
 @compiled
 def _fall_back(
-    setpoint: Vector, out: Vector, parameters: Records, axis: int, low: float, high: float, back: float
+    setpoint: Vector, out: Vector, parameters: Records, axis: int, low: float, high: float, return_speed: float
 ) -> None:
     """Write into out (3, 3) one axis one period further along its fastest stop.
 
-    If that stop would end beyond a bound, the axis follows the fastest change to the speed `back`
-    [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which one counts.
+    If that stop would end beyond a bound, the axis follows the fastest change to the speed
+    `return_speed` [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which
+    one counts.
     """
     max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
-    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + ON_BOUND_M
-    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > ON_BOUND_M - low
+    over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + TOLERANCE
+    under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > TOLERANCE - low
     if over and under:  # the stop ends beyond both bounds
         over = setpoint[1, axis] > 0.0
         under = not over
-    frame, stop = back * (under - over), np.empty(6)
+    frame, stop = return_speed * (under - over), np.empty(6)
     fastest_stop(setpoint[1, axis] - frame, setpoint[2, axis], max_acceleration, max_jerk, dt, stop)
     out[0, axis] = setpoint[0, axis] + (stop[2] + frame * dt)
     out[1, axis], out[2, axis] = stop[0] + frame, stop[1]
 
 
 @compiled
-def farthest(setpoint: Vector, axis: int, side: float, max_acceleration: float, max_jerk: float, back: float) -> float:
+def farthest(
+    setpoint: Vector, axis: int, side: float, max_acceleration: float, max_jerk: float, return_speed: float
+) -> float:
     """Farthest position [m] of an axis, toward `side` (1 or -1), along its fastest change of speed.
 
-        side x + π(side v + back, side a)
+        side x + π(side v + return_speed, side a)
 
-    With back = 0 this is top, the end of the fastest stop. With back > 0 it is P, for the fastest
-    change to the velocity -side `back` [m/s], in the frame that moves at this velocity.
+    With return_speed = 0 this is top, the end of the fastest stop. Otherwise it is P, for the
+    fastest change to the velocity -side `return_speed` [m/s], in the frame that moves at it.
     """
     stop = np.empty(6)
-    fastest_stop(side * setpoint[1, axis] + back, side * setpoint[2, axis], max_acceleration, max_jerk, 0.0, stop)
+    fastest_stop(
+        side * setpoint[1, axis] + return_speed, side * setpoint[2, axis], max_acceleration, max_jerk, 0.0, stop
+    )
     return float(side * setpoint[0, axis] + stop[4])
 
 
@@ -259,14 +271,14 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
     if acceleration >= 0.0:
         t = acceleration / change
         speed_then = speed + 0.5 * acceleration * t
-        way = t * (speed + acceleration * t / 3.0)
+        distance = t * (speed + acceleration * t / 3.0)
     else:  # the braking is treated as begun at acceleration 0
         t = min(-acceleration, brake) / change
         speed_then = speed + 0.5 * change * t * t
-        way = -(speed_then * t - change * t * t * t / 6.0)
+        distance = -(speed_then * t - change * t * t * t / 6.0)
     if speed_then >= brake * brake / change:
-        return way + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
-    return way + speed_then * math.sqrt(speed_then / change)
+        return distance + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+    return distance + speed_then * math.sqrt(speed_then / change)
 
 
 @compiled
@@ -293,20 +305,22 @@ def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, li
 
 
 @compiled
-def stopping(way: float, comes: float, v: float, a: float, brakes: Pair, jerks: Pair, kept: float, dt: float) -> float:
+def stopping(
+    distance: float, growth: float, v: float, a: float, brakes: Pair, jerks: Pair, retained: float, dt: float
+) -> float:
     """Largest jerk [m/s³] in [lowest, wanted] at which a discrete barrier keeps a distance h.
 
     With d the `stop_distance` by `brakes` (m/s², m/s³) before and d' after one period at this jerk:
 
-        h  = way - d                       distance [m] left at the end of a stop
-        h' = way + comes - v dt - d'       the same, one period later
-        h' >= kept h
+        h  = distance - d                      left at the end of a stop [m]
+        h' = distance + growth - v dt - d'     the same, one period later
+        h' >= retained h
 
-    `comes` [m] is how much the way grows by itself in a period. A secant method finds the jerk, to
-    STOP_SECANT_TOLERANCE_M of h'.
+    `growth` [m] is how much the distance grows by itself in a period. A secant method finds the
+    jerk, to STOP_SECANT_TOLERANCE_M of h'.
     """
     (brake, change), (wanted, chosen) = brakes, jerks
-    limit = way + comes - kept * (way - stop_distance(v, a, brake, change))
+    limit = distance + growth - retained * (distance - stop_distance(v, a, brake, change))
     most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
     for _ in range(STOP_SECANTS):
         chosen = between(wanted, chosen, most, passed, limit)

@@ -56,11 +56,11 @@ def turn_orientation(
     most max_acceleration * period, and turns the quaternion for one period. If only the direction
     of +z is followed, e is its shortest turn and target_turning loses its component about +z.
     """
-    given, dt = parameters[0], parameters[0].period_s
+    config, dt = parameters[0], parameters[0].period_s
     error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
     axis_of(quaternion, axis)
     along = 0.0
-    if given.about:
+    if config.about:
         turn_between(quaternion, target, error)
     else:
         swing(axis, target, error)
@@ -68,7 +68,7 @@ def turn_orientation(
             along += target_turning[i] * axis[i]
     angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
     # rate is constant for small errors; for large ones the turn ends at constant deceleration
-    brake, rate = ORIENTATION_BRAKE_SHARE * given.max_acceleration, ORIENTATION_GAIN_PER_S
+    brake, rate = ORIENTATION_BRAKE_SHARE * config.max_acceleration, ORIENTATION_GAIN_PER_S
     near = brake / ORIENTATION_GAIN_PER_S**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
@@ -76,12 +76,12 @@ def turn_orientation(
     for i in range(3):
         wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
         speed += wanted[i] * wanted[i]
-    slower = min(1.0, given.max_speed / max(math.sqrt(speed), 1e-12))
+    slower = min(1.0, config.max_speed / max(math.sqrt(speed), 1e-12))
     change = 0.0
     for i in range(3):
         wanted[i] = slower * wanted[i] - turning[i]
         change += wanted[i] * wanted[i]
-    share = min(1.0, given.max_acceleration * dt / max(math.sqrt(change), 1e-12))
+    share = min(1.0, config.max_acceleration * dt / max(math.sqrt(change), 1e-12))
     for i in range(3):
         turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
         wanted[i] = dt * turning[i]

@@ -25,10 +25,11 @@ import math
 import numpy as np
 
 from service.core.arm.stage import Arm
+from service.core.codes import SetpointBound
 from service.core.frame import Record, Vector, as_array, parameters
 from service.core.kinematics import Kinematics
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import BOUNDS, farthest, what_is_wrong
+from service.core.setpoint.bounds import broken_bound, farthest
 from service.core.setpoint.orientation import OrientationSetpoint
 from service.core.setpoint.step import finish, lead, ready, write
 from service.core.setpoint.tracker import gains_for, waiting
@@ -69,8 +70,8 @@ class SetpointGenerator:
         the share of each joint's limit that a tool velocity, acceleration and jerk need. slow:
         share of max_speed that is allowed while the tool is behind.
 
-        Returns 0 if no limit was met, PLANNED or STOPPED if one was, and WRONG if a bound is
-        broken. WRONG means an error in this program; the setpoint then stays where it is.
+        Returns 0 if no limit was met, PLANNED or STOPPED if one was, and BROKEN if a bound is
+        broken. BROKEN means an error in this program; the setpoint then stays where it is.
         """
         motion = target.position, target.velocity, target.acceleration
         return int(lead(as_array(state), *motion, self._parameters, box, costs, slow))
@@ -86,9 +87,10 @@ class SetpointGenerator:
         )
         return np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
 
-    def why_wrong(self, state: Record, before: Vector, box: Vector) -> str:
+    def name_of_broken_bound(self, state: Record, before: Vector, box: Vector) -> str:
         """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
-        return BOUNDS[what_is_wrong(state["setpoint"], before, state["hull"], box, self._parameters)]
+        bound = SetpointBound(broken_bound(state["setpoint"], before, state["hull"], box, self._parameters))
+        return bound.name.lower().replace("_", " ") if bound else ""
 
 
 class SetpointStage:

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.codes import PLANNED, STOPPED, WRONG
+from service.core.codes import BROKEN, PLANNED, STOPPED
 from service.core.frame import Records, Vector
 from service.core.kinematics import joint_costs
-from service.core.setpoint.bounds import between, bounds_around, stopping, take_safe, what_is_wrong
+from service.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
 from service.core.setpoint.orientation import turn_orientation
 from service.core.setpoint.tuning import (
     BARRIER_RATE_PER_S,
@@ -75,11 +75,11 @@ def lead(
 
     `take_safe` accepts this step or replaces it by the fall-back.
     """
-    state, given, setpoint = states[0], parameters[0], states[0].setpoint
+    state, config, setpoint = states[0], parameters[0], states[0].setpoint
     target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
     target[0], target[1], target[2] = position, velocity, acceleration
     state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
-    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), given.period_s
+    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), config.period_s
     late_s = LATE_STOP_SHARE * max(0.0, state.response_s - PROMPT_RESPONSE_S)
     met = _track(setpoint, target, parameters, costs, slow, late_s, box, jerk)
     for i in range(3):
@@ -89,9 +89,9 @@ def lead(
         ahead[2, i] = a + dt * j
     if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
         met = STOPPED
-    if what_is_wrong(setpoint, before, state.hull, box, parameters):
+    if broken_bound(setpoint, before, state.hull, box, parameters):
         setpoint[:] = before
-        return WRONG
+        return BROKEN
     return met
 
 
@@ -115,7 +115,7 @@ def _track(
     Without k2 if φ < 1: accelerations of a target beyond the speed limit are not followed.
 
     `_approach_sides` and `_limit_jerk` limit this. Then the jerk along the velocity is reduced
-    until h' >= kept h for each of three barriers, where h' is the value of h one period later.
+    until h' >= retained h for each of three barriers, where h' is the value of h one period later.
     Along the unit vector of the velocity:
 
         v, a      speed and acceleration of the setpoint
@@ -124,15 +124,15 @@ def _track(
         B, C      deceleration and jerk that are planned with, within the limits of tool and joints
         top       speed that is planned with, `slow` times the limit of tool and joints
 
-        stop      h = w + room - stop_distance(v, a, B, C)
-                  room = STOP_OVERSHOOT_M - min(late_s v, LATE_STOP_MAX_M)
+        stop      h = w + o - stop_distance(v, a, B, C)
+                  o    = STOP_OVERSHOOT_M - min(late_s v, LATE_STOP_MAX_M)
                          + stop_room (STOP_REACTION_S v_p + v_p² / (2 HAND_BRAKE_MPS2))
                   v_p  = max(0, v_t + DECELERATION_LOOKAHEAD_S min(a_t, 0))    predicted speed
         meeting   h = w + MEETING_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
                   M = max(MEETING_BRAKE_SHARE B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
         speed     h = top - (v + a |a| / 2C)
 
-        kept = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
+        retained = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
 
     In the stop, w grows by min(v_p, v) dt in a period. `late_s` is the additional delay with which
     the hand tracker shows a stop. The meeting applies only while the setpoint is faster than its
@@ -141,9 +141,9 @@ def _track(
 
     Returns PLANNED if a barrier reduced the jerk, else 0.
     """
-    given = parameters[0]
-    gains, dt = given.gains, given.period_s
-    max_speed = given.max_speed
+    config = parameters[0]
+    gains, dt = config.gains, config.period_s
+    max_speed = config.max_speed
     speed, target_speed = _norm(setpoint[1]), _norm(target[1])
     feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
     for i in range(3):
@@ -156,36 +156,40 @@ def _track(
     if speed <= LEAST_SPEED_MPS:
         return 0
     along = np.empty(3)
-    a = u = way = v_target = a_target = 0.0
+    a = u = distance = v_target = a_target = 0.0
     for i in range(3):
         along[i] = setpoint[1, i] / speed
         a += along[i] * setpoint[2, i]
         u += along[i] * jerk[i]
-        way += along[i] * (target[0, i] - setpoint[0, i])
+        distance += along[i] * (target[0, i] - setpoint[0, i])
         v_target += along[i] * feasible * target[1, i]
         a_target += along[i] * target[2, i]
-    brake = PLANNED_BRAKE_SHARE * min(given.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
-    change = PLANNED_BRAKE_SHARE * min(given.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
+    brake = PLANNED_BRAKE_SHARE * min(config.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = PLANNED_BRAKE_SHARE * min(config.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
     change = min(change, STOP_JERK_ERROR_M * gains[0])
     top = slow * PLANNED_SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
-    coming = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
-    room = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
-    room += given.stop_room * (STOP_REACTION_S * coming + coming * coming / (2.0 * HAND_BRAKE_MPS2))
+    predicted_speed = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
+    overshoot = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
+    overshoot += config.stop_room * (
+        STOP_REACTION_S * predicted_speed + predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
+    )
     # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
     # each barrier's distance shrinks at BARRIER_RATE_PER_S at most
-    kept = 1.0 - min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt)
-    chosen = stopping(way + room, min(coming, speed) * dt, speed, a, (brake, change), (u, lowest), kept, dt)
+    retained = 1.0 - min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt)
+    chosen = stopping(
+        distance + overshoot, min(predicted_speed, speed) * dt, speed, a, (brake, change), (u, lowest), retained, dt
+    )
     faster, a_faster = speed - v_target, a - a_target
     if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
         meeting = max(MEETING_BRAKE_SHARE * brake + min(a_target, 0.0), MEETING_BRAKE_LEAST_SHARE * brake)
         chosen = stopping(
-            way + MEETING_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), kept, dt
+            distance + MEETING_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
         )
-    limit = top - kept * (top - now)
-    most = _coasting(speed, a, chosen, change, dt)
-    chosen = between(chosen, -change, most, _coasting(speed, a, -change, change, dt), limit)
+    limit = top - retained * (top - now)
+    coasting = _coasting(speed, a, chosen, change, dt)
+    chosen = between(chosen, -change, coasting, _coasting(speed, a, -change, change, dt), limit)
     if chosen >= u:
         return 0
     for i in range(3):
@@ -206,13 +210,13 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
     would pass its target a little, begin the fastest stop each time, and oscillate. Beyond a side,
     h is 0: the setpoint moves no farther out, and its targets bring it back.
     """
-    given = parameters[0]
-    p = given.gains[0] ** (1.0 / 3.0)
+    config = parameters[0]
+    p = config.gains[0] ** (1.0 / 3.0)
     for i in range(3):
         x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
         damping = -3.0 * p * (p * v + a)
-        highest = max(p**3 * max(box[1, i] - x, 0.0) + damping, -given.stop_jerk)
-        lowest = min(p**3 * min(max(box[0, i], given.lowest[i]) - x, 0.0) + damping, given.stop_jerk)
+        highest = max(p**3 * max(box[1, i] - x, 0.0) + damping, -config.stop_jerk)
+        lowest = min(p**3 * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk)
         jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
 
 
@@ -246,14 +250,14 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
     First the acceleration after the period, a + dt jerk, is scaled to its limits, which gives the
     jerk; then the jerk itself is scaled to its own.
     """
-    given, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
+    config, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
-    excess = max(_norm(ahead) / given.max_acceleration, _largest(costs[1], ahead))
+    excess = max(_norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
     if excess > 1.0:
         for i in range(3):
             jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
-    excess = max(_norm(jerk) / given.max_jerk, _largest(costs[2], jerk))
+    excess = max(_norm(jerk) / config.max_jerk, _largest(costs[2], jerk))
     if excess > 1.0:
         for i in range(3):
             jerk[i] /= excess

@@ -9,12 +9,11 @@ from scipy.linalg import solve_continuous_are
 
 from service.core.frame import Vector
 from service.core.joint_limits import acceleration_rate
+from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
 from service.core.setpoint.tuning import (
     ACCELERATION_REVERSION_PER_S,
-    GAIN_DECIMALS,
     GAP_STOPPED_M,
     GAP_WAITING_M,
-    SLOWEST_PER_S,
     STIFFEST_PER_M,
     TRACKER_LOOP_SHARE,
     TRACKER_RATE_SHARE,
@@ -77,10 +76,10 @@ def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
 
     A target in whose direction the setpoint would approach its tool is returned unchanged.
     """
-    ahead, way = setpoint[0] - tool, target.position - setpoint[0]
+    ahead, to_target = setpoint[0] - tool, target.position - setpoint[0]
     gap = float(np.linalg.norm(ahead))
-    if ahead @ way <= 0.0:
+    if ahead @ to_target <= 0.0:
         return target
     share = min(max((GAP_STOPPED_M - gap) / (GAP_STOPPED_M - GAP_WAITING_M), 0.0), 1.0)
     still = np.zeros(3)
-    return Target(setpoint[0] + share * way, still, still, clamped=target.clamped)
+    return Target(setpoint[0] + share * to_target, still, still, clamped=target.clamped)

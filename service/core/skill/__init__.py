@@ -9,6 +9,7 @@ from service.contract.records import Field
 ORDER = 4  # cascaded filters of a hand's memory: the last one has its position 2 s ago, blurred by 1 s
 TURNS = 3  # cascaded filters of a hand's orientation, so that its angular acceleration is continuous
 
+MAX_SKILL_DISTANCE_M = 10.0  # largest distance of anything in a skill's file from the base plate
 STATE = (
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample [m²]; zeros: none
     Field("orientation_covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample [rad²]

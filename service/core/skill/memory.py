@@ -67,16 +67,16 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
     width = moving.shape[1]
     for i in range(width):
         out[0, i], out[1, i], out[2, i] = moving[0, i], moving[1, i], moving[2, i]
-        at, rate, bend = moving[0, i], moving[1, i], moving[2, i]
+        at, velocity, acceleration = moving[0, i], moving[1, i], moving[2, i]
         for row in range(len(memory)):
             value = memory[row, i]
-            bend = (rate - (at - value) / MEMORY_LAG_S) / MEMORY_LAG_S
-            rate = (at - value) / MEMORY_LAG_S
+            acceleration = (velocity - (at - value) / MEMORY_LAG_S) / MEMORY_LAG_S
+            velocity = (at - value) / MEMORY_LAG_S
             at = value
             column = (row + 1) * width + i
             out[0, column] = value - moving[0, i]
-            out[1, column] = rate - moving[1, i]
-            out[2, column] = bend - moving[2, i]
+            out[1, column] = velocity - moving[1, i]
+            out[2, column] = acceleration - moving[2, i]
     first = (1 + len(memory)) * width
     for i in range(out.shape[1] - first):
         before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]

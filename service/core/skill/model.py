@@ -49,7 +49,7 @@ class Motion(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
     gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`
-    torn: float = 0.0  # probability that the tool belongs elsewhere, in another stage
+    ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another stage
 
 
 class Seen(NamedTuple):
@@ -82,8 +82,8 @@ class Wanted(NamedTuple):
     orientation: Vector  # (4,) quaternion x y z w
     turning: Vector  # (3,) [rad/s]
     gate_m: float  # [m] distance that is compared with the skill's threshold
-    torn: bool  # true if the stage of the task is ambiguous
-    needs: bool  # true if a hand that is not seen may move the target far
+    is_ambiguous: bool  # true if the stage of the task is ambiguous
+    needs_unseen_hand: bool  # true if a hand that is not seen may move the target far
 
 
 class Model(Protocol):

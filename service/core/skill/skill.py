@@ -18,13 +18,13 @@ from kmp.compiled import compiled
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.core.frame import Vector
 from service.core.intake.hand_estimator import STILL
+from service.core.numerics import MAX_TARGET_M
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import delayed
 from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
-from service.core.skill.tuning import MAX_TARGET_M
 from service.settings.config import Reach
 
 NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
@@ -125,7 +125,7 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 UNTOLD = np.empty((0, 18))  # orientation of hands if it is not known
 MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
 """All types of models."""
-Known: TypeAlias = tuple[Vector, Vector, float]
+Earlier: TypeAlias = tuple[Vector, Vector, float]
 """Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], and closure of the gripper, as
 predicted at the newest sample of a hand."""
 
@@ -138,7 +138,7 @@ class Prediction(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²] of the model, before the calibration by `Regions`
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
-    torn: float  # probability that the tool belongs elsewhere, in another stage
+    ambiguity: float  # probability that the tool belongs elsewhere, in another stage
     turn: Turn
     closure: float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 
@@ -174,7 +174,7 @@ class Skill(Immutable):
         accelerations: Vector,
         stillness: Vector = STILL,
         *,
-        before: Known | None = None,
+        before: Earlier | None = None,
         past: Vector | None = None,
         turns: Vector | None = None,
         belief: Vector | None = None,

@@ -89,10 +89,10 @@ class SkillStage:
         frame["closure"] = state["closure"]
         _tell_stage(belief, frame)
         most = AMBIGUOUS_PROBABILITY * (AMBIGUOUS_OFF_SHARE if state["reason"] == AMBIGUOUS else 1.0)
-        if found.torn <= most:
+        if found.ambiguity <= most:
             state["sure_tick"] = tick
-        torn = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, torn, off > UNSURE_M)
+        is_ambiguous = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
 
     def set_stage(self, state: Record, name: str) -> None:
         """Set the belief to the stage that begins at the via-point of this name (at the last

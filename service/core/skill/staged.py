@@ -19,6 +19,7 @@ from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
+from service.core.numerics import BELIEF_PERIODS
 from service.core.skill.model import COVARIANCE_ROUND_TO, Arrays, Motion, Seen
 from service.core.skill.stages import (
     MOST_STAGES,
@@ -34,8 +35,8 @@ from service.core.skill.stages import (
     tools_at,
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
-from service.core.skill.tuning import BELIEF_PERIODS, MOTION_STEP_S, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
-from service.core.skill.via_points import bent
+from service.core.skill.tuning import MOTION_STEP_S, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.core.skill.via_points import pulls_through
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
@@ -51,7 +52,7 @@ class Placed(Immutable):
     * `errors` (M, 3 + 3): shares x (2,), stage, and the tool's error [m] in held-out
       demonstrations.
     * `pulls` (X, 9): hands (6,) [m] and weight (3,) [m] of the kernels by which other via-points
-      move the tool, see `via_points.bent`.
+      move the tool, see `via_points.pulls_through`.
 
     All arrays are read-only: for writable ones, the compiled functions would be compiled once more
     while the loop runs.
@@ -177,7 +178,7 @@ class StagedKMP:
     def placed(self) -> Placed:
         """Stages between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
-        return replace(self._unpulled, pulls=np.hstack(bent(self._resting, self.hands, others)))
+        return replace(self._unpulled, pulls=np.hstack(pulls_through(self._resting, self.hands, others)))
 
     @cached_property
     def _unpulled(self) -> Placed:
@@ -200,8 +201,8 @@ class StagedKMP:
         hands["moving"], hands["now"] = seen.moving, seen.now
         hands["stillness"], hands["period_s"] = seen.stillness, seen.period_s
         errors = at.errors if known is None else NO_ERRORS
-        gate_m, torn = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
-        return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, torn)
+        gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
+        return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names))

@@ -93,15 +93,15 @@ def on_way(hand: Vector, stage: Record, side: int) -> tuple[float, float]:
 
     A hand that rests in this stage (w = 0) has covered the whole segment: the share is 1.
     """
-    begins, way, square = stage["begins"][side], stage["way"][side], stage["square"][side]
+    begins, segment, square = stage["begins"][side], stage["way"][side], stage["square"][side]
     along = 0.0
     if square > STAYS:
         for i in range(3):
-            along += (hand[i] - begins[i]) * way[i]
+            along += (hand[i] - begins[i]) * segment[i]
         along = min(max(along / square, 0.0), 1.0)
     off = 0.0
     for i in range(3):
-        off += (hand[i] - begins[i] - along * way[i]) ** 2
+        off += (hand[i] - begins[i] - along * segment[i]) ** 2
     return along if square > STAYS else 1.0, math.sqrt(off)
 
 
@@ -202,23 +202,23 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
         before = belief[0]
         for k in range(count - 1):
             near = _near(hands, stages[k + 1])
-            on = min(STAGE_FORWARD_PER_S * period_s * near, 0.5) * before
-            back = min(STAGE_BACK_PER_S * period_s * near, 0.5) * belief[k + 1]
+            forward = min(STAGE_FORWARD_PER_S * period_s * near, 0.5) * before
+            backward = min(STAGE_BACK_PER_S * period_s * near, 0.5) * belief[k + 1]
             before = belief[k + 1]
-            belief[k] += back - on
-            belief[k + 1] += on - back
-        again = min(STAGE_CYCLE_PER_S * period_s * _near(hands, stages[0]), 0.5) * belief[count - 1]
-        belief[count - 1] -= again
-        belief[0] += again
+            belief[k] += backward - forward
+            belief[k + 1] += forward - backward
+        restart = min(STAGE_CYCLE_PER_S * period_s * _near(hands, stages[0]), 0.5) * belief[count - 1]
+        belief[count - 1] -= restart
+        belief[0] += restart
         for k in range(count):
             belief[k] += STAGE_ASTRAY_PER_S * period_s * (1.0 / count - belief[k])
-    told = np.empty(count)
+    likelihood = np.empty(count)
     for k in range(count):
-        told[k] = _likely(moving, stages[k])
-    most = told.max()
+        likelihood[k] = _likely(moving, stages[k])
+    most = likelihood.max()
     total = 0.0
     for k in range(count):
-        belief[k] *= math.exp((told[k] - most) * share)
+        belief[k] *= math.exp((likelihood[k] - most) * share)
         total += belief[k]
     for k in range(count):
         belief[k] = round(belief[k] / total * ROUND_TO) / ROUND_TO
@@ -273,7 +273,8 @@ def _tool_in(
         tool = t + s u + δ
 
     t and u are the tool's first via-point and its segment. Added are the hands that the tool
-    follows (`add_followed`) and the `pulls` (X, 9) of other via-points (`via_points.bent`).
+    follows (`add_followed`) and the `pulls` (X, 9) of other via-points
+    (`via_points.pulls_through`).
     """
     stage, found = stages[k], np.empty(OUTPUTS)
     one, other = along_both(hands, still, stage)
@@ -328,7 +329,7 @@ def expected(belief: Vector, tools: Vector, out: Vector) -> None:
 
 
 @compiled
-def _torn(belief: Vector, tools: Vector) -> float:
+def _ambiguity(belief: Vector, tools: Vector) -> float:
     """Probability that the tool belongs elsewhere: the sum of p_k over the stages whose tool
     position (K, 3) is more than AMBIGUOUS_M from that of the most probable stage.
 
@@ -364,8 +365,8 @@ def _around(moving: Vector, out: Vector) -> None:
             square += moving[1, i] * moving[1, i]
         goes = 1.0 - math.exp(-((math.sqrt(square) / CALM_MPS) ** 4))
         for i in range(3 * side, 3 * side + 3):
-            step, bend = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
-            out[0, i], out[1, i], out[2, i] = moving[0, i] - step + bend, moving[0, i], moving[0, i] + step + bend
+            step, curved = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
+            out[0, i], out[1, i], out[2, i] = moving[0, i] - step + curved, moving[0, i], moving[0, i] + step + curved
 
 
 @compiled
@@ -441,7 +442,7 @@ def predicted(
         acceleration = clip((t_+ - 2 t_0 + t_-) / h², ±MAX_TARGET_MPS2)
 
     Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
-    the threshold, and the probability that the tool belongs elsewhere (`_torn`).
+    the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
     one, hands, steps = seen[0], np.empty((3, 6)), np.empty((3, 3))
     still, tools = one["stillness"], np.empty((3, len(stages), 3))
@@ -452,13 +453,13 @@ def predicted(
         tools_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
         expected(belief, tools[n], steps[n])
     for i in range(3):
-        bend = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
+        acceleration = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
         out[0, i] = steps[1, i]
         out[1, i] = (steps[2, i] - steps[0, i]) / (2.0 * MOTION_STEP_S)
-        out[2, i] = min(max(bend, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
+        out[2, i] = min(max(acceleration, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
     if len(errors):
         scatter(hands[1], still, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
-    return off_all(one["now"][0], stages), _torn(belief, tools[1])
+    return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])

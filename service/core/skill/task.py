@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from service.contract.requests import Name, ViaPoint
 from service.core.frame import Records, Vector, structured
+from service.core.skill import MAX_SKILL_DISTANCE_M
 from service.core.skill.stages import MOST_STAGES, NONE, RIGHT, STAGE, STAYS
-from service.core.skill.tuning import LEAST_SEGMENT_M, MAX_SKILL_DISTANCE_M
+from service.core.skill.tuning import LEAST_SEGMENT_M
 
 MOST_NAMES = MOST_STAGES + 1  # largest number of via-points of a task
 TASK_UNITS = (

@@ -15,7 +15,6 @@ from service.core.skill.model import REGION_95
 if TYPE_CHECKING:
     from service.core.skill.skill import Skill
 
-CHANGES_RATE = float(MODE_SWITCH_RATES_PER_S.max())  # [1/s] rate at which an unseen hand changes its motion
 STANDS = np.zeros((2, 3))  # velocities and accelerations of both hands: not needed for the position
 
 
@@ -24,13 +23,14 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     """Standard deviation [m] on each axis of the position of a hand that is not seen, τ after its
     newest sample:
 
-        σ² = Σ_j (s μ_j + (1 - s) ρ_j) P_j[0, 0],   s = exp(-CHANGES_RATE τ)
+        σ² = Σ_j (s μ_j + (1 - s) ρ_j) P_j[0, 0],   s = exp(-λ τ)
 
-    μ_j and P_j are probability and covariance of mode j, ρ is MODE_PRIOR: since it was seen, the
+    μ_j and P_j are probability and covariance of mode j, ρ is MODE_PRIOR, and λ the largest of
+    MODE_SWITCH_RATES_PER_S, at which an unseen hand changes its motion: since it was seen, the
     hand may have begun to move, or to rest.
     """
     state, variance = states[0], 0.0
-    stay = math.exp(-CHANGES_RATE * (state.tick - state.hand_ticks[side]) * period_s)
+    stay = math.exp(-MODE_SWITCH_RATES_PER_S.max() * (state.tick - state.hand_ticks[side]) * period_s)
     for mode in range(len(MODE_PRIOR)):
         share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * MODE_PRIOR[mode]
         variance += share * state.mode_covariances[side, mode, 0, 0]

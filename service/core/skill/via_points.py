@@ -32,9 +32,11 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
     return np.array(inputs).reshape(-1, 6), np.array(outputs).reshape(-1, 3), np.array(deviations)
 
 
-def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector]:
+def pulls_through(
+    mean: Callable[[Vector], Vector], unchanged: Vector, via_points: Sequence[ViaPoint]
+) -> tuple[Vector, Vector]:
     """Kernels that make the mean f of a model, (T, 6) to (T, 3) [m], pass through via-points, and
-    leave it as it is at the hands `kept` (K, 6).
+    leave it as it is at the hands `unchanged` (K, 6).
 
     Returns centres c (X, 6) [m] and weights W (X, 3) [m] of
 
@@ -42,13 +44,13 @@ def bent(mean: Callable[[Vector], Vector], kept: Vector, via_points: Sequence[Vi
         W = (G + diag(σ²) + LEAST_PULL_VARIANCE_SHARE I)⁻¹ E,   G_xy = exp(-k |c_x - c_y|²)
 
     The centres are the via-points' hands with E = tool - f(c) and the via-points' variance σ² [m²],
-    and `kept` with E = 0 and σ = 0. Without via-points, there are no kernels.
+    and `unchanged` with E = 0 and σ = 0. Without via-points, there are no kernels.
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     if not len(inputs):
         return inputs, outputs.reshape(0, 3)
-    centres = np.concatenate([inputs, kept])
-    off = np.concatenate([outputs - mean(inputs), np.zeros((len(kept), 3))])
+    centres = np.concatenate([inputs, unchanged])
+    off = np.concatenate([outputs - mean(inputs), np.zeros((len(unchanged), 3))])
     square = ((centres[:, None] - centres) ** 2).sum(axis=2)
-    noise = np.concatenate([deviations**2, np.zeros(len(kept))]) + LEAST_PULL_VARIANCE_SHARE
+    noise = np.concatenate([deviations**2, np.zeros(len(unchanged))]) + LEAST_PULL_VARIANCE_SHARE
     return centres, np.linalg.solve(np.exp(-PULL_SHARPNESS_PER_M2 * square) + np.diag(noise), off)

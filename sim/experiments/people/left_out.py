@@ -119,7 +119,7 @@ def _through_core(
         goes = bool(known & HANDS_KNOWN)
         if skill is not None and goes:
             wanted = stage.step(state, frame)
-            goes = wanted.gate_m <= used.threshold and not wanted.torn
+            goes = wanted.gate_m <= used.threshold and not wanted.is_ambiguous
         if tick % every == 0:
             moving.append(hands[:, :2].transpose(1, 0, 2).reshape(2, 6))
             means.append(frame["target"].copy())

@@ -14,7 +14,7 @@ import numpy as np
 
 from service.core.intake.hand_estimator import STILL
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import Known, Prediction, Skill
+from service.core.skill.skill import Earlier, Prediction, Skill
 from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2, MOTION_STEP_S
 from sim.bench import Bench
 from sim.experiments.results import Array
@@ -67,7 +67,7 @@ class Rival(Skill):
         accelerations: Array,
         stillness: Array = STILL,
         *,
-        before: Known | None = None,
+        before: Earlier | None = None,
         past: Array | None = None,
         turns: Array | None = None,
         belief: Array | None = None,

@@ -18,7 +18,7 @@ from service.contract.records import SIDES, Flag
 from service.core.arm.stage import Arm, Closing
 from service.core.frame import Event, Tick, Vector
 from service.core.limiter.stage import Limiter
-from service.core.separation.tuning import FARTHEST_REPORTED_M
+from service.core.separation import FARTHEST_REPORTED_M
 from service.core.skill.skill import Skill
 from service.settings.config import Settings, robot_description
 from sim.closed_loop import START_NS, hand_event

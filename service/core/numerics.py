@@ -1,0 +1,27 @@
+"""Tolerances, roundings, caps and iteration counts of the core's arithmetic. They follow from
+64-bit floating point and from the algorithms, not from how the arm should move: none is tuned.
+"""
+
+from __future__ import annotations
+
+ROUNDING = 1e-12  # smaller velocities, distances, pivots and multipliers are rounding
+TOLERANCE = 1e-9  # a bound that is exceeded by less than this is kept
+INSIDE_LIMIT_SHARE = 1.0 - TOLERANCE  # limits are planned with this share, so that rounding does not break them
+LEAST_SLOPE = 1e-10  # a constraint with a smaller slope in the free directions cannot be approached
+TICK_ROUNDING = 1e-6  # [ticks] rounding of a duration, as sums of periods are not exact
+PROBABILITY_ROUND_TO = 1e12  # probabilities are rounded, so that a replay on another kind of CPU agrees
+GAIN_DECIMALS = 6  # gains are rounded, so that a replay on another kind of CPU agrees
+SLOWEST_PER_S = 0.2  # [1/s] the tracker's Riccati equation is not solved reliably for a lower rate
+
+# Inputs are clipped to these before anything is calculated; larger ones are errors elsewhere.
+LARGEST_USABLE = 1e6  # a state of the joints with a larger number is rejected
+MAX_JOINT_RAD = 1e4
+MAX_TARGET_M = 1e3
+MAX_ERROR_M = 10.0  # [m, m/s] errors and velocities of the tool
+MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow as integers
+
+# Iterations.
+BOUND_ROUNDS = 12  # largest number of rounds in which a joint is held at its bound or released
+CONSTRAINT_ROUNDS = 40  # largest number of rounds in which an inequality is added or removed
+BELIEF_PERIODS = 20  # number of updates after which the belief of hands at rest has converged
+CAPSULE_FITS = 101  # number of lengths that are tried for a capsule

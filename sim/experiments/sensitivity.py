@@ -1,0 +1,562 @@
+"""Sensitivity of what the other experiments measure to each tuned number of the core: every number
+times a half and times two, beside the noise of each figure, which is its spread over other seeds.
+
+The numbers are module constants that Numba compiles into the code, and compiling takes a minute. So
+this module, run as a program, loads the service with each use of a number replaced by a read from
+memory (`ReadsNumbers`). It is compiled once. Each value is then measured in a fork of that process,
+which writes the value to this memory first. Each read leaves a mark, so a number is measured only
+in the sessions that read it; a number that none reads is not exercised.
+"""
+
+from __future__ import annotations
+
+from service.process import one_blas_thread  # noqa: F401
+
+# isort: split
+import argparse
+import ast
+import copy
+import functools
+import importlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numba
+import numpy as np
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from sim.experiments.results import ExperimentError
+
+if TYPE_CHECKING:  # the rest of the service is imported after `begin`
+    from sim.experiments.people.moving_hands import Moving
+    from sim.experiments.results import Array, Options, Results
+
+Figures: TypeAlias = dict[str, dict[str, float]]
+"""By session, the figures by name."""
+Session: TypeAlias = Callable[[int], dict[str, float]]
+"""From the number of a seed, below EACH, to figures by name."""
+
+ROOT = Path(__file__).parents[2]
+STAGES = ("intake", "skill", "setpoint", "arm", "separation", "limiter", "decision")  # in the order of measurement
+FACTORS = (0.5, 2.0)
+EVENTS = ("handover", "grasp", "carry")
+MADE = "three"  # kind of made task for `partners`
+MOTION_S, CALM_S = 4.0, 2.5  # length of the sequences
+SLOW_MPS, APART_M = 0.005, 0.04  # speed of a slow hand; distance between the positions of two sources
+UNSEEN_S, TWO_S = (2.0, 0.3), (3.0, 1.0)  # middle and length of the time without one hand, and with two sources
+LIMIT_S = 300  # a value that takes longer has no figures
+ROOM = 1024  # float64 values for which there is memory
+
+EACH = 4  # seeds of a session: the first one is measured at all values, the others give the noise
+
+values = np.zeros(ROOM)
+marks = np.zeros(ROOM, np.uint8)
+_VALUES_AT, _MARKS_AT = values.ctypes.data, marks.ctypes.data
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _pointer(_: Any, address: Any) -> Any:
+    """An address as a pointer."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(address), generate
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def number(at: int) -> float:
+    """Value of the number at an index; leaves a mark."""
+    numba.carray(_pointer(_MARKS_AT), ROOM, np.uint8)[at] = 1
+    return float(numba.carray(_pointer(_VALUES_AT), ROOM, np.float64)[at])
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def count(at: int) -> int:
+    """The same for a whole number."""
+    return int(number(at))
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def row(at: int, size: int) -> Any:
+    """The same for several numbers in a row."""
+    numba.carray(_pointer(_MARKS_AT), ROOM, np.uint8)[at] = 1
+    return numba.carray(_pointer(_VALUES_AT), ROOM, np.float64)[at : at + size]
+
+
+class Number(NamedTuple):
+    """A tuned number, or several in a row, and the place of the first value in memory."""
+
+    stage: str
+    name: str
+    value: Any
+    at: int
+
+    @property
+    def key(self) -> str:
+        """Name of the number in the result."""
+        return f"{self.stage}.{self.name}"
+
+    @property
+    def size(self) -> int:
+        """How many values it has."""
+        return int(np.size(self.value))
+
+    def read(self) -> ast.expr:
+        """Expression that reads it from memory."""
+        kind = "row" if np.ndim(self.value) else "count" if isinstance(self.value, int) else "number"
+        more = f", {self.size}" if np.ndim(self.value) else ""
+        return ast.parse(f"_memory.{kind}({self.at}{more})", mode="eval").body
+
+    def changed(self, factor: float) -> Any:
+        """The number times a factor; a count is rounded and differs by at least 1."""
+        if not isinstance(self.value, int):
+            return np.asarray(self.value) * factor
+        return max(self.value + 1, round(self.value * factor)) if factor > 1 else min(self.value - 1, self.value // 2)
+
+
+class Tuning(NamedTuple):
+    """The tuned numbers of the core by key, and for each name the expression that reads it: a name
+    whose value names others is no number of its own, but a formula of them.
+    """
+
+    numbers: dict[str, Number]
+    reads: dict[str, ast.expr]
+
+
+def tuning() -> Tuning:
+    """All names of the stages' `tuning.py`."""
+    found, modules = Tuning({}, {}), {}
+    at = 0
+    for stage in STAGES:
+        module = importlib.import_module(f"service.core.{stage}.tuning")
+        modules[stage] = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+        for name, formula in _assigned(modules[stage]):
+            if not _named(formula):
+                one = Number(stage, name, getattr(module, name), at)
+                found.numbers[one.key], found.reads[one.key], at = one, one.read(), at + one.size
+    for stage, tree in modules.items():
+        replace = _Reads(f"{stage}/tuning.py", found.reads, stage, inside=True)
+        for node in tree.body:
+            replace.visit(node) if isinstance(node, ast.ImportFrom) else None
+        for name, formula in _assigned(tree):
+            if _named(formula):
+                found.reads[f"{stage}.{name}"] = replace.visit(formula)
+    return found
+
+
+def numbers() -> dict[str, Number]:
+    """The tuned numbers of the core, by key."""
+    return tuning().numbers
+
+
+def _assigned(tree: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            yield node.targets[0].id, node.value
+
+
+def _named(formula: ast.expr) -> bool:
+    """True if a value names other numbers."""
+    return any(isinstance(node, ast.Name) and node.id.isupper() for node in ast.walk(formula))
+
+
+class _Reads(ast.NodeTransformer):
+    """Replace the numbers that a module imports by reads from memory."""
+
+    def __init__(self, path: str, reads: Mapping[str, ast.expr], stage: str = "", *, inside: bool = False) -> None:
+        """`stage` is that of a `tuning.py`, whose own names are replaced too."""
+        self._path, self._reads, self._inside = path, reads, inside
+        self._named = {key.split(".")[1]: read for key, read in reads.items() if key.split(".")[0] == stage}
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
+        module = (node.module or "").split(".")
+        if module[:2] == ["service", "core"] and module[-1] == "tuning":
+            for one in node.names:
+                self._named[one.asname or one.name] = self._reads[f"{module[2]}.{one.name}"]
+        return node
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        before, self._inside = self._inside, True
+        node.body = [self.visit(part) for part in node.body]
+        self._inside = before
+        self.visit(node.args)
+        return node
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        if node.id not in self._named or not isinstance(node.ctx, ast.Load):
+            return node
+        if not self._inside:
+            raise ImportError(f"{self._path}:{node.lineno}: {node.id} is read outside of a function")
+        return ast.copy_location(copy.deepcopy(self._named[node.id]), node)
+
+
+class _Loader(SourceFileLoader):
+    """Loader of a module of the service that reads its numbers from memory."""
+
+    reads: Mapping[str, ast.expr] = {}
+
+    def get_code(self, fullname: str) -> Any:
+        path = self.get_filename(fullname)
+        tree = _Reads(path, self.reads).visit(ast.parse(self.get_data(path)))
+        return compile(ast.fix_missing_locations(tree), path, "exec")
+
+    def exec_module(self, module: ModuleType) -> None:
+        vars(module)["_memory"] = sys.modules[__name__]
+        super().exec_module(module)
+
+
+class ReadsNumbers(MetaPathFinder):
+    """Finder that has each module of the service, but the tuning itself, read its numbers from
+    memory.
+    """
+
+    def __init__(self, reads: Mapping[str, ast.expr]) -> None:
+        _Loader.reads = reads
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
+        """Specification of a module of the service; None for any other."""
+        if not fullname.startswith("service.") or fullname.endswith(".tuning"):
+            return None
+        spec = PathFinder.find_spec(fullname, path, target)
+        if spec is not None and spec.origin and spec.origin.endswith(".py"):
+            spec.loader = _Loader(fullname, spec.origin)
+        return spec
+
+
+def begin() -> dict[str, Number]:
+    """Write all numbers to memory, and have the service read them from there. Returns them."""
+    known, reads = tuning()
+    loaded = [name for name in sys.modules if name.startswith("service.core.") and name.count(".") > 2]
+    if early := [name for name in loaded if not name.endswith(".tuning")]:
+        raise ImportError(f"imported before its numbers could be replaced: {', '.join(early)}")
+    for one in known.values():
+        values[one.at : one.at + one.size] = one.value
+    import kmp.compiled
+
+    kmp.compiled.compiled = numba.njit  # Numba's caches on disk have the numbers in the code
+    sys.meta_path.insert(0, ReadsNumbers(reads))
+    return known
+
+
+def forget() -> None:
+    """Empty all caches of the service and the simulation, which may depend on a number."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("service.", "sim.")):
+            for one in list(vars(module).values()):
+                if callable(clear := getattr(one, "cache_clear", None)):
+                    clear()
+
+
+def sessions() -> dict[str, Session]:
+    """Short sessions by name: from the number of a seed, below EACH, to figures by name."""
+    from scipy.signal import butter, sosfiltfilt
+
+    from service.contract.records import Flag, Mode
+    from service.contract.requests import TOLERANCE_M
+    from service.core.controller import Controller
+    from service.files.recording import Recording
+    from service.files.replay import ticks
+    from service.files.shipped import recordings, shipped_skill
+    from service.learning.learn import learn
+    from service.learning.skill_file import decoded
+    from service.learning.via_points import adapted
+    from service.settings.config import Settings
+    from sim.experiments import motion, phase, reached, separation
+    from sim.experiments.catalogue import EXPERIMENTS
+    from sim.experiments.open_loop import targets
+    from sim.experiments.partners import summary
+    from sim.experiments.people import moving_hands
+    from sim.experiments.people.left_out import judged, left_out, predicted
+    from sim.experiments.rehearsal import NOISE_M, TREMOR_M, rehearse
+    from sim.experiments.rivals.followers import ours
+    from sim.made_tasks import takes
+    from sim.scene import Scene
+    from sim.script import HandScript
+
+    streams = EXPERIMENTS["sensitivity"].seeds.tuning
+    period_s, names = moving_hands.PERIOD_S, ("error_rms_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
+
+    def follow(hands: list[Moving], keep: tuple[str, ...]) -> dict[str, float]:
+        """Figures of sequences with the core alone, by a skill that depends on the hands alone."""
+        skill = decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
+        out: dict[str, list[float]] = {}
+        for one in hands:
+            found = motion.figures("ours", one, targets(skill, one.truth), ours(skill, Settings())(one))
+            for name in keep:
+                out.setdefault(f"{one.group}: {name}", []).append(getattr(found, name))
+        return {name: float(np.mean(values)) for name, values in out.items()}
+
+    def middle() -> Array:
+        return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER).hands.mean(axis=0)
+
+    def person(seed: int) -> list[Moving]:
+        hands = moving_hands.modelled(middle(), numbers=[streams["people"].numbers[seed]], seconds=MOTION_S)
+        return [one for one in hands if one.group in motion.FLOOR_GROUPS]
+
+    def disturbed(seed: int) -> dict[str, float]:
+        """Late samples, a hand out of sight, and a second source for a while."""
+        hands, random = person(seed)[0], np.random.default_rng([streams["disturbed"].seed, seed])
+        late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
+        late[np.abs(hands.stamps - UNSEEN_S[0]) < UNSEEN_S[1] / 2, seed % 2] = np.inf
+        samples, twice = hands.samples.copy(), np.flatnonzero(np.abs(hands.stamps - TWO_S[0]) < TWO_S[1] / 2)
+        samples[twice[::2], :3] += APART_M
+        groups = {"late and unseen": replaced(hands, late=late), "two sources": replaced(hands, samples=samples)}
+        return follow([replaced(one, group=name) for name, one in groups.items()], names)
+
+    def replaced(hands: Moving, **changed: Any) -> Moving:
+        return type(hands)(**{**vars(hands), **changed})
+
+    def stops(seed: int) -> dict[str, float]:
+        numbers = streams["stops"].numbers[seed : seed + 1]
+        seen = moving_hands.stops(middle(), numbers=numbers)
+        seen += moving_hands.stops(middle(), numbers=numbers, rate_hz=30, noise=0.002, group="stops, 30 Hz, 2 mm")
+        return follow(seen, ("overshoot_mm", "settled_ms"))
+
+    def calm(seed: int) -> dict[str, float]:
+        """Hands that tremble at rest, then a hand that moves slowly."""
+        random, times = np.random.default_rng([streams["calm"].seed, seed]), np.arange(0.0, CALM_S, period_s)
+        rates = random.uniform(8.0, 12.0, 6)
+        truth = middle() + 0.001 * np.sin(2.0 * np.pi * rates * times[:, None])
+        slow = middle() + SLOW_MPS * np.maximum(times - 0.5, 0.0)[:, None] * np.array([0.3, 0.9, 0.3, 0.0, 0.0, 0.0])
+        out: dict[str, float] = {}
+        skill = decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
+        for name, hands in (("tremor", truth), ("slow", slow)):
+            samples = hands[::5] + NOISE_M * random.standard_normal((len(hands[::5]), 6))
+            tool = ours(skill, Settings())(moving_hands.Moving(name, name, hands, times[::5], samples)).tool[500:]
+            fast = sosfiltfilt(butter(4, 4.0, "highpass", fs=1.0 / period_s, output="sos"), tool, axis=0)
+            out[f"{name}: above_4_hz_mm"] = 1000 * float(np.sqrt(np.mean(np.sum(fast**2, axis=1))))
+        speed = np.diff(tool, axis=0) @ (tool[-1] - tool[0]) / np.linalg.norm(tool[-1] - tool[0]) / period_s
+        return out | {"slow: speed_std_mm_s": 1000 * float(speed.std())}
+
+    def pauses(seed: int) -> dict[str, float]:
+        script = HandScript(
+            Scene(),
+            seed=streams["hands"].numbers[seed],
+            pauses=(phase.STOP, phase.BACK),
+            tremor_rms=TREMOR_M,
+            noise_std=NOISE_M,
+        )
+        one = rehearse(script, reached.ours(Scene()), rate_hz=separation.RATE_HZ, keep=True)
+        stopped = one.tool[slice(*np.searchsorted(one.time_s, phase.STOPPED_S))]
+        resting = stopped[len(stopped) // 2 :] - stopped[len(stopped) // 2 :].mean(axis=0)
+        return {
+            **{f"{name}_error_mm": value for name, value in zip(EVENTS, one.errors_mm, strict=True)},
+            "goes_on_mm": float(1000 * np.linalg.norm(stopped[-1] - stopped[0])),
+            "tremor_in_pause_mm": float(1000 * np.sqrt(np.mean(np.sum(resting**2, axis=1)))),
+            "held_s": one.held_s,
+        }
+
+    def scene(kind: str) -> Session:
+        def run_one(seed: int) -> dict[str, float]:
+            one = separation.run_one((kind, streams["scenes"].numbers[seed]))
+            return {
+                "success": float(one.success),
+                **{f"{name}_error_mm": value for name, value in zip(EVENTS, one.errors_mm, strict=True)},
+                "done_s": one.times_s[-1],
+                "nearest_mm": one.capsules_mm,
+                "pushed_mm": one.pushed_mm,
+                "excess_mm_s": 1000 * max(one.excess_after_reaction, one.excess_hurried),
+                "limited_s": one.limited_s,
+            }
+
+        return run_one
+
+    def partners(seed: int) -> dict[str, float]:
+        stream = streams["made"]
+        who = stream.numbers[3 * seed : 3 * seed + 3]
+        learned, asked = takes(MADE, people=who[:2], each=2, seed=stream.seed), takes(MADE, people=who[2:], each=1)
+        skill = learn([take.demonstration for take in learned])
+        seen = [left_out("", "", take.demonstration) for take in asked]
+        there = [adapted(skill, one.demonstration.places, tolerance=TOLERANCE_M) for one in seen]
+        found = summary([judged(one, predicted(at, one)) for one, at in zip(seen, there, strict=True)])
+        return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "held", "unsure")}
+
+    first: dict[str, Any] = {}
+
+    def golden(_: int) -> dict[str, float]:
+        """The inputs of the golden session, which does not react: how many frames change."""
+        recording = Recording.open(recordings() / "golden.mcap")
+        controller = Controller(recording.settings, shipped_skill(), urdf=recording.urdf)
+        frames = np.array([controller.step(tick) for tick in ticks(recording)])
+        was = first.setdefault("frames", frames)
+        flags = (frames["flags"] ^ was["flags"]) & int(Flag.SPEED_LIMITED | Flag.SEPARATION) > 0
+        return {
+            "changed": float(np.mean([a.tobytes() != b.tobytes() for a, b in zip(frames, was, strict=True)])),
+            "other_mode": float(np.mean(frames["mode"] != was["mode"])),
+            "other_flags": float(np.mean(flags)),
+            "following": float(np.mean(frames["mode"] == Mode.FOLLOW)),
+            "tool_moved_mm": float(1000 * np.linalg.norm(frames["tool"] - was["tool"], axis=1).max()),
+        }
+
+    return {
+        "motion": lambda seed: follow(person(seed), names),
+        "stops": stops,
+        "disturbed": disturbed,
+        "calm": calm,
+        "phase": pauses,
+        "scene": scene("random"),
+        "thrust": scene("thrust"),
+        "partners": partners,
+        "golden": golden,
+    }
+
+
+class Known(NamedTuple):
+    """Figures at the tuned values, their noise, and the numbers that each session reads."""
+
+    figures: Figures
+    noise: Figures
+    reads: dict[str, list[str]]
+    seconds: dict[str, float]
+
+
+def at_tuned_values(known: Mapping[str, Number], all_sessions: Mapping[str, Session]) -> Known:
+    """Measure all sessions with all seeds."""
+    out = Known({}, {}, {}, {})
+    for name, session in all_sessions.items():
+        marks[:] = 0
+        found, began = [session(0)], time.monotonic()
+        out.reads[name] = [key for key, one in known.items() if marks[one.at]]
+        found += [session(seed) for seed in range(1, 1 if name == "golden" else EACH)]
+        out.seconds[name] = (time.monotonic() - began) / max(1, len(found) - 1)
+        out.figures[name] = found[0]
+        spread = {figure: [one[figure] for one in found] for figure in found[0]}
+        out.noise[name] = {figure: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for figure, v in spread.items()}
+    return out
+
+
+def in_fork(work: Callable[[], Any]) -> Callable[[], Any]:
+    """Start a function in a fork of this process. Returns a function that waits for its result,
+    which is an error's text if there is none.
+    """
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        signal.alarm(LIMIT_S)
+        try:
+            out = work()
+        except Exception as error:
+            out = f"{type(error).__name__}: {error}"
+        os.write(writing, json.dumps(out).encode())
+        os._exit(0)
+    os.close(writing)
+
+    def result() -> Any:
+        with open(reading, "rb") as pipe:
+            found = pipe.read()
+        os.waitpid(child, 0)
+        return json.loads(found) if found else f"no result within {LIMIT_S} s"
+
+    return result
+
+
+def at_other_value(one: Number, value: Any, known: Known, all_sessions: Mapping[str, Session]) -> Figures:
+    """Figures of the sessions that read a number, at another value; runs in a fork."""
+    values[one.at : one.at + one.size] = value
+    forget()
+    out: Figures = {}
+    for name, session in all_sessions.items():
+        if one.key in known.reads[name]:
+            out[name] = session(0)
+    return out
+
+
+def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
+    """Measure numbers one after the other: first all figures at the tuned values, then a row a
+    number. With two workers, both values of a number are measured at the same time.
+    """
+    known = begin()
+    all_sessions = sessions()
+    here = at_tuned_values(known, all_sessions)
+    yield {"tuned": here._asdict()}
+    for key in keys:
+        one, began = known[key], time.monotonic()
+        values = {f"{factor:g}": one.changed(factor) for factor in FACTORS}
+        found: dict[str, Any] = {}
+        for factor, value in values.items():
+            found[factor] = in_fork(functools.partial(at_other_value, one, value, here, all_sessions))
+            if workers == 1:
+                found[factor] = functools.partial(lambda done: done, found[factor]())
+        changed = {
+            factor: {"to": np.asarray(values[factor]).tolist(), "figures": done()} for factor, done in found.items()
+        }
+        row = {"value": np.asarray(one.value).tolist(), "changed": changed}
+        yield {"number": key, "row": row | {"seconds": round(time.monotonic() - began, 1)}}
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """Measure the numbers that the result does not have yet; the result is written after each."""
+    from sim.experiments.evidence import result_of
+
+    known = numbers()
+    before = result_of(results.folder, results.name) or {}
+    same = before.get("depends_on") == results.origin["depends_on"]
+    rows: dict[str, Any] = {key: row for key, row in before.get("numbers", {}).items() if same and key in known}
+    rows = {key: row for key, row in rows.items() if row["value"] == np.asarray(known[key].value).tolist()}
+    wanted = [key for key in known if key not in rows and options.numbers in ("", key, *key.split("."))]
+    out: dict[str, Any] = {"tuned": before.get("tuned", {}) if same else {}, "numbers": rows, "unmeasured": []}
+    command = [sys.executable, "-m", "sim.experiments.sensitivity", f"--workers={options.workers}", *wanted]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as server:
+        assert server.stdout is not None
+        for line in server.stdout:
+            found = json.loads(line)
+            if "tuned" in found:
+                out["tuned"] = found["tuned"]
+            else:
+                rows[found["number"]] = found["row"]
+                results.say(f"{found['number']}: {worst(found['row'], out['tuned'])}")
+            out["unmeasured"] = [key for key in known if key not in rows]
+            results.numbers(out)
+    if server.returncode:
+        raise ExperimentError(f"the measuring process ended with {server.returncode}")
+    return out
+
+
+def effects(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[tuple[float, str, str, float]]:
+    """Changes of figures by a number: how many times the noise, factor, figure, and the change.
+
+    A figure without noise is left out, except for those of the golden session.
+    """
+    for factor, found in row["changed"].items():
+        if isinstance(found["figures"], str):
+            yield math.inf, factor, found["figures"], math.nan
+            continue
+        for session, figures in found["figures"].items():
+            for name, value in figures.items():
+                if "nan" in (value, tuned["figures"][session][name]):
+                    continue
+                change, noise = value - tuned["figures"][session][name], tuned["noise"][session][name]
+                if noise > 0.0:
+                    yield abs(change) / noise, factor, f"{session} {name}", change
+
+
+def worst(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> str:
+    """The largest change by a number, in words."""
+    found = max(effects(row, tuned), default=None)
+    if found is None:
+        return "no session reads it"
+    times, factor, figure, change = found
+    return f"{figure} {change:+.3g} at {factor} times the value, {times:.1f} times the noise"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Measure numbers of the core, by stage.NAME; a line of JSON each.")
+    parser.add_argument("numbers", nargs="*", metavar="STAGE.NAME")
+    parser.add_argument("--workers", type=int, default=1)
+    arguments = parser.parse_args()
+    for made in serve(arguments.numbers, arguments.workers):
+        print(json.dumps(made), flush=True)
