@@ -49,12 +49,12 @@ SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # of each person, half with
 SIGMAS_M = (0.005, 0.010)
 BREAKING_SCENES: dict[Group, int] = {group: len(part["breaking"].numbers) for group, part in PARTS.items()}
 RESAMPLED = 2000
-SAME = 0.05  # candidates whose success differs by no more are as good
+SAME = 0.05  # candidates within this difference of success are equally good
 TEACHER = "teacher"
 
 
 class Entry(NamedTuple):
-    """A method: what it is called, and the parameters that were tried, the chosen ones first."""
+    """A method: its label, and the parameters that were tried, the chosen ones first."""
 
     label: str
     candidates: tuple[Method, ...]
@@ -135,7 +135,7 @@ def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | N
 
 
 def outcomes(task: Task) -> list[Outcome]:
-    """What became of a task's sessions."""
+    """The outcomes of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
         return [judge(None, one) for one in runs]
@@ -242,7 +242,7 @@ def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
-    """Which candidate is chosen: of those whose success is within SAME of the best, the one whose
+    """The chosen candidate: among those whose success is within SAME of the best, the one whose
     target is nearest to the teacher's tool.
     """
     success = [float(np.mean([one.success for one in rows])) for rows in tried]
@@ -251,7 +251,7 @@ def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
 
 
 def _more(rows: Sequence[Outcome], ours: Sequence[Outcome]) -> dict[str, float]:
-    """By how much it succeeds more often than ours, scene by scene."""
+    """Difference of its success rate to ours, scene by scene."""
     difference = np.array([float(a.success) - float(b.success) for a, b in zip(rows, ours, strict=True)])
     mean, low, high = _resampled(rows, difference)
     return {"mean": mean, "low": low, "high": high}
@@ -279,7 +279,7 @@ def line(rows: Sequence[Outcome]) -> str:
     of = {name: s[name]["mean"] for name in MEASURES}
     return (
         f"success {100 * of['success']:3.0f} ({100 * s['success']['low']:.0f}-{100 * s['success']['high']:.0f}), "
-        f"on the way {100 * of['success_on_the_way']:.0f}, "
+        f"on the path {100 * of['success_on_the_way']:.0f}, "
         f"events {' '.join(f'{100 * e:.0f}' for e in s['events'])}, path {of['path_rms_mm']:.1f} mm, "
         f"held {100 * of['held']:.1f} (falsely {100 * of['falsely_held']:.1f}), "
         f"falsely followed {100 * of['falsely_followed']:.1f}, "
@@ -295,11 +295,11 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     found = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
-    labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
+    labels = {TEACHER: "teacher who knows\nthe scene", **{name: entry.label for name, entry in METHODS.items()}}
     colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
     bars = (
-        ("success", 100.0, "success [%]\n(dark: on the teacher's way all through)"),
-        ("path_rms_mm", 1.0, "target off the teacher's tool,\nrms [mm]"),
+        ("success", 100.0, "success [%]\n(dark: on the teacher's path throughout)"),
+        ("path_rms_mm", 1.0, "distance of target and\nteacher's tool, rms [mm]"),
         ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
     )
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
@@ -333,7 +333,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
                 annotation_clip=False,
                 arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colours[method], "relpos": (0, 0.5), "shrinkB": 2},
             )
-    axes[3].set(xlabel="region said to hold [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
+    axes[3].set(xlabel="nominal region [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
     people, scenes = numbers["people"], numbers["scenes_of_each"]
-    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % over people")
+    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % intervals")
     results.figure(figure)
