@@ -127,7 +127,7 @@ def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
 
 
 def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[Moving]:
-    """People modelled after the recordings, each seen by the trackers of the groups of `recorded`."""
+    """People modelled after the recordings, seen by the trackers of the groups of `recorded`."""
     out = []
     for number in numbers:
         truth = person(number, middle, seconds)

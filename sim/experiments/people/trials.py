@@ -129,7 +129,7 @@ class Outcome(NamedTuple):
 
 
 def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
-    """The outcome of a session; None is the teacher, with the places as the methods perceive them."""
+    """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
     found = served(placed, one)
     target, tool, held = found["target"], found["tool"], found["mode"] != Mode.FOLLOW
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
