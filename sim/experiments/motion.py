@@ -26,7 +26,20 @@ from sim.experiments import spectra
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
 from sim.experiments.people.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
-from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
+from sim.experiments.results import (
+    ADAPTED,
+    LEFT,
+    OTHER,
+    REFERENCE,
+    RIGHT,
+    TOOL,
+    Array,
+    Options,
+    Results,
+    brief,
+    pyplot,
+    rgb,
+)
 from sim.experiments.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
 from sim.experiments.rivals.linear_filters import best_linear
 from sim.experiments.workers import shared_out
@@ -207,7 +220,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     found = _measured(tasks, options)
     table = {name: _summary([one for one in found if one.follower == name]) for name in by_name if name != TRUTH}
     for name, groups in table.items():
-        results.say(f"{name}: {_line(groups)}")
+        results.say(f"{name}: {brief(groups)}")
     floors = {
         group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
         for group, rate_hz in FLOOR_GROUPS.items()
@@ -267,12 +280,12 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
         }
         lags = [one.lag_ms for one in found if one.follower == "ours" and one.group == group]
         together[group] = means | {"ratio": means["ours"] / means["chase"], "lag_ms": float(np.median(lags))}
-        results.say(f"{group}, all: {', '.join(f'{name} {value:.2f}' for name, value in together[group].items())}")
+        results.say(f"{group}, all: {brief(together[group])}")
     worse, of_harder = {}, _measured(harder, options)
     for group in HARDER_GROUPS:
         error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
         worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
-        results.say(f"{group}, all: {error_mm:.2f} mm, {worse[group]['times_clean']:.2f} times clean")
+        results.say(f"{group}, all: {brief(worse[group])}")
     numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together, "harder": worse}
     draw_numbers(results, numbers)
     return numbers
@@ -291,8 +304,7 @@ def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dic
             for person in dict.fromkeys(one.person for one in of)
             for mine in [[one for one in of if one.person == person]]
         }
-        told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in out[group].items())
-        results.say(f"{group}, ours / best chase: {told}")
+        results.say(f"{group}, rms [mm]: {brief(out[group])}")
     return out
 
 
@@ -305,21 +317,6 @@ def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dic
 
 def _pooled(rows: list[Figures], follower: str) -> float:
     return math.sqrt(np.mean([one.error_rms_mm**2 for one in rows if one.follower == follower]))
-
-
-def _line(groups: dict[str, dict[str, float]]) -> str:
-    """The summary of one follower as a line."""
-    parts = []
-    for group, f in groups.items():
-        if "lag_ms" in f:
-            parts.append(
-                f"{group} {f['error_rms_mm']:.1f} mm, {f['lag_ms']:.0f} ms, "
-                f"acceleration {f['acceleration_ratio']:.2f}, jerk {f['jerk_ratio']:.1f}"
-            )
-        else:
-            overshoot = f"{f['overshoot_mean_mm']:.1f} / {f['overshoot_worst_mm']:.1f} mm"
-            parts.append(f"{group} {overshoot}, {f['settled_worst_ms']:.0f} ms")
-    return "; ".join(parts)
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:

@@ -29,7 +29,7 @@ from service.settings.config import Settings
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.reached import taught
-from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
 from sim.experiments.rivals.partners import RIVALS, left_out_by
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
@@ -265,15 +265,8 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
 
 def _line(fold: Fold) -> str:
     """A fold as a line of progress."""
-    one = summary([row for row in fold.accepted if row] or fold.in_spite)
-    if not one["takes"]:
-        return f"refused: {[*fold.refusals, *fold.take_refusals][0]}"
-    inside = [100 * one["coverage"][LEVELS.index(level)] for level in (0.5, 0.95)]
-    text = (
-        f"{one['rms_mm']:.0f} mm, {one['shifted_rms_mm']:.0f} shifted, worst {one['worst_mm']:.0f}, inside "
-        f"{inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %, uncertain {100 * one['unsure']:.0f} %"
-    )
-    return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
+    one = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
+    return f"refused ({fold.refusals[0]}), in spite of it {one}" if fold.refusals else one
 
 
 class Verdict(NamedTuple):

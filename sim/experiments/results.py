@@ -145,6 +145,15 @@ def pyplot() -> Any:
     return plt
 
 
+def brief(value: Any) -> str:
+    """Numbers in one line of progress, by name, with three significant digits."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {brief(one)}" for name, one in value.items())
+    if isinstance(value, (list, tuple)):
+        return f"({' '.join(map(brief, value))})"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
 def rgb(colour: str) -> tuple[int, int, int]:
     """Red, green, blue (0 to 255) of #RRGGBB."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -27,7 +27,7 @@ from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.reached import EVENTS, ours
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
@@ -269,7 +269,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     for one in shared_out(run_one, tasks, options.workers):
         found[one.kind].append(one)
         if len(found[one.kind]) % max(1, len(scenes) // 5) == 0:
-            results.say(f"{one.kind}: {_summary(found[one.kind])}")
+            results.say(f"{one.kind}: {brief(_summary(found[one.kind]))}")
     recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
     results.series(
         {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in found.items() for name in recorded}, "scene"

@@ -16,7 +16,7 @@ from sim.experiments.catalogue import DRAWING, EXPERIMENTS
 from sim.experiments.load.live import live_run
 from sim.experiments.reached import EVENTS, places_in, shown
 from sim.experiments.rehearsal import rehearse
-from sim.experiments.results import ADAPTED, OTHER, Options, Results, pyplot, rgb
+from sim.experiments.results import ADAPTED, OTHER, Options, Results, brief, pyplot, rgb
 from sim.experiments.rivals.as_skill import in_bench
 from sim.experiments.rivals.gaussian_process import SampleProcess
 from sim.experiments.rivals.method import Learn, Model
@@ -105,7 +105,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
                 "agrees": live.success == inside.success,
             }
         )
-        results.say(f"scene {number} over Zenoh in real time: {in_real_time[-1]}")
+        results.say(f"scene {number} over Zenoh in real time: {brief(in_real_time[-1])}")
     paths = {f"/{name}/{method}": (method, i) for method in found for i, name in enumerate(EVENTS)}
     styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(who))], names=[who]) for path, (who, _) in paths.items()}
     values = {path: [one.errors_mm[i] for one in found[who]] for path, (who, i) in paths.items()}

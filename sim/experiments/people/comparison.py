@@ -30,7 +30,7 @@ from sim.experiments.people.trials import (
     judge,
     seen,
 )
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from sim.experiments.rivals.gaussian_process import GaussianProcess
 from sim.experiments.rivals.method import Method, Model
 from sim.experiments.rivals.mixtures import MixtureRegression, TaskParameterised
@@ -159,7 +159,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         if task.kind:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
         else:
-            results.say(f"{task.method:<17} {task.candidate}: {line(rows)}")
+            results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
     main = {task.method: rows for task, rows in found.items() if not task.kind and task.candidate == 0}
     broken = {
         method: {kind: _broken(found[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
@@ -271,23 +271,6 @@ def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
     """Successes, and failures in which the tool held through each event that it missed."""
     held = [not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near for o in rows]
     return {"successes": sum(one.success for one in rows), "held": sum(held), "of": len(rows)}
-
-
-def line(rows: Sequence[Outcome]) -> str:
-    """A summary in a line."""
-    s = summary(rows)
-    of = {name: s[name]["mean"] for name in MEASURES}
-    return (
-        f"success {100 * of['success']:3.0f} ({100 * s['success']['low']:.0f}-{100 * s['success']['high']:.0f}), "
-        f"on the path {100 * of['success_on_the_way']:.0f}, "
-        f"events {' '.join(f'{100 * e:.0f}' for e in s['events'])}, path {of['path_rms_mm']:.1f} mm, "
-        f"held {100 * of['held']:.1f} (falsely {100 * of['falsely_held']:.1f}), "
-        f"falsely followed {100 * of['falsely_followed']:.1f}, "
-        f"-log lik. {of['negative_log_likelihood']:.1f}, "
-        f"coverage {100 * of['inside_50']:.0f} {100 * of['inside_95']:.0f}, "
-        f"rms {s['predicted_rms_mm']:.0f} predicted {s['error_rms_mm']:.0f}, "
-        f"delay {1000 * of['delay_s']:.0f} {1000 * of['tool_delay_s']:.0f} ms, too near {100 * of['too_near']:.0f}"
-    )
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:

@@ -205,16 +205,8 @@ def searched(
     exploration: float = EXPLORATION,
 ) -> Improvement:
     """The result of one search for a Lambda, of ROLLOUTS trajectories an update."""
-    return improve(
-        primitive,
-        reward,
-        TIMES[:, None],
-        correlation=correlation,
-        exploration=exploration,
-        updates=updates,
-        rollouts=ROLLOUTS,
-        seed=seed,
-    )
+    search: dict[str, Any] = {"updates": updates, "rollouts": ROLLOUTS, "seed": seed, "exploration": exploration}
+    return improve(primitive, reward, TIMES[:, None], correlation=correlation, **search)
 
 
 def scaled(
