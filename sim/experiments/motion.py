@@ -49,7 +49,7 @@ PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "
 SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
-WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
+WEIGHTS = (1e-8, 4e-8)  # jerk weights besides the default
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
 LABELS = {
@@ -59,7 +59,7 @@ LABELS = {
 }
 TRUTH, SMOOTH = "truth", "minimum jerk"  # the follower and the group whose frequencies are shown
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-HARDER_GROUPS = ("late", "unseen")  # of clean hands: ours alone is measured
+HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
 SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, appended to a group's name

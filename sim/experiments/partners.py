@@ -44,7 +44,7 @@ RECORDED = {  # the beginnings of the files' names
     "walk": ("walk",),
 }
 PEOPLE = ("give",)  # its groups are persons
-NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
+NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
 BLOCK = 9  # takes of `walk` that are left out together
 SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
@@ -72,7 +72,7 @@ class Part(NamedTuple):
 class Fold(NamedTuple):
     """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
 
-    refusals: tuple[str, ...]  # of the command; with any, it writes no skill
+    refusals: tuple[str, ...]  # reasons why the command writes no skill
     figures: Figures | None  # none where nothing could be learned
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused

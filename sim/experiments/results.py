@@ -48,10 +48,10 @@ class Options:
     letters: Path | None = None  # a folder of recorded letters, for those about letters
     hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
-    group: Literal["tuning", "test"] = "test"  # of people, for `people`
+    group: Literal["tuning", "test"] = "test"  # the people of `people`
     workers: int = 1  # processes
-    share: float = 1.0  # of the full size, for a quick look
-    arm: str = "wam"  # of `faults` and `motion`: one of the shipped, or a cell's settings
+    share: float = 1.0  # share of the full size; less for a quick look
+    arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
 
 
 @dataclass

@@ -35,8 +35,8 @@ from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pau
 SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
 EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
-GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # of all scenes, the largest is given
-REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
+GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
+REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
 AHEAD_M = 0.22  # distance ahead of the tool, on its path, at which a hand is thrust
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6

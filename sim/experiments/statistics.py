@@ -31,7 +31,7 @@ from sim.scene import GRASP_DISTANCE
 
 SEEDS = EXPERIMENTS["statistics"].seeds
 SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
-ELL = 5.0  # of our skill
+ELL = 5.0  # [1/m²] as the shipped skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
 METHODS: dict[str, tuple[str, Learn]] = {
     "ours": ("KMP, taught places\n(the service)", lambda shown: LearnedByService(shipped_skill())),
@@ -65,7 +65,7 @@ class Outcome(NamedTuple):
 
 @functools.cache
 def _learned(method: str) -> Model[Places]:
-    """What a method learned, once in a process."""
+    """The model of a method, learned once in a process."""
     return METHODS[method][1](shown())
 
 

@@ -56,7 +56,7 @@ class Seen:
 
     @property
     def due(self) -> Mask:
-        """Where holding is right (T,)."""
+        """True where holding is right (T,)."""
         return np.asarray(~self.fresh | self.swapped)
 
 

@@ -15,7 +15,7 @@ from sim.experiments.reproduction.correlation import SHARPNESS, SHOWN, TIMES
 from sim.experiments.results import OTHER, Array, Options, Results, pyplot
 
 SEARCHES = EXPERIMENTS["runs"].seeds.evaluation["searches"]
-VIA_ROW = 50  # of 100 along the letter
+VIA_ROW = 50  # row of the via-point, of 100 along the letter
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
