@@ -19,6 +19,7 @@ import jinja2
 
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.evidence import RESULTS, result_of, staleness, tree
+from sim.experiments.partners import verdict
 from sim.experiments.people.moving_hands import MOST_LATE_S, UNSEEN_S
 
 HERE = Path(__file__).parent
@@ -120,37 +121,16 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         "thousands": lambda value: f"{value:,}".replace(",", " "),
         "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
         "word": lambda value: WORDS.get(value, str(value)),
-        "judged": judged,
+        "judged": verdict,
         "refusals": refusals,
     }
     return found
 
 
-def judged(task: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """A task's row of the service in `partners`: accepted takes, and refused ones used in spite.
-
-    In results without `folds_refused`, a task's skills were used although all of them, or none,
-    were called unsafe.
-    """
-    one = task["methods"][method]
-    none: dict[str, Any] = {"takes": 0}
-    folds_refused, in_spite = one.get("folds_refused", one["unsafe"]), one.get("in_spite_of_refusal")
-    accepted = none if in_spite is None and folds_refused else one
-    if in_spite is None:
-        in_spite = one if folds_refused else none
-    takes = f"{one['refuses']} of {one['takes'] + one['refuses']} takes" if one["refuses"] else "none"
-    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else takes
-    some = bool(accepted["takes"] and one["refuses"] and "beside_mm" in one)
-    return {"accepted": accepted, "in_spite": in_spite, "refused": refused, "some_refused": some}
-
-
 def refusals(tasks: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
     """The numbers of refused skills and of all in recorded tasks of `partners`."""
-    rows = [(task, m) for task in tasks.values() for name, m in task["methods"].items() if name.startswith("service")]
-    return {
-        "refused": sum(one.get("folds_refused", one["unsafe"]) for _, one in rows),
-        "folds": sum(task["folds"] for task, _ in rows),
-    }
+    rows = [(task, verdict(task, name)) for task in tasks.values() for name in task["methods"] if "service" in name]
+    return {"refused": sum(one.folds_refused for _, one in rows), "folds": sum(task["folds"] for task, _ in rows)}
 
 
 def significant(value: float, digits: int) -> str:

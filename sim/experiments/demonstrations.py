@@ -19,7 +19,7 @@ from sim.scene import GRASP_DISTANCE, Scene
 
 SEEDS = EXPERIMENTS["demonstrations"].seeds
 MOST, ORDERS, SCENES = 10, SEEDS.learned["orders"], SEEDS.evaluation["scenes"]
-EVERY = 4  # of the samples, to save time
+EVERY = 4  # every fourth sample is used, to save time
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:

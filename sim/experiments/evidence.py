@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "recordings" / "experiments"
 CODE = ("kmp", "service", "sim", "pyproject.toml", "recordings/*.npz", "recordings/people", "recordings/golden.mcap")
 MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
-DECIMALS = 6  # of kmp's outputs: what CPUs agree on
+DECIMALS = 6  # kmp's outputs are rounded to these, on which CPUs agree
 
 
 USUAL = Options()
@@ -120,7 +120,7 @@ def origin(name: str, options: Options) -> dict[str, Any]:
 
 
 def options_of(name: str, options: Options) -> dict[str, Any]:
-    """The options that an experiment heeds; folders by their number of files and a digest."""
+    """The options that an experiment uses; folders by their number of files and a digest."""
     given = {one: getattr(options, one) for one in ("share", *EXPERIMENTS[name].options)}
     return {
         "set" if one == "group" else one: _folder(value) if isinstance(value, Path) else value

@@ -29,10 +29,10 @@ NOMINAL = Drawn(Scene(), 1.0, (), SEED)
 MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED
 )
-MOVING_M_S = 0.05  # a hand this fast has begun
+MOVING_M_S = 0.05  # a hand at this speed has started
 ATTEMPTS = 3
-SKIPPED = 25  # a run in which the bench skipped more periods is no evidence: the machine was too busy for real time
-SHOWN_HZ, SERVICE_HZ = 20, 500  # of the ways in the figure, and of the recordings that they are from
+SKIPPED = 25  # a run with more skipped periods of the bench is no evidence: the machine was too busy
+SHOWN_HZ, SERVICE_HZ = 20, 500  # rates of the paths in the figure, and of their recordings
 EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.24), (640, 480)
 THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
 DRAWN = {"reproduction": "dotted: as learned", "adaptation": "solid: adapted"}
@@ -91,9 +91,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 
 def _steady(drawn: Drawn, scratch: Path, *, taught: bool) -> tuple[RunReport, int]:
-    """A run in which the machine kept real time, or the last attempt at one; and which attempt it
-    is.
-    """
+    """A run in which the machine kept real time, or the last attempt, and the attempt's number."""
     for attempt in range(1, ATTEMPTS + 1):
         for old in scratch.glob("*"):
             old.unlink()
@@ -114,7 +112,7 @@ def _numbers(ran: RunReport) -> dict[str, Any]:
 
 
 def is_evidence(skipped: int) -> bool:
-    """Whether a run counts in which the bench skipped so many periods."""
+    """True if a run with a number of skipped periods is evidence."""
     return skipped <= SKIPPED
 
 
@@ -136,7 +134,7 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
-    """The figure of the ways of hands and tool. That of the stages shows more than the numbers."""
+    """The figure of the paths of hands and tool. That of the stages shows more than the numbers."""
     runs = {
         name: Traces(*(np.array(shown[part]).T for part in Traces._fields)) for name, shown in numbers["shown"].items()
     }
@@ -165,24 +163,14 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         for c, n in ((LEFT, "left hand"), (RIGHT, "right hand"), (TOOL, "robot's tool"))
     ]
     handles += [plt.Line2D([], [], color="black", marker=m, lw=0, label=n) for m, n in (("*", "start"), ("+", "end"))]
-    handles.append(
-        plt.Line2D(
-            [],
-            [],
-            color="black",
-            marker="o",
-            mfc="none",
-            lw=0,
-            ms=8,
-            label="new places for the tool: handover, glass, over the board",
-        )
-    )
+    places = "new places for the tool: handover, glass, over the board"
+    handles.append(plt.Line2D([], [], color="black", marker="o", mfc="none", lw=0, ms=8, label=places))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     results.figure(figure)
 
 
 def _mark(ran: dict[str, Any] | None) -> str:
-    """What is to be said of a run that is no evidence."""
+    """The note on a run that is no evidence."""
     if ran is None:
         return ", in process"
     skipped = ran["periods_skipped_by_bench"]
@@ -244,7 +232,7 @@ def _draw_stages(results: Results) -> None:
         grid[0, 0].annotate(name, at, at + np.array(aside), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
     handles = [
         plt.Line2D([], [], color=c, label=n)
-        for c, n in ((LEFT, "way of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
+        for c, n in ((LEFT, "path of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure, "stages")

@@ -26,7 +26,20 @@ from sim.experiments import spectra
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
 from sim.experiments.people.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
-from sim.experiments.results import ADAPTED, LEFT, OTHER, REFERENCE, RIGHT, TOOL, Array, Options, Results, pyplot, rgb
+from sim.experiments.results import (
+    ADAPTED,
+    LEFT,
+    OTHER,
+    REFERENCE,
+    RIGHT,
+    TOOL,
+    Array,
+    Options,
+    Results,
+    brief,
+    pyplot,
+    rgb,
+)
 from sim.experiments.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
 from sim.experiments.rivals.linear_filters import best_linear
 from sim.experiments.workers import shared_out
@@ -35,24 +48,24 @@ SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "hands"))
 SECONDS = 15.0
 SETTLED_MM = 5.0
-BEGUN_S = 1.0  # a recording may begin in full motion, with the tool at rest: that is not following
-WEIGHTS = (1e-8, 4e-8)  # of jerk, besides the default: the trade-off
+BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
+WEIGHTS = (1e-8, 4e-8)  # jerk weights besides the default
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
 LABELS = {
-    "ours": "ours, by weight of jerk (ringed: the default)",
+    "ours": "ours, by jerk weight (ringed: the default)",
     "chase": "One-Euro filter, then Ruckig after the target",
-    "servo": "MoveIt Servo's way: Butterworth and Ruckig on the joints",
+    "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
 }
-TRUTH, SMOOTH = "truth", "minimum jerk"  # a follower for the group of which frequencies are shown
+TRUTH, SMOOTH = "truth", "minimum jerk"  # the follower and the group whose frequencies are shown
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-HARDER_GROUPS = ("late", "unseen")  # of clean hands: ours alone is measured
+HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
-SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, as said after a group's name
-TEACHERS = SEEDS.learned["teachers"].numbers  # people whom nobody follows
+SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, appended to a group's name
+TEACHERS = SEEDS.learned["teachers"].numbers  # people who are not followed
 TAUGHT_S, TAUGHT_EVERY = 20.0, 10  # ticks from one sample to the next
-LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # of their tool
+LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # motion of their tool, per motion of a hand
 
 
 @dataclass(frozen=True)
@@ -79,7 +92,7 @@ class Figures:
 
 
 def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
-    """A skill learned from modelled people whose tool goes along with both hands."""
+    """A skill learned from modelled people whose tool moves with both hands."""
     centre = shipped.mean(middle[None])[0]
     demonstrations = []
     for seed in TEACHERS:
@@ -93,7 +106,7 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
 
 
 def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follower]:
-    """All that is compared; for a quick look one of each kind, and ours."""
+    """All followers; for a quick look one of each kind, and ours."""
     found = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
     for weight in WEIGHTS if share == 1 else ():
@@ -126,9 +139,9 @@ _known: dict[str, Any] = {}
 
 
 def prepare(share: float, arm: str) -> None:
-    """Loads the skills and what follows by them, once in a process."""
+    """Load the skills and their followers, once in a process."""
     settings = cell_of(arm)
-    # a function of where hands are alone: then how the tool follows is the followers' doing
+    # A function of the hands' positions alone, so that only the followers differ.
     skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
     for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
@@ -207,7 +220,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     found = _measured(tasks, options)
     table = {name: _summary([one for one in found if one.follower == name]) for name in by_name if name != TRUTH}
     for name, groups in table.items():
-        results.say(f"{name}: {_line(groups)}")
+        results.say(f"{name}: {brief(groups)}")
     floors = {
         group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
         for group, rate_hz in FLOOR_GROUPS.items()
@@ -267,20 +280,20 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
         }
         lags = [one.lag_ms for one in found if one.follower == "ours" and one.group == group]
         together[group] = means | {"ratio": means["ours"] / means["chase"], "lag_ms": float(np.median(lags))}
-        results.say(f"{group}, all: {', '.join(f'{name} {value:.2f}' for name, value in together[group].items())}")
+        results.say(f"{group}, all: {brief(together[group])}")
     worse, of_harder = {}, _measured(harder, options)
     for group in HARDER_GROUPS:
         error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
         worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
-        results.say(f"{group}, all: {error_mm:.2f} mm, {worse[group]['times_clean']:.2f} times clean")
+        results.say(f"{group}, all: {brief(worse[group])}")
     numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together, "harder": worse}
     draw_numbers(results, numbers)
     return numbers
 
 
 def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each group and person the root mean square error [mm] over all sequences: ours, and that
-    of the chase that is best for them.
+    """Root mean square error [mm] over all sequences of each group and person: ours, and that of
+    the best chase for this person.
     """
     out: dict[str, dict[str, dict[str, float]]] = {}
     for group in dict.fromkeys(one.group for one in rows):
@@ -291,13 +304,12 @@ def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dic
             for person in dict.fromkeys(one.person for one in of)
             for mine in [[one for one in of if one.person == person]]
         }
-        told = ", ".join(f"{name} {row['ours']:.1f} / {row['chase']:.1f} mm" for name, row in out[group].items())
-        results.say(f"{group}, ours / best chase: {told}")
+        results.say(f"{group}, rms [mm]: {brief(out[group])}")
     return out
 
 
 def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """By follower the joints' speeds by frequency, and the share that is ripple."""
+    """The joints' speeds by frequency and the share of ripple, for each follower."""
     rows = {one.follower: one.joint_speeds for one in found if one.group == SMOOTH and one.follower in names}
     kinds = {name.partition(",")[0]: rows[name] for name in names}
     return {kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()}
@@ -307,24 +319,9 @@ def _pooled(rows: list[Figures], follower: str) -> float:
     return math.sqrt(np.mean([one.error_rms_mm**2 for one in rows if one.follower == follower]))
 
 
-def _line(groups: dict[str, dict[str, float]]) -> str:
-    """The summary of one follower as a line."""
-    parts = []
-    for group, f in groups.items():
-        if "lag_ms" in f:
-            parts.append(
-                f"{group} {f['error_rms_mm']:.1f} mm, {f['lag_ms']:.0f} ms, "
-                f"acceleration {f['acceleration_ratio']:.2f}, jerk {f['jerk_ratio']:.1f}"
-            )
-        else:
-            overshoot = f"{f['overshoot_mean_mm']:.1f} / {f['overshoot_worst_mm']:.1f} mm"
-            parts.append(f"{group} {overshoot}, {f['settled_worst_ms']:.0f} ms")
-    return "; ".join(parts)
-
-
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
-    """The figure of the experiment's numbers: error against jerk, for every follower and the best
-    linear filters; of recorded hands each person's error, ours against the chase's.
+    """The figure of the experiment's numbers: error against jerk of every follower and of the best
+    linear filters; for recorded hands each person's error, ours against the chase's.
     """
     plt = pyplot()
     figure, axes = plt.subplots(1, len(FLOOR_GROUPS), figsize=(10, 4.2), layout="constrained")
@@ -354,7 +351,7 @@ def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[d
             panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
     x, y = ([row[name] for row in floor] for name in ("jerk_ratio", "error_rms_mm"))
     panel.plot(x, y, "k--", lw=1, label="best linear filter, without limits and arm")
-    panel.set(xscale="log", xlabel="jerk, times the truth's", ylabel="error, rms [mm]", ylim=(0, None))
+    panel.set(xscale="log", xlabel="jerk, multiple of the truth's", ylabel="error, rms [mm]", ylim=(0, None))
 
 
 def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:

@@ -24,12 +24,12 @@ from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Opti
 from sim.experiments.scenes import Drawn, draw
 from sim.scene import TOOL_ORIENTATION, Scene
 
-EYES = np.array([1.15, 0.0, 0.50])  # [m] of the user, frame base
-SCATTER_RAD = 0.03  # of the demonstrated orientations, each axis
-COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # of the position, as the shipped skill
+EYES = np.array([1.15, 0.0, 0.50])  # [m] the user's eyes, frame base
+SCATTER_RAD = 0.03  # deviation of the demonstrated orientations, each axis
+COMPONENTS, ELL, PENALTY = 10, 5.0, 2.0  # parameters of the paper's way
 SCENES = EXPERIMENTS["orientation"].seeds.evaluation["scenes"]
 SEED, RATE_HZ = EXPERIMENTS["orientation"].seeds.evaluation["hands"].seed, 250
-WORK_S = 3.0  # that the hands stay over the board
+WORK_S = 3.0  # the hands stay this long over the board
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:

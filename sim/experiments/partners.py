@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from service.settings.config import Settings
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.reached import taught
-from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
 from sim.experiments.rivals.partners import RIVALS, left_out_by
 from sim.experiments.workers import shared_out
 from sim.made_tasks import KINDS, takes
@@ -44,7 +44,7 @@ RECORDED = {  # the beginnings of the files' names
     "walk": ("walk",),
 }
 PEOPLE = ("give",)  # its groups are persons
-NAMES_PLACES = ("give",)  # its takes begin and end at places that could be told
+NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
 BLOCK = 9  # takes of `walk` that are left out together
 SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
@@ -72,7 +72,7 @@ class Part(NamedTuple):
 class Fold(NamedTuple):
     """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
 
-    refusals: tuple[str, ...]  # of the command; with any, it writes no skill
+    refusals: tuple[str, ...]  # reasons why the command writes no skill
     figures: Figures | None  # none where nothing could be learned
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
@@ -265,23 +265,36 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
 
 def _line(fold: Fold) -> str:
     """A fold as a line of progress."""
-    one = summary([row for row in fold.accepted if row] or fold.in_spite)
-    if not one["takes"]:
-        return f"refused: {[*fold.refusals, *fold.take_refusals][0]}"
-    inside = [100 * one["coverage"][LEVELS.index(level)] for level in (0.5, 0.95)]
-    text = (
-        f"{one['rms_mm']:.0f} mm, {one['shifted_rms_mm']:.0f} shifted, worst {one['worst_mm']:.0f}, inside "
-        f"{inside[0]:.0f} {inside[1]:.0f} %, held {100 * one['held']:.0f} %, uncertain {100 * one['unsure']:.0f} %"
-    )
-    return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
+    one = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
+    return f"refused ({fold.refusals[0]}), in spite of it {one}" if fold.refusals else one
 
 
-def _label(name: str, methods: dict[str, Any], ending: str) -> str:
-    """A set's name, and how often the service refuses."""
-    ours = methods[SERVICE + ending]
-    if ours.get("folds_refused"):
-        return f"{name}\n(learn refuses {ours['folds_refused']} of {ours['folds']} skills)"
-    return name + f"\n({ours['refuses']} of {ours['takes'] + ours['refuses']} takes refused)" * bool(ours["refuses"])
+class Verdict(NamedTuple):
+    """A set as `learn` judges it: summaries of accepted takes, and of refused skills in spite."""
+
+    accepted: Mapping[str, Any]
+    in_spite: Mapping[str, Any]
+    folds_refused: int
+    refused: str  # the number of refused skills or takes, in words
+
+    @property
+    def some_refused(self) -> bool:
+        """True if the errors are of some of the takes only, and rivals are known on the same."""
+        return bool(self.accepted["takes"] and self.accepted["refuses"] and "beside_mm" in self.accepted)
+
+
+def verdict(task: Mapping[str, Any], method: str) -> Verdict:
+    """The verdict on the service in a set's numbers.
+
+    In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
+    or none.
+    """
+    one, none = task["methods"][method], {"takes": 0}
+    folds_refused, takes = one.get("folds_refused", one["unsafe"]), one["takes"] + one["refuses"]
+    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{one['refuses']} of {takes} takes"
+    if "in_spite_of_refusal" not in one and folds_refused:
+        return Verdict(none, one, folds_refused, refused)
+    return Verdict(one, one.get("in_spite_of_refusal", none), folds_refused, refused if one["refuses"] else "none")
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
@@ -290,27 +303,26 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     panels = []
     for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, via-points given", numbers["made"])):
         rows = []
-        for task, one in sets.items():
-            endings = [ending for ending in ("", TOLD) if SERVICE + ending in one["methods"]]
-            rows += [
-                (task.replace("_", " ") + GIVEN * bool(ending and len(endings) > 1), one["methods"], ending)
-                for ending in endings
-            ]
+        for name, task in sets.items():
+            endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
+            rows += [(name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending) for ending in endings]
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
     figure, axes = plt.subplots(
         len(panels), 1, figsize=(7.5, 1.6 + 0.36 * sum(heights)), height_ratios=heights, squeeze=False, sharex=True
     )
     for ax, (title, rows) in zip(axes[:, 0], panels, strict=True):
-        for y, (_, methods, ending) in enumerate(rows):
+        labels = []
+        for y, (name, task, ending) in enumerate(rows):
+            ours = verdict(task, SERVICE + ending)
+            labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
             ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
-            for name, (_, colour, marker) in SHOWN.items():
-                ax.plot(methods[name + ending].get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
-            ours = methods[SERVICE + ending]
-            ax.plot(ours.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
-            in_spite = ours.get("in_spite_of_refusal", {}).get("rms_mm", np.nan)
-            ax.plot(in_spite, y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
-        ax.set_yticks(range(len(rows)), [_label(*row) for row in rows])
+            for who, (_, colour, marker) in SHOWN.items():
+                one = ours.accepted if who == SERVICE else task["methods"][who + ending]
+                ax.plot(one.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
+            ax.plot(ours.accepted.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
+            ax.plot(ours.in_spite.get("rms_mm", np.nan), y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
+        ax.set_yticks(range(len(rows)), labels)
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
     for label, colour, marker in SHOWN.values():
@@ -318,9 +330,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     axes[0, 0].plot(
         [], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, with the best time shift of each take"
     )
-    if any("in_spite_of_refusal" in methods[SERVICE + ending] for _, rows in panels for _, methods, ending in rows):
-        label = "service, refused by learn, used in spite of it"
-        axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
+    label = "service, refused by learn, used in spite of it"
+    axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
     axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     results.figure(figure)

@@ -25,9 +25,9 @@ from sim.script import PAUSE_RAMP_S, Pause
 
 STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
 SEED, RATE_HZ = EXPERIMENTS["phase"].seeds.evaluation["hands"].seed, 500
-STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # of the hands, in the pause
+STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # the hands stand still
 SETTLED_S = 0.3  # after the hands have stopped
-SHOWN_HZ = 20  # of what the figure shows
+SHOWN_HZ = 20  # rate of the samples in the figure
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -62,13 +62,13 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 
 def _from_its_place_mm(one: Rehearsed, scene: Scene) -> float:
-    """How far the left hand stands from where it takes the board, while the hands pause."""
+    """Distance of the left hand from the handover while the hands pause."""
     at = int(np.searchsorted(one.time_s, STOPPED_S[0]))
     return float(1000 * np.linalg.norm(one.hands[at, 0] - scene.handover))
 
 
 def _passes(time_s: Array, script_s: Array) -> tuple[Any, Any, Any]:
-    """Which ticks are the way forth, back, and forth again over what the hands go back over."""
+    """Ticks forth, back, and forth again on the part of the path that the hands repeat."""
     began, ended = BACK.at_s + PAUSE_RAMP_S / 2, BACK.at_s + BACK.lasts_s - PAUSE_RAMP_S / 2
     back = (time_s >= began) & (time_s <= ended)
     low, high = script_s[back].min(), script_s[back].max()

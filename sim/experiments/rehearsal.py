@@ -5,7 +5,8 @@ tick with the bench.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,28 +26,25 @@ from sim.script import Array, HandScript
 from sim.teach import demonstrate
 from sim.world import World
 
-TREMOR_M, NOISE_M = 0.0015, 0.0005  # of the hands and of the tracker, each axis
+TREMOR_M, NOISE_M = 0.0015, 0.0005  # deviations of hands and tracker, each axis
 
 
-@dataclass
+@dataclass(frozen=True)
 class Rehearsed:
-    """One run: how its events went, and what was seen at each tick, if that was kept.
-
-    Arrays over T ticks.
-    """
+    """The events of a run, and, where these are kept, arrays over its T ticks."""
 
     events: TaskEvents
-    held_s: float  # how long the service did not follow while the hands moved
-    frames: NDArray[np.void] = field(default_factory=lambda: np.empty(0, np.void))
-    time_s: Array = field(default_factory=lambda: np.empty(0))  # of the script; 0 before it begins
-    hands: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # as they are, without noise [m]
-    joints: Array = field(default_factory=lambda: np.empty((0, 2, 0)))  # as measured [rad, rad/s]
-    tool: Array = field(default_factory=lambda: np.empty((0, 3)))  # as measured in the simulation [m]
-    axis: Array = field(default_factory=lambda: np.empty((0, 3)))  # the tool's +z, as measured
+    held_s: float  # time in which the service did not follow while the hands moved
+    frames: NDArray[np.void]
+    time_s: Array  # of the script; 0 before it begins
+    hands: Array  # (T, 2, 3) true positions, without noise [m]
+    joints: Array  # (T, 2, J) as measured [rad, rad/s]
+    tool: Array  # (T, 3) as measured in the simulation [m]
+    axis: Array  # (T, 3) the tool's +z, as measured
 
     @property
     def errors_mm(self) -> tuple[float, float, float]:
-        """Of handover, grasp and carry."""
+        """Errors of handover, grasp and carry."""
         return tuple(getattr(self.events, name).error_mm for name in TaskEvents.__struct_fields__)
 
 
@@ -62,18 +60,13 @@ def rehearse(
 ) -> Rehearsed:
     """One run of a script through core and physics.
 
-    `settings` name the arm and the rate (or else the shipped cell's), unless `rate_hz` is another;
-    `world` is the physics, or else the first installed. `look` is shown the bench after each tick;
-    `keep` keeps what was seen.
+    `settings` name the arm and the rate (default: the shipped cell's); `rate_hz` overrides the
+    rate; `world` is the physics (default: the first installed). `look` sees the bench after each
+    tick; `keep` keeps the arrays.
     """
     settings = settings or Settings()
     settings = msgspec.structs.replace(settings, rate_hz=rate_hz or settings.rate_hz)
-    frames: list[Frame] = []
-    times: list[float] = []
-    hands: list[Array] = []
-    joints: list[tuple[tuple[float, ...], ...]] = []
-    tool: list[tuple[float, ...]] = []
-    axes: list[tuple[float, float, float]] = []
+    rows: list[tuple[Any, ...]] = []
     held = 0
     with Bench(script, settings=settings, world=world) as bench:
 
@@ -82,27 +75,17 @@ def rehearse(
             held += bool(bench.time_s > 0 and frame["mode"] != Mode.FOLLOW)
             if keep:
                 seen = bench.observe()
-                frames.append(frame)
-                times.append(bench.time_s)
-                hands.append(np.stack([seen.hands.left.position, seen.hands.right.position]))
-                joints.append((seen.joints, seen.joint_velocities))
-                tool.append(seen.tool.position)
                 x, y, z, w = seen.tool.orientation
-                axes.append((2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)))
+                axis = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+                hands = np.stack([seen.hands.left.position, seen.hands.right.position])
+                joints = (seen.joints, seen.joint_velocities)
+                rows.append((frame, bench.time_s, hands, joints, seen.tool.position, axis))
             look(bench)
 
         loop = ClosedLoop(bench)
         run(Controller(settings, skill_for(bench), urdf=robot_description(settings)), loop.ticks(), [loop.follow, tap])
-        result = Rehearsed(bench.events(), held * settings.period_s)
-    if keep:
-        result.frames, result.time_s, result.hands, result.tool = (
-            np.array(frames),
-            np.array(times),
-            np.array(hands),
-            np.array(tool),
-        )
-        result.axis, result.joints = np.array(axes), np.array(joints)
-    return result
+        arrays = [np.array(column) for column in zip(*rows, strict=True)] or [np.empty(0)] * 6
+        return Rehearsed(bench.events(), held * settings.period_s, *arrays)
 
 
 def demonstrated(stream: Stream = SHIPPED) -> list[Demonstration]:

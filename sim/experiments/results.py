@@ -11,6 +11,7 @@ import math
 import re
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,34 +28,31 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's colours, which people with colour vision deficiencies tell apart.
-LEFT, RIGHT, TOOL = (
-    "#D55E00",
-    "#0072B2",
-    "#009E73",
-)  # as in the paper: the left hand red, the right one blue, the robot green
+# Okabe and Ito's colours, which people with colour vision deficiencies distinguish. As in the
+# paper, the left hand is red, the right one blue, and the robot green.
+LEFT, RIGHT, TOOL = "#D55E00", "#0072B2", "#009E73"
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = ("#D55E00", "#0072B2", "#009E73")
+SERIES = (LEFT, RIGHT, TOOL)
 DPI, COLOURS = 110, 256
 ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
 
 
 class ExperimentError(ExplainedError):
-    """An experiment that cannot be made; the message says what would help."""
+    """An experiment that cannot be made; the message gives the remedy."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line says for all experiments."""
+    """Options of the command line."""
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
     hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
-    group: Literal["tuning", "test"] = "test"  # of people, for `people`
+    group: Literal["tuning", "test"] = "test"  # the people of `people`
     workers: int = 1  # processes
-    share: float = 1.0  # of the full size, for a quick look
-    arm: str = "wam"  # of `faults` and `motion`: one of the shipped, or a cell's settings
-    numbers: str = ""  # of `sensitivity`: a stage of the core, or one of its numbers; empty: all
+    share: float = 1.0  # share of the full size; less for a quick look
+    arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
+    numbers: str = ""  # for `sensitivity`: a stage of the core, or one of its numbers; empty: all
 
 
 @dataclass
@@ -83,9 +81,8 @@ class Results:
 
         whole = io.BytesIO()
         figure.savefig(whole, dpi=DPI, bbox_inches="tight")
-        Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
-            path, optimize=True
-        )  # a third of the size
+        picture = Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        picture.save(path, optimize=True)  # a third of the size
         figure.clear()
         self.figures.append(path.name)
         self.say(f"{path}")
@@ -114,6 +111,16 @@ class Results:
         found: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
         return found
 
+    def series(self, values: Mapping[str, Sequence[Any]], timeline: str, styles: Mapping[str, Any] = {}) -> None:
+        """Records numbers by path, one a step of a timeline; a path may have a style of its own."""
+        stream = self.recording()
+        for path, numbers in values.items():
+            if path in styles:
+                stream.log(path, styles[path], static=True)
+            steps = [rr.TimeColumn(timeline, sequence=np.arange(len(numbers)))]
+            stream.send_columns(path, steps, rr.Scalars.columns(scalars=np.array(numbers)))
+        stream.disconnect()
+
     def recording(self) -> rr.RecordingStream:
         """A Rerun stream into the experiment's .rrd file; `disconnect` ends it."""
         stream = rr.RecordingStream(f"thirdhand-{self.name}")
@@ -130,13 +137,22 @@ def pyplot() -> Any:
             "the experiments draw with Matplotlib, which is not installed: pip install 'thirdhand[experiments]'"
         ) from None
     mpl.use("Agg")
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # axes of equal scale give up a limit: no news
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of limits that equal scales change
     from matplotlib import pyplot as plt
 
     plt.rcParams.update(
         {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True}
     )
     return plt
+
+
+def brief(value: Any) -> str:
+    """Numbers in one line of progress, by name, with three significant digits."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {brief(one)}" for name, one in value.items())
+    if isinstance(value, (list, tuple)):
+        return f"({' '.join(map(brief, value))})"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -149,31 +165,22 @@ def equal_box(axes: Any, points: Array) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.55 * (high - low).clip(min=1e-3)
     middle = (low + high) / 2
-    axes.set(
-        xlim=middle[0] + half[0] * np.array([-1, 1]),
-        ylim=middle[1] + half[1] * np.array([-1, 1]),
-        zlim=middle[2] + half[2] * np.array([-1, 1]),
-    )
+    axes.set(**{f"{name}lim": (middle[i] - half[i], middle[i] + half[i]) for i, name in enumerate("xyz")})
     axes.set_box_aspect(half, zoom=1.1)
 
 
 def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:
-    """Draws where a 2-D normal (2,), (2, 2) is one standard deviation from its mean."""
+    """Draws the ellipse of one standard deviation of a 2-D normal (2,), (2, 2)."""
     from matplotlib.patches import Ellipse
 
     values, vectors = np.linalg.eigh(covariance)
-    size = 2 * np.sqrt(values)
-    axes.add_patch(
-        Ellipse(
-            (mean[0], mean[1]), size[0], size[1], angle=math.degrees(math.atan2(vectors[1, 0], vectors[0, 0])), **style
-        )
-    )
+    width, height = 2 * np.sqrt(values)
+    angle = math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
+    axes.add_patch(Ellipse((mean[0], mean[1]), width, height, angle=angle, **style))
 
 
 def _plain(value: Any) -> Any:
-    """JSON's own types, numbers with five significant digits; what is not a number or infinite as
-    text.
-    """
+    """JSON's own types, numbers with five significant digits; infinite ones and NaN as text."""
     if isinstance(value, dict):
         return {str(name): _plain(one) for name, one in value.items()}
     if isinstance(value, (list, tuple)):

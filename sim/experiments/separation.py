@@ -12,7 +12,6 @@ from unittest.mock import patch
 
 import msgspec
 import numpy as np
-import rerun as rr
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
@@ -28,26 +27,28 @@ from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.reached import EVENTS, ours
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
 from sim.experiments.workers import shared_out
 from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
 
 SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
-REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # of a thrust
-AHEAD_M = 0.22  # of the tool on its way: there a hand is thrust
+EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
+GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
+REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
+AHEAD_M = 0.22  # distance ahead of the tool, on its path, at which a hand is thrust
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
-SHOWN_SCENES, SHOWN_TICKS = 5, 10  # of the figure: the first scenes, and every so many ticks of them
-HURRY = 0.05  # [m/s] by which a hand is faster than was assumed
-UNHEEDED_EVERY = 4  # scenes: only to tell what it costs to heed anyone
+SHOWN_SCENES, SHOWN_TICKS = 5, 10  # the figure shows the first scenes, and every tenth tick
+HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more is hurried
+UNHEEDED_EVERY = 4  # scenes run without separation too, to measure its cost
 
 
 class ThrustScript(HandScript):
-    """Hands of a random scene; one is thrust in the tool's way once, stays, and goes back.
+    """Hands of a random scene; one is thrust into the tool's path once, stays, and returns.
 
-    Meanwhile the task goes back to where it was, so that nothing of it is missed.
+    Meanwhile the task returns to where it was, so that nothing of it is lost.
     """
 
     def __init__(self, drawn: Drawn) -> None:
@@ -66,7 +67,7 @@ class ThrustScript(HandScript):
                 self._place = ahead[0]
                 break
         later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
-        back = Pause(there_s, self.lasts_s + STAY_S, 2.0)  # by as much as the task went on since at_s
+        back = Pause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
         super().__init__(
             drawn.scene,
             seed=drawn.seed,
@@ -99,8 +100,8 @@ def _reach(u: float) -> tuple[float, float]:
 
 
 class Outcome(NamedTuple):
-    """One run. Ticks at which the tool offers the board to the left hand are judged by the speed
-    for contact, as the service does.
+    """One run. While the tool offers the board to the left hand, the contact speed applies, as in
+    the service.
     """
 
     kind: str
@@ -108,23 +109,23 @@ class Outcome(NamedTuple):
     success: bool
     errors_mm: tuple[float, float, float]
     times_s: tuple[float, float, float]  # of the events
-    away_s: float  # that a hand was thrust in the way
+    away_s: float  # time in which a hand was thrust in
     shapes_mm: float  # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
-    capsules_mm: float  # the same of the capsules that the rule takes for them, which are wider
-    pushed_mm: float  # that a part of the arm went toward a hand that it touched
-    excess_at_once: float  # [m/s] over the rule, the most
-    excess_after_reaction: float  # over the most that the rule allowed within the reaction time
-    excess_hurried: float  # the same at hands that were faster meanwhile than the rule had assumed
-    excess_lasts_s: float  # that a part is above the rule at once by more than SLIP_SPEED_MPS without a break
+    capsules_mm: float  # the same for the capsules of the rule, which are wider
+    pushed_mm: float  # path of a part of the arm toward a hand that it touches
+    excess_at_once: float  # [m/s] largest excess over the rule
+    excess_after_reaction: float  # [m/s] over the largest allowed speed within the reaction time
+    excess_hurried: float  # the same for hands that were faster than the rule had assumed
+    excess_lasts_s: float  # longest time of an excess above SLIP_SPEED_MPS
     fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
-    limited_s: float  # in which separation held the arm back
-    self_mm: float  # nearest that links come to each other, which are kept apart
+    limited_s: float  # time in which separation limited the arm
+    self_mm: float  # least distance of links that are kept apart
     table_mm: float
     near: Array  # (N, 2): distance [m] and speed [m/s] of the pair nearest to its limit, some ticks
 
 
 def run_one(task: tuple[str, int]) -> Outcome:
-    """What became of one scene."""
+    """The outcome of one scene."""
     kind, number = task
     drawn = draw(number, seed=SCENES.seed)
     script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
@@ -189,7 +190,7 @@ def _judged(
 
 
 def _longest(found: NDArray[np.bool_]) -> int:
-    """The most ticks in a row in which something is found, (T, ...)."""
+    """The largest number of consecutive ticks in which something is found, (T, ...)."""
     run, most = np.zeros(found.shape[1:], np.int64), 0
     for now in found:
         run = (run + 1) * now
@@ -198,14 +199,14 @@ def _longest(found: NDArray[np.bool_]) -> int:
 
 
 def _later_by(ticks: int, values: Array) -> Array:
-    """Values (T, ...) so many ticks later, the first ones repeated."""
+    """Values (T, ...) delayed by a number of ticks; the first one is repeated."""
     return np.concatenate([np.repeat(values[:1], ticks, axis=0), values])[: len(values)]
 
 
 def nearest(settings: Settings, body: Body, joints: Array, hands: Array) -> tuple[Array, ...]:
-    """Of each moving capsule of the body and each hand the distance [m], how fast the capsule's
-    nearest point comes, and how fast the hand does [m/s], (T, 2, N) each; then the least distances
-    (T,) [m] of links, and of links and table. Joints (T, 2, J) [rad, rad/s], hands (T, 2, 3) [m].
+    """Distance [m] of each moving capsule of the body from each hand, approach speeds of the
+    capsule's nearest point and of the hand [m/s], (T, 2, N) each; then least distances (T,) [m]
+    between links, and between links and table. Joints (T, 2, J) [rad, rad/s], hands (T, 2, 3) [m].
     """
     people, count = settings.people, int((body.capsules["link"] > 0).sum())
     moving = np.stack([hands, np.gradient(hands, settings.period_s, axis=0)], axis=2)
@@ -268,8 +269,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     for one in shared_out(run_one, tasks, options.workers):
         found[one.kind].append(one)
         if len(found[one.kind]) % max(1, len(scenes) // 5) == 0:
-            results.say(f"{one.kind}: {_summary(found[one.kind])}")
-    _record(results, found)
+            results.say(f"{one.kind}: {brief(_summary(found[one.kind]))}")
+    recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
+    results.series(
+        {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in found.items() for name in recorded}, "scene"
+    )
     numbers = {
         "scenes": len(scenes),
         "rate_hz": RATE_HZ,
@@ -288,7 +292,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 
 def _shown(rows: list[Outcome]) -> dict[str, Any]:
-    """What the figure shows of some scenes: points at distances [mm] and speeds [mm/s]."""
+    """Content of the figure: points at distances [mm] and speeds [mm/s]."""
     near = np.concatenate([one.near for one in rows])
     return {
         "scenes": len(rows),
@@ -304,28 +308,22 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "successes": sum(one.success for one in rows),
         "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
         "overlaps": int((closest < 0).sum()),
-        "pushed_mm": max(one.pushed_mm for one in rows),
-        "excess_at_once": max(one.excess_at_once for one in rows),
-        "excess_after_reaction": max(one.excess_after_reaction for one in rows),
-        "excess_hurried": max(one.excess_hurried for one in rows),
-        "excess_lasts_s": max(one.excess_lasts_s for one in rows),
         "above_after_reaction": sum(one.excess_after_reaction > SLIP_SPEED_MPS for one in rows),
-        "fastest_hand": max(one.fastest_hand for one in rows),
         "limited_s": float(np.mean([one.limited_s for one in rows])),
-        "self_mm": min(one.self_mm for one in rows),
-        "table_mm": min(one.table_mm for one in rows),
+        **{name: max(getattr(one, name) for one in rows) for name in GREATEST},
+        **{name: min(getattr(one, name) for one in rows) for name in ("self_mm", "table_mm")},
     }
 
 
 def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
-    """By how much the events come later than if nobody were heeded [s]."""
+    """Delay of the events [s] against the same scenes without separation."""
     late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
     return {name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())} for i, name in enumerate(EVENTS)}
 
 
 def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:
-    """By how much the task ends later for a thrust than for its scene alone, beyond the time in
-    which the hand was away [s], where both succeed.
+    """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
+    both runs succeed.
     """
     both = [(one, other) for one, other in zip(thrust, undisturbed, strict=True) if one.success and other.success]
     late = np.array([one.times_s[-1] - other.times_s[-1] - one.away_s for one, other in both])
@@ -338,7 +336,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     plt, people = pyplot(), Settings().people
     reaction_s = (Settings().hands.stale_ms + people.reaction_ms) / 1000
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), sharey=True)
-    titles = ("random scenes", "a hand thrust in the way", "random scenes, nobody heeded")
+    titles = ("random scenes", "a hand thrust into the path", "random scenes, without separation")
     colours = (OTHER, ADAPTED, "#595959")
     for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
         shown = numbers["shown"][kind]
@@ -349,21 +347,11 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             rule = [allowed_speed(d, hand, people.brake, reaction_s, people.clearance) for d in distances]
             ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
         closest = shown["closest_of_capsules_mm"]
-        ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"the nearest: {closest:.0f} mm")
+        ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"least distance: {closest:.0f} mm")
         ax.axvline(0, color="black", lw=0.6)
         ax.set_title(f"{title} ({shown['scenes']} shown)", fontsize=9)
         ax.set(xlim=(-100, 1000 * SHOWN_M), ylim=(-0.6, 0.9))
         ax.legend(frameon=False, fontsize=7.5, loc="lower right")
     axes[0].set(ylabel="speed toward the hand [m/s]")
-    axes[1].set(xlabel="distance between the rule's capsules of a part of the arm and of a hand [mm]")
+    axes[1].set(xlabel="distance between the rule's capsules of arm and hand [mm]")
     results.figure(figure)
-
-
-def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
-    stream = results.recording()
-    for kind, rows in found.items():
-        for name in ("capsules_mm", "shapes_mm", "excess_after_reaction"):
-            values: Array = np.array([getattr(one, name) for one in rows])
-            times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]
-            stream.send_columns(f"/{name}/{kind}", times, rr.Scalars.columns(scalars=values))
-    stream.disconnect()

@@ -13,11 +13,11 @@ from sim.experiments.people.moving_hands import PERIOD_S
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)
-PARTS = 3  # of that band
+PARTS = 3  # bands within RIPPLE_HZ
 EDGES_HZ = RIPPLE_HZ[0] * (RIPPLE_HZ[1] / RIPPLE_HZ[0]) ** (np.arange(-5, 7) / PARTS)
-MOVING_MPS = 0.05  # of the tool
+MOVING_MPS = 0.05  # speed of a moving tool
 LABELS = {
-    "truth": ("the hands themselves, through the arm", REFERENCE, "--"),
+    "truth": ("true hands, through the arm", REFERENCE, "--"),
     "ours": ("ours", TOOL, "-"),
     "chase": ("One-Euro filter, then Ruckig after the target", ADAPTED, "-"),
     "no smoothing": ("no smoothing", OTHER, "-"),

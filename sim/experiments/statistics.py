@@ -16,7 +16,7 @@ from sim.experiments.catalogue import DRAWING, EXPERIMENTS
 from sim.experiments.load.live import live_run
 from sim.experiments.reached import EVENTS, places_in, shown
 from sim.experiments.rehearsal import rehearse
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot, rgb
+from sim.experiments.results import ADAPTED, OTHER, Options, Results, brief, pyplot, rgb
 from sim.experiments.rivals.as_skill import in_bench
 from sim.experiments.rivals.gaussian_process import SampleProcess
 from sim.experiments.rivals.method import Learn, Model
@@ -31,7 +31,7 @@ from sim.scene import GRASP_DISTANCE
 
 SEEDS = EXPERIMENTS["statistics"].seeds
 SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
-ELL = 5.0  # of our skill
+ELL = 5.0  # [1/m²] as the shipped skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
 METHODS: dict[str, tuple[str, Learn]] = {
     "ours": ("KMP, taught places\n(the service)", lambda shown: LearnedByService(shipped_skill())),
@@ -43,12 +43,17 @@ METHODS: dict[str, tuple[str, Learn]] = {
     "promp": ("ProMP over time,\nnominal speed", ProMPOverTime().learn),
     "gmr": ("GMR alone", MixtureRegression(COMPONENTS).learn),
 }
-LEAST_MM = 1e-3  # to what errors are rounded: the least that a logarithmic axis shows
+LEAST_MM = 1e-3  # errors are rounded to it; a logarithmic axis shows nothing smaller
+
+
+def colour_of(method: str) -> str:
+    """The colour of a method in the figure and in the recording."""
+    return ADAPTED if method == "ours" else OTHER
 
 
 class Outcome(NamedTuple):
-    """One scene with one method: errors [mm] of the three events, success, and how long the service
-    held [s].
+    """One scene with one method: errors [mm] of the three events, success, and the time in which
+    the service held [s].
     """
 
     method: str
@@ -60,7 +65,7 @@ class Outcome(NamedTuple):
 
 @functools.cache
 def _learned(method: str) -> Model[Places]:
-    """What a method learned, once in a process."""
+    """The model of a method, learned once in a process."""
     return METHODS[method][1](shown())
 
 
@@ -100,8 +105,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
                 "agrees": live.success == inside.success,
             }
         )
-        results.say(f"scene {number} over Zenoh in real time: {in_real_time[-1]}")
-    _record(results, found)
+        results.say(f"scene {number} over Zenoh in real time: {brief(in_real_time[-1])}")
+    paths = {f"/{name}/{method}": (method, i) for method in found for i, name in enumerate(EVENTS)}
+    styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(who))], names=[who]) for path, (who, _) in paths.items()}
+    values = {path: [one.errors_mm[i] for one in found[who]] for path, (who, i) in paths.items()}
+    results.series(values, "scene", styles)
     numbers = {
         "scenes": count,
         "rate_hz": {"ours": OURS_HZ, "rivals": RIVALS_HZ},
@@ -149,7 +157,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     figure, (rates, *events) = plt.subplots(1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1))
     random = np.random.default_rng(DRAWING)
     for i, (method, one) in enumerate(found.items()):
-        colour = ADAPTED if method == "ours" else OTHER
+        colour = colour_of(method)
         rate, (low, high) = 100 * one["successes"] / one["of"], one["rate_95_percent_interval"]
         rates.barh(i, rate, color=colour, height=0.6)
         rates.plot((100 * low, 100 * high), (i, i), color="black", lw=1.2)
@@ -181,15 +189,3 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         fontsize=10,
     )
     results.figure(figure)
-
-
-def _record(results: Results, found: dict[str, list[Outcome]]) -> None:
-    stream = results.recording()
-    for method, rows in found.items():
-        colour = ADAPTED if method == "ours" else OTHER
-        for event, name in enumerate(EVENTS):
-            values: Array = np.array([one.errors_mm[event] for one in rows])
-            stream.log(f"/{name}/{method}", rr.SeriesPoints(colors=[rgb(colour)], names=[method]), static=True)
-            times = [rr.TimeColumn("scene", sequence=np.arange(len(rows)))]
-            stream.send_columns(f"/{name}/{method}", times, rr.Scalars.columns(scalars=values))
-    stream.disconnect()

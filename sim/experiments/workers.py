@@ -19,8 +19,8 @@ def shared_out(
     prepare: Callable[[], None] | None = None,
     chunk: int = 1,
 ) -> Iterator[Outcome]:
-    """What comes of each task, in order: in this process if there is one worker, which is prepared
-    then; else in new ones, which `prepare` first.
+    """The outcome of each task, in order: in this process if there is one worker, which is prepared
+    then; else in new ones, which run `prepare` first.
     """
     if workers == 1:
         yield from map(work, tasks)

@@ -35,10 +35,10 @@ from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
 from sim.parts import PartError
 from sim.script import Array
 
-STANDS_M = 0.001  # a tool that stays this near to where it ends has come to rest
+STANDS_M = 0.001  # a tool that stays within this distance of its end is at rest
 DISK_MB = 64
-BEFORE_S, AFTER_S = 0.3, 1.0  # around a fault, in the figure
-SCRIBE_SILENT_S = 8.0  # until one that is stopped is replaced, and the new one writes
+BEFORE_S, AFTER_S = 0.3, 1.0  # the figure shows this time around a fault
+SCRIBE_SILENT_S = 8.0  # time in which a stopped scribe is replaced, and the new one writes
 Act = Callable[[FaultyCell], None]
 
 
@@ -51,7 +51,7 @@ def _begin_anew(part: str) -> Act:
 
 
 def _and_reset(mend: Act) -> Act:
-    """Mends, then resets a service that is at fault, as an operator would."""
+    """An act that mends, then resets a service in fault, as an operator would."""
 
     def mend_and_reset(cell: FaultyCell) -> None:
         mend(cell)
@@ -116,9 +116,9 @@ FAULTS = {
     "scribe killed": Fault(_stop_or_kill("scribe", KILL), _until_recorded, stops=False, lasts_s=3.0),
     "scribe stopped": Fault(_stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S),
     "disk full": Fault(_fill_the_disk, _empty_the_disk, stops=False, lasts_s=3.0),
-    # what ends the service is the last of its cell
+    # The last of its cell, as it ends the service.
     "service killed": Fault(_kill_the_service, FaultyCell.begin_service),
-    # takes the recordings with it: the first of its cell
+    # The first of its cell, as it removes the recordings.
     "recording folder removed": Fault(_remove_the_folder, _until_recorded, stops=False, network="router", lasts_s=3.0),
     "cable pulled": Fault(
         lambda cell: cell.link.set("down"), _and_reset(lambda cell: cell.link.set("up")), network="link"
@@ -137,9 +137,7 @@ SHORT = (
 
 
 class Recorded:
-    """What the recordings in a folder say of each tick: its mode and reason; and those that are
-    missing.
-    """
+    """Mode and reason of each tick in the recordings of a folder."""
 
     def __init__(self, folder: Path) -> None:
         ticks, modes, reasons = [], [], []
@@ -152,20 +150,20 @@ class Recorded:
         self.ticks, self.modes, self.reasons = (np.array(values, np.int64) for values in (ticks, modes, reasons))
 
     def first_stop(self, after: int) -> tuple[int, str] | None:
-        """The first tick behind one that did not follow, and why."""
+        """The first tick after a given one that did not follow, and its reason."""
         found = np.flatnonzero((self.ticks > after) & (self.modes != Mode.FOLLOW))
         if not len(found):
             return None
         return int(self.ticks[found[0]]), Reason(int(self.reasons[found[0]])).name.lower()
 
     def stopped(self, after: int, until: int) -> int:
-        """How many ticks did not follow."""
+        """The number of ticks that did not follow."""
         return int(((self.ticks > after) & (self.ticks <= until) & (self.modes != Mode.FOLLOW)).sum())
 
 
 def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
-    """When a point came to rest [s] and how far it went until then [m]: times (T,) and places
-    (T, 3) from an event to where it surely rests.
+    """Time at which a point came to rest [s], and its path until then [m]: times (T,) and places
+    (T, 3) from an event until the point surely rests.
     """
     far = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) > STANDS_M)
     rest = min(int(far[-1]) + 1, len(times) - 1) if len(far) else 0
@@ -181,7 +179,7 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
     stop = recorded.first_stop(event.tick)
     hold_ms = None if stop is None else (stop[0] - event.tick) * period_ms
     if hold_ms is not None and hold_ms > 1e3 * (until - event.struck_s):
-        hold_ms = None  # it belongs to what came later
+        hold_ms = None  # it belongs to a later event
     found: dict[str, Any] = {
         "hold_ms": hold_ms,
         "reason": None if stop is None or hold_ms is None else stop[1],
@@ -214,7 +212,7 @@ def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, st
 
 
 def _commanded(told: list[Command], settings: Settings) -> float:
-    """How far the commands led the tool [m]."""
+    """Path of the tool by the commands [m]."""
     if len(told) < 2:
         return 0.0
     arm = Arm(settings, robot_description(settings))
@@ -237,9 +235,9 @@ def disk() -> Iterator[tuple[Path, bool]]:
 
 @dataclass
 class Suffered:
-    """The figures of faults by name, the tool's speed around each (T, 2) [s, m/s], and how many
-    commands went out that are neither recorded nor counted as lost, and how many faults came that
-    nobody struck.
+    """Figures of faults by name, the tool's speed around each (T, 2) [s, m/s], the number of
+    commands that are neither recorded nor counted as lost, and the number of faults that nobody
+    caused.
     """
 
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -251,7 +249,7 @@ class Suffered:
 def suffered(
     names: Sequence[str], say: Callable[[str], None] = lambda line: None, settings: Settings | None = None
 ) -> Suffered:
-    """What came of some faults, each struck once, in a cell of some settings.
+    """The results of some faults, each caused once, in a cell with some settings.
 
     Raises FaultError, LaunchError and PartError.
     """
@@ -273,7 +271,7 @@ def suffered(
 
 
 def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Callable[[str], None]) -> None:
-    """What came of some faults in one cell, which runs meanwhile."""
+    """Cause some faults in one running cell, and add their results."""
     events: list[Event] = []
     with cell:
         for name in names:
@@ -293,8 +291,8 @@ def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Calla
 
 def table(found: dict[str, dict[str, Any]]) -> str:
     """The figures for people to read."""
-    rows = [f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'told':>8}{'lost':>7}{'on again':>10}"]
-    rows += [f"{'':<32}{'ms':>8}{'ms':>9}{'mm':>11}{'mm':>8}{'ticks':>7}{'ms':>10}"]
+    rows = [f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'commanded':>11}{'lost':>7}{'moves again':>13}"]
+    rows += [f"{'':<32}{'ms':>8}{'ms':>9}{'mm':>11}{'mm':>11}{'ticks':>7}{'ms':>13}"]
     for name, one in found.items():
         values = (
             one.get(key)
@@ -302,13 +300,13 @@ def table(found: dict[str, dict[str, Any]]) -> str:
         )
         cells = ("-" if value is None else f"{value:.0f}" for value in values)
         rows.append(
-            f"{name:<32}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, (8, 9, 11, 8, 7, 10), strict=True))
+            f"{name:<32}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, (8, 9, 11, 11, 7, 13), strict=True))
         )
     return "\n".join(rows)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """The figures of every fault, or of a few where less than the full size is wanted."""
+    """The figures of every fault, or of a few for a quick look."""
     came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say, cell_of(options.arm))
     print(table(came.figures), flush=True)
     _draw(results, came)

@@ -30,7 +30,7 @@ from sim.experiments.people.trials import (
     judge,
     seen,
 )
-from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, pyplot
+from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from sim.experiments.rivals.gaussian_process import GaussianProcess
 from sim.experiments.rivals.method import Method, Model
 from sim.experiments.rivals.mixtures import MixtureRegression, TaskParameterised
@@ -45,16 +45,16 @@ SEEDS = EXPERIMENTS["people"].seeds
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
 DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
 PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
-SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # of each person, half with each sigma
+SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # scenes of a person, half with each sigma
 SIGMAS_M = (0.005, 0.010)
 BREAKING_SCENES: dict[Group, int] = {group: len(part["breaking"].numbers) for group, part in PARTS.items()}
 RESAMPLED = 2000
-SAME = 0.05  # candidates whose success differs by no more are as good
+SAME = 0.05  # candidates within this difference of success are equally good
 TEACHER = "teacher"
 
 
 class Entry(NamedTuple):
-    """A method: what it is called, and the parameters that were tried, the chosen ones first."""
+    """A method: its label, and the parameters that were tried, the chosen ones first."""
 
     label: str
     candidates: tuple[Method, ...]
@@ -135,7 +135,7 @@ def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | N
 
 
 def outcomes(task: Task) -> list[Outcome]:
-    """What became of a task's sessions."""
+    """The outcomes of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
         return [judge(None, one) for one in runs]
@@ -159,7 +159,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         if task.kind:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
         else:
-            results.say(f"{task.method:<17} {task.candidate}: {line(rows)}")
+            results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
     main = {task.method: rows for task, rows in found.items() if not task.kind and task.candidate == 0}
     broken = {
         method: {kind: _broken(found[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
@@ -242,7 +242,7 @@ def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
-    """Which candidate is chosen: of those whose success is within SAME of the best, the one whose
+    """The chosen candidate: among those whose success is within SAME of the best, the one whose
     target is nearest to the teacher's tool.
     """
     success = [float(np.mean([one.success for one in rows])) for rows in tried]
@@ -251,7 +251,7 @@ def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
 
 
 def _more(rows: Sequence[Outcome], ours: Sequence[Outcome]) -> dict[str, float]:
-    """By how much it succeeds more often than ours, scene by scene."""
+    """Difference of its success rate to ours, scene by scene."""
     difference = np.array([float(a.success) - float(b.success) for a, b in zip(rows, ours, strict=True)])
     mean, low, high = _resampled(rows, difference)
     return {"mean": mean, "low": low, "high": high}
@@ -273,33 +273,16 @@ def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
     return {"successes": sum(one.success for one in rows), "held": sum(held), "of": len(rows)}
 
 
-def line(rows: Sequence[Outcome]) -> str:
-    """A summary in a line."""
-    s = summary(rows)
-    of = {name: s[name]["mean"] for name in MEASURES}
-    return (
-        f"success {100 * of['success']:3.0f} ({100 * s['success']['low']:.0f}-{100 * s['success']['high']:.0f}), "
-        f"on the way {100 * of['success_on_the_way']:.0f}, "
-        f"events {' '.join(f'{100 * e:.0f}' for e in s['events'])}, path {of['path_rms_mm']:.1f} mm, "
-        f"held {100 * of['held']:.1f} (falsely {100 * of['falsely_held']:.1f}), "
-        f"falsely followed {100 * of['falsely_followed']:.1f}, "
-        f"-log lik. {of['negative_log_likelihood']:.1f}, "
-        f"coverage {100 * of['inside_50']:.0f} {100 * of['inside_95']:.0f}, "
-        f"rms {s['predicted_rms_mm']:.0f} predicted {s['error_rms_mm']:.0f}, "
-        f"delay {1000 * of['delay_s']:.0f} {1000 * of['tool_delay_s']:.0f} ms, too near {100 * of['too_near']:.0f}"
-    )
-
-
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     found = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
-    labels = {TEACHER: "who knows the scene\n(not learned)", **{name: entry.label for name, entry in METHODS.items()}}
+    labels = {TEACHER: "teacher who knows\nthe scene", **{name: entry.label for name, entry in METHODS.items()}}
     colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
     bars = (
-        ("success", 100.0, "success [%]\n(dark: on the teacher's way all through)"),
-        ("path_rms_mm", 1.0, "target off the teacher's tool,\nrms [mm]"),
+        ("success", 100.0, "success [%]\n(dark: on the teacher's path throughout)"),
+        ("path_rms_mm", 1.0, "distance of target and\nteacher's tool, rms [mm]"),
         ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
     )
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
@@ -333,7 +316,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
                 annotation_clip=False,
                 arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colours[method], "relpos": (0, 0.5), "shrinkB": 2},
             )
-    axes[3].set(xlabel="region said to hold [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
+    axes[3].set(xlabel="nominal region [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
     people, scenes = numbers["people"], numbers["scenes_of_each"]
-    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % over people")
+    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % intervals")
     results.figure(figure)

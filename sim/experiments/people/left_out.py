@@ -37,7 +37,7 @@ RATE_HZ, JUDGED_HZ = 125, 25
 LONGEST_SHIFT_S = 1.0
 FAR_M = 1e3  # the corner of a workspace that clamps nothing
 ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
-PLACE_STD_M = 0.003  # of a place that is where a take begins or ends
+PLACE_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
 
 
 class LeftOut(NamedTuple):
@@ -58,8 +58,8 @@ class LeftOut(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What is judged of a take: sums of its samples' squares [m²]; numbers of those that are inside
-    the region of each of LEVELS, and so on.
+    """The judgement of a take: sums of squared errors [m²], and numbers of samples, for example
+    inside the region of each of LEVELS.
     """
 
     samples: int
@@ -71,7 +71,7 @@ class Judged(NamedTuple):
     held: int | None
     unsure: int | None
     wrong: int  # the tool is farther off than UNSURE_M
-    told: int | None  # of these, held or unsure
+    told: int | None  # of these, those where it held or reported to be uncertain
 
 
 @cache
@@ -131,7 +131,7 @@ def _through_core(
 
 
 def _inboxes(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
-    """What comes of a take's hands at each tick."""
+    """The samples of a take's hands at each tick."""
     since = demonstration.stamps_ns - demonstration.stamps_ns[0]
     inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * RATE_HZ) + 1)]
     for side in sides:
@@ -143,7 +143,7 @@ def _inboxes(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Ev
 
 
 def judged(take: LeftOut, said: Predicted) -> Judged:
-    """What is judged of what was predicted of a take."""
+    """The judgement of a prediction of a take."""
     count, errors = len(take.tool), take.tool - said.mean
     shifted = []
     for shift in range(-round(LONGEST_SHIFT_S * JUDGED_HZ), round(LONGEST_SHIFT_S * JUDGED_HZ) + 1):

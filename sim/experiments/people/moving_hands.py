@@ -23,18 +23,18 @@ from sim.scene import Scene
 from sim.script import HandScript
 
 PERIOD_S = 0.002
-NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # below this rate a tracker is a camera, whose noise asks for more
+NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # a tracker below 60 Hz is a camera, and is noisier
 CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # base from a camera's x right, y down
-MOST_SPEED = 1.0  # [m/s] 99th percentile of a hand: faster motion is made smaller
+MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is scaled down
 STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
-MOST_LATE_S = 0.06  # of a wireless tracker's samples
-UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # shares of a recording at which one hand is not seen, for so long
+MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
+UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
 
 
 @dataclass(frozen=True)
 class Moving:
-    """One sequence: the truth at 500 Hz (N, 6), and what a tracker says: stamps (M,) [s], samples
-    (M, 6), both hands [m].
+    """One sequence: the truth at 500 Hz (N, 6), and a tracker's stamps (M,) [s] and samples (M, 6),
+    both hands [m].
     """
 
     name: str
@@ -43,11 +43,11 @@ class Moving:
     stamps: Array
     samples: Array
     stop_s: float = math.nan  # when a sudden stop begins
-    late: Array | None = None  # (M, 2) [s] by which each hand's samples come; inf: they never do
+    late: Array | None = None  # (M, 2) [s] delay of each hand's samples; inf: they never arrive
 
     @property
     def person(self) -> str:
-        """Whose hands they are."""
+        """The name of the person."""
         return self.name.rsplit("_", 1)[0]
 
 
@@ -61,20 +61,27 @@ def recorded(folder: Path, middle: Array) -> list[Moving]:
     return [sequence for number, path in enumerate(files) for sequence in _of_file(path, middle, number)]
 
 
-def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
+def hands_in(path: Path) -> tuple[Array, Array, float]:
+    """A recording: times (T,) [s], both hands (T, 6) [m] in base axes, and the cut-off frequency
+    [Hz] of its noise. Raises ExperimentError.
+    """
     try:
         with np.load(path, allow_pickle=False) as data:
             t = np.asarray(data["t" if "t" in data else "time_s"], np.float64)
             left, right = (_seen(t, np.asarray(data[name], np.float64)) for name in ("left", "right"))
     except (KeyError, ValueError, OSError) as error:
         raise ExperimentError(f"{path}: not a recording of hands: {in_words(error, named=False)}") from None
+    is_camera = 1 / float(np.mean(np.diff(t))) < NOISY_HZ
+    axes = CAMERA_AXES if is_camera else np.eye(3)
+    return t, np.hstack([left @ axes.T, right @ axes.T]), NOISY_CUT_HZ if is_camera else CUT_HZ
+
+
+def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
+    t, hands, cut_hz = hands_in(path)
     t = t - t[0]
     rate = 1 / float(np.mean(np.diff(t)))
-    noisy = rate < NOISY_HZ
-    axes = CAMERA_AXES if noisy else np.eye(3)
-    hands = np.hstack([left @ axes.T, right @ axes.T])
     hands = hands - np.median(hands, axis=0)
-    truth = _smooth(hands, rate, NOISY_CUT_HZ if noisy else CUT_HZ)
+    truth = _smooth(hands, rate, cut_hz)
     speed = np.linalg.norm(np.gradient(truth.reshape(-1, 2, 3), 1 / rate, axis=0), axis=2).max(axis=1)
     scale = min(1.0, MOST_SPEED / float(np.percentile(speed, 99)), 0.3 / float(np.abs(truth).max()))
     spline = CubicSpline(t, middle + scale * truth)
@@ -97,7 +104,7 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
 
 
 def _unseen(stamps: Array, random: np.random.Generator) -> Array:
-    """Lateness (M, 2) of samples of which one hand's are missing, twice."""
+    """Delays (M, 2) of samples of which one hand's are missing, twice."""
     late = np.zeros((len(stamps), 2))
     for share in UNSEEN_AT:
         begin = stamps[-1] * (share + random.uniform(-0.1, 0.1))
@@ -120,7 +127,7 @@ def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
 
 
 def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[Moving]:
-    """People modelled after the recordings, each seen by the trackers of `recorded`'s groups."""
+    """People modelled after the recordings, seen by the trackers of the groups of `recorded`."""
     out = []
     for number in numbers:
         truth = person(number, middle, seconds)
@@ -142,7 +149,7 @@ def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[M
 
 
 def person(seed: int, middle: Array, seconds: float) -> Array:
-    """Overlapping reaches with rests and turns back, and sway: both hands (N, 6) [m]."""
+    """Overlapping reaches with rests and reversals, and sway: both hands (N, 6) [m]."""
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
     x = np.zeros((len(t), 6))
@@ -160,7 +167,7 @@ def person(seed: int, middle: Array, seconds: float) -> Array:
 
 
 def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Generator) -> tuple[Array, Array]:
-    """With outliers of some centimetres, and dropouts of 30 to 90 ms."""
+    """Stamps and samples with outliers of some centimetres, and dropouts of 30 to 90 ms."""
     samples, keep = samples.copy(), np.ones(len(stamps), bool)
     for hand in (0, 3):
         hit = random.random(len(stamps)) < 0.002

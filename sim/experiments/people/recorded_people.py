@@ -11,19 +11,18 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from service.contract.explain import in_words
-from sim.experiments.people.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
+from sim.experiments.people.moving_hands import hands_in
 from sim.experiments.results import Array, ExperimentError
 from sim.people import Person, Tracker, person
 from sim.sessions import SHAPE_STEPS
 
-SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach is what lies between slow moments, and as long as this
-MOST_UNEVEN = 5.0  # a reach's greatest speed over its mean one: beyond it, it is none
-FIRST_NUMBER = 100  # of these people: their other habits are those of no other
+SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach lies between slow moments, and is at least this long
+MOST_UNEVEN = 5.0  # largest ratio of a reach's highest speed to its mean speed
+FIRST_NUMBER = 100  # seeds of their other habits, which no modelled person has
 
 
 def recorded_people(folder: Path) -> list[Person]:
-    """One person for each recording of a folder with any reaches in it. Raises ExperimentError."""
+    """One person for each recording of a folder that has reaches. Raises ExperimentError."""
     files = sorted(folder.glob("*.npz"))
     people = [one for number, path in enumerate(files) if (one := _of_file(path, FIRST_NUMBER + number)) is not None]
     if not people:
@@ -32,16 +31,9 @@ def recorded_people(folder: Path) -> list[Person]:
 
 
 def _of_file(path: Path, number: int) -> Person | None:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            t, left, right = (np.asarray(data[name], np.float64) for name in ("time_s", "left", "right"))
-    except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands: {in_words(error, named=False)}") from None
+    t, hands, cut_hz = hands_in(path)
     rate = 1 / float(np.mean(np.diff(t)))
-    noisy = rate < NOISY_HZ
-    axes = CAMERA_AXES if noisy else np.eye(3)
-    hands = np.hstack([left @ axes.T, right @ axes.T])
-    sos = butter(4, NOISY_CUT_HZ if noisy else CUT_HZ, fs=rate, output="sos")
+    sos = butter(4, cut_hz, fs=rate, output="sos")
     smooth = np.asarray(sosfiltfilt(sos, hands, axis=0))
     reaches = [one for side in (0, 3) for one in _reaches(smooth[:, side : side + 3], rate)]
     if not reaches:
@@ -51,8 +43,8 @@ def _of_file(path: Path, number: int) -> Person | None:
 
 
 def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
-    """Shares of the way (M,) and deviations from it (M, 3) a metre, with the way along x, of the
-    reaches in a hand's path (T, 3) [m].
+    """Reaches in a hand's path (T, 3) [m]: shares of the way (M,), and deviations from it (M, 3)
+    per metre, with the way along x.
     """
     speed = np.linalg.norm(np.gradient(x, 1 / rate_hz, axis=0), axis=1)
     moving = np.flatnonzero(np.diff(np.concatenate([[0], (speed > SLOW_MPS).astype(int), [0]])))

@@ -31,13 +31,13 @@ from sim.sessions import Session
 from sim.teach import places_of
 
 RATE_HZ = 125
-WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # of an event
-NEAR_M, FAST_MPS = 0.05, 0.25  # faster than this nearer than that to a hand is a failure
-WRONG_M = 0.10  # a target so far from the teacher's is followed falsely
-SMOOTHED = 5  # ticks over which a target's velocity is taken where a rival has a memory
+WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # an event succeeds within 10 mm for 0.3 s below 5 cm/s
+NEAR_M, FAST_MPS = 0.05, 0.25  # nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
+WRONG_M = 0.10  # a target farther from the teacher's tool is followed falsely
+SMOOTHED = 5  # ticks; velocity of a target of a rival with a memory is taken over them
 LONGEST_DELAY_S = 0.6
-KEPT = 0.05  # share of the time falsely followed up to which the way was kept
-SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # until when it must be held; after it the hands' estimates are coming back
+KEPT = 0.05  # largest share of the time falsely followed on the teacher's path
+SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +48,15 @@ class Seen:
     ticks: tuple[Tick, ...]
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
-    rest: Array  # (T, 2) how much each hand rests
+    rest: Array  # (T, 2) stillness of each hand, 0 to 1
     fresh: Mask  # (T,) whether both hands are seen, by one source
-    swapped: Mask  # (T,) whether left is taken for right
+    swapped: Mask  # (T,) whether left is reported as right
     hands: Array  # (T, 6) as they are
     tool: Array  # (T, 3) the teacher's
 
     @property
     def due(self) -> Mask:
-        """Where holding is right (T,)."""
+        """True where holding is right (T,)."""
         return np.asarray(~self.fresh | self.swapped)
 
 
@@ -66,7 +66,7 @@ def settings() -> Settings:
 
 
 def ticks(session: Session) -> Iterator[Tick]:
-    """What the tracker says of a session, tick by tick."""
+    """The tracker's samples of a session, tick by tick."""
     inboxes: list[list[Event]] = [[] for _ in range(int(session.lasts_s * RATE_HZ))]
     for side, (stamps, samples) in zip(SIDES, session.samples(), strict=True):
         for stamp, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
@@ -76,7 +76,7 @@ def ticks(session: Session) -> Iterator[Tick]:
 
 
 def seen(session: Session) -> Seen:
-    """The session through tracker and service, which holds for nothing but the hands."""
+    """The session through tracker and service, which holds only because of the hands."""
     known = tuple(ticks(session))
     core = controller(replace(shipped_skill(), threshold=np.inf), settings())
     times = np.arange(len(known)) / RATE_HZ
@@ -91,8 +91,8 @@ def seen(session: Session) -> Seen:
 
 
 class EventOutcome(NamedTuple):
-    """How one event went: whether it succeeded, the least distance [mm] to the place as perceived,
-    then to the true one, and whether the tool held all through its window.
+    """One event: whether it succeeded, least distances [mm] from the perceived and from the true
+    place, and whether the tool held throughout its window.
     """
 
     reached: bool
@@ -102,7 +102,7 @@ class EventOutcome(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a session with a skill. Shares are of the session's ticks."""
+    """The outcome of a session with a skill. Shares are of the session's ticks."""
 
     person: str
     number: int
@@ -115,7 +115,7 @@ class Outcome(NamedTuple):
     held: float
     falsely_held: float
     falsely_followed: float
-    swapped: float  # from 0.3 s after left was taken for right
+    swapped: float  # from 0.3 s after the swap of hands
     swapped_held: float  # of the session, as all shares
     negative_log_likelihood: float
     inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
@@ -124,14 +124,12 @@ class Outcome(NamedTuple):
 
     @property
     def kept(self) -> bool:
-        """A success on the teacher's way, not only at its places."""
+        """True for a success on the teacher's path, not only at its places."""
         return self.success and self.falsely_followed <= KEPT
 
 
 def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
-    """The outcome of a session; None stands for the teacher, who is told the places as the others
-    are.
-    """
+    """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
     found = served(placed, one)
     target, tool, held = found["target"], found["tool"], found["mode"] != Mode.FOLLOW
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
@@ -193,10 +191,10 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
 
 
 def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
-    """A rival's predictions of all ticks, and how its target moves (T, 3, 3).
+    """A rival's predictions at all ticks, and the motion of its target (T, 3, 3).
 
-    Of a memoryless one along the hands' motion, as of the service's skill; of another by
-    differences in time of what it has said.
+    The target of a function of the hands moves along with them, as that of the service's skill; the
+    velocity of others is taken from consecutive predictions.
     """
     s, v, a = one.estimates.transpose(1, 0, 2)
     if placed is None:
@@ -215,7 +213,7 @@ def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
 def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
-    if i == 0:  # the board is wanted where the hand is, as it is seen
+    if i == 0:  # the board belongs where the hand is seen
         told = one.estimates[window, 0, :3] + TOOL_FROM_HAND
         true = one.hands[window, :3] + TOOL_FROM_HAND
     else:
@@ -232,7 +230,7 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOut
 
 
 def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:
-    """By how many ticks `x` (T, 3) comes after `wanted`, and its mean square distance then [m²]."""
+    """Delay [ticks] of `x` (T, 3) behind `wanted`, and the mean square distance at it [m²]."""
     count = len(x)
     found = []
     for delay in range(0, int(LONGEST_DELAY_S * RATE_HZ), 2):

@@ -26,7 +26,7 @@ from sim.experiments.rivals.service import COMPONENTS
 from sim.experiments.scenes import draw
 from sim.scene import GRASP_DISTANCE
 
-PAPER_ELL = 0.5  # of its section III-C, which names no unit: taken as metres
+PAPER_ELL = 0.5  # section III-C, which names no unit; metres are assumed
 SCENES = EXPERIMENTS["hands"].seeds.evaluation["scenes"]
 
 
@@ -38,8 +38,8 @@ class Variant(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """Of T scenes: how far the target is at each event (T, 3) [mm], and how many times as far as
-    the hands it moves there at most (T, 3); how many scenes were refused as contradictory.
+    """Errors of the target at each event (T, 3) [mm] in T scenes, the largest gain from hands to
+    tool there (T, 3), and the number of scenes refused as contradictory.
     """
 
     errors_mm: Array
@@ -93,8 +93,6 @@ def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
 
 
 def _slope(skill: Skill, hands: Array) -> Array:
-    """How the tool moves with the hands (6,) [m]: the velocities (6, 3) for one of 1 m/s of each
-    axis of a hand.
-    """
+    """The tool's velocities (6, 3) for 1 m/s of each axis of the hands, at hands (6,) [m]."""
     at, still = hands.reshape(2, 3), np.zeros((2, 3))
     return np.array([skill.predict(at, way.reshape(2, 3), still).velocity for way in np.eye(6)])

@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 from scipy.stats import wilcoxon
 
-from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, improve
+from kmp import KMP, Correlation, GaussianKernel, GaussianMixture, Gaussians, Improvement, improve
 from service.core.arm.stage import Arm
 from service.core.kinematics import Kinematics
 from service.settings.config import Settings, robot_description
@@ -27,17 +27,17 @@ from sim.experiments.results import ADAPTED, DESIRED, OTHER, REFERENCE, Array, O
 
 ELL, LAMBDA, SHARPNESS = 0.1, 2.0, 5.0  # the paper's ell, lambda and gamma; here over seconds and centimetres
 DURATION_S, POINTS, COMPONENTS = 10.0, 100, 8
-CENTRE_CM = np.array([55.0, 0.0, 40.0])  # of the letter, frame base
-TILT = np.radians(60)  # of the plane it is written in, against the table
+CENTRE_CM = np.array([55.0, 0.0, 40.0])  # centre of the letter, frame base
+TILT = np.radians(60)  # angle between writing plane and table
 DEPTH_STD_CM = 0.8
-VIA_ROWS, VIA_STEP_CM, VIA_VARIANCE = (20, 80), 4.0, 1e-6  # where along the letter, how far from it, [cm²]
-JOINT_WEIGHTS = np.array([3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0])  # W: what moves much of the arm costs more
+VIA_ROWS, VIA_STEP_CM, VIA_VARIANCE = (20, 80), 4.0, 1e-6  # rows along the letter, offset, [cm²]
+JOINT_WEIGHTS = np.array([3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0])  # W: joints near the base cost more
 SEEDS = EXPERIMENTS["correlation"].seeds
 LETTERS, VIA_POINTS = SEEDS.evaluation["letters"], SEEDS.evaluation["points"]
 BASES, EXPLORATION, UPDATES, ROLLOUTS = 8, 0.25, 30, 12
-SPREAD = (0.25, 2.0)  # of random Lambda around 1, drawn evenly in the logarithm
-BEYOND = 2.0  # times the cost at first, for each share by which the distance is overdrawn
-WITHIN, SECANTS, LEAST_SLOPE = 0.01, 8, 0.05  # how equal the distances are made, and by how many secants
+SPREAD = (0.25, 2.0)  # deviation of random Lambda from 1, uniform in the logarithm
+BEYOND = 2.0  # penalty of an exceeded distance: multiple of the first cost, for each share
+WITHIN, SECANTS, LEAST_SLOPE = 0.01, 8, 0.05  # distances agree within 1 %, after at most 8 secants
 SHOWN = "D"
 TIMES = np.linspace(0.0, DURATION_S, POINTS)
 METHODS = {
@@ -95,13 +95,13 @@ class Letter(NamedTuple):
     base: KMP
 
     def distance(self, trajectory: Array) -> float:
-        """Of a trajectory (100, 3) from the reference, root mean square [cm]."""
+        """Root mean square distance [cm] of a trajectory (100, 3) from the reference."""
         return float(np.sqrt(np.mean(np.sum((trajectory - self.base.reference.mean) ** 2, axis=1))))
 
 
 class Policy(NamedTuple):
-    """What a Lambda makes of a letter: the joints' cost [rad], the distance from the reference
-    [cm], and the trajectory (100, 3) [cm].
+    """A letter with a Lambda: cost of the joints [rad], distance from the reference [cm], and the
+    trajectory (100, 3) [cm].
     """
 
     correlation: Correlation
@@ -111,9 +111,8 @@ class Policy(NamedTuple):
 
 
 class Policies(NamedTuple):
-    """Before learning, learned, and three that are equally far from the reference. Only what is
-    tried at that distance counts as a try of the random ones: the trajectories by which each is
-    brought there do not.
+    """Before learning, learned, and three at the same distance from the reference. The number of
+    random ones is that of the rollouts; the secants that scale each are not counted.
     """
 
     first: Policy
@@ -133,8 +132,8 @@ class Trial(NamedTuple):
     costs: Array  # (U + 1,) [rad] of the policy before the first update and after each
     trajectories: list[Array]  # the same
     c: float
-    flipped: float  # share of the correlations of which learning changed the sign
-    largest_miss: float  # of the via-point [cm]
+    flipped: float  # share of the correlations whose sign learning changed
+    largest_miss: float  # distance from the via-point [cm]
 
     def beside_c(self, method: str) -> float:
         """A method's cost as a multiple of that of Lambda = c I."""
@@ -149,7 +148,7 @@ class Trial(NamedTuple):
 
 
 def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
-    """A letter with its via-point of that number, by all methods."""
+    """A letter with the via-point of a number, by all methods."""
     random = np.random.default_rng([number, *map(ord, one.name)])
     via_s = float(TIMES[random.integers(*VIA_ROWS)])
     way = random.standard_normal(3)
@@ -161,30 +160,28 @@ def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
         trajectory = correlation.applied(primitive).mean(TIMES[:, None])
         return Policy(correlation, joints.cost(trajectory), one.distance(trajectory), trajectory)
 
-    def apart(correlation: Correlation) -> float:
+    def distance(correlation: Correlation) -> float:
         return one.distance(correlation.applied(primitive).mean(TIMES[:, None]))
 
-    neutral = Correlation.neutral(np.linspace(0, DURATION_S, BASES)[:, None], width=DURATION_S / BASES, outputs=3)
-    seen: list[Array] = []
+    neutral, seen = unlearned(), list[Array]()
 
     def reward(trajectory: Array) -> float:
         seen.append(trajectory)
         return float(np.exp(-SHARPNESS * joints.cost(trajectory)))
 
-    searched: dict[str, Any] = {"updates": updates, "rollouts": ROLLOUTS, "seed": number}
-    found = improve(primitive, reward, TIMES[:, None], correlation=neutral, exploration=EXPLORATION, **searched)
+    found = searched(primitive, reward, neutral, updates=updates, seed=number)
     learned, first = policy(found.correlation), policy(neutral)
 
     def beyond(trajectory: Array) -> float:
         overdrawn = max(0.0, one.distance(trajectory) / learned.distance - 1)
         return float(np.exp(-SHARPNESS * (joints.cost(trajectory) + BEYOND * first.cost * overdrawn)))
 
-    single, c = scaled(neutral, learned.distance, apart)
+    single, c = scaled(neutral, learned.distance, distance)
     best = min(
-        (policy(scaled(_drawn(neutral, random), learned.distance, apart, begun=c)[0]) for _ in range(len(seen))),
+        (policy(scaled(_drawn(neutral, random), learned.distance, distance, begun=c)[0]) for _ in range(len(seen))),
         key=lambda each: each.cost,
     )
-    more = improve(primitive, beyond, TIMES[:, None], correlation=single, exploration=EXPLORATION * c, **searched)
+    more = searched(primitive, beyond, single, updates=updates, seed=number, exploration=EXPLORATION * c)
     policies = Policies(first, learned, policy(single), best, policy(more.correlation))
     misses = [each.correlation.applied(primitive).mean([[via_s]])[0] - via for each in policies[1:]]
     signs = np.sign(learned.correlation(TIMES[:, None]))
@@ -193,25 +190,44 @@ def tried(one: Letter, number: int, joints: Joints, *, updates: int) -> Trial:
     return Trial(one.name, via_s, via, policies, costs, seen[:: ROLLOUTS + 1], c, flipped, miss)
 
 
+def unlearned() -> Correlation:
+    """Lambda = I, from which each search starts."""
+    return Correlation.neutral(np.linspace(0, DURATION_S, BASES)[:, None], width=DURATION_S / BASES, outputs=3)
+
+
+def searched(
+    primitive: KMP,
+    reward: Callable[[Array], float],
+    correlation: Correlation,
+    *,
+    updates: int,
+    seed: int,
+    exploration: float = EXPLORATION,
+) -> Improvement:
+    """The result of one search for a Lambda, of ROLLOUTS trajectories an update."""
+    search: dict[str, Any] = {"updates": updates, "rollouts": ROLLOUTS, "seed": seed, "exploration": exploration}
+    return improve(primitive, reward, TIMES[:, None], correlation=correlation, **search)
+
+
 def scaled(
-    correlation: Correlation, distance: float, apart: Callable[[Correlation], float], *, begun: float = 1.0
+    correlation: Correlation, wanted: float, distance: Callable[[Correlation], float], *, begun: float = 1.0
 ) -> tuple[Correlation, float]:
-    """The multiple of a Lambda that is so far [cm] from the reference within 1 %, and the
-    multiplier; one near to it where that is out of reach. `begun` is a first guess.
+    """The multiple of a Lambda at the wanted distance [cm] from the reference within 1 %, and the
+    multiplier; the nearest one that the secants found where none is. `begun` is a first guess.
     """
 
     def times(log_c: float) -> Correlation:
         return replace(correlation, theta=np.exp(log_c) * correlation.theta)
 
     before, now = np.log(begun) - 0.3, np.log(begun)
-    off_before, off = (apart(times(x)) / distance - 1 for x in (before, now))
+    off_before, off = (distance(times(x)) / wanted - 1 for x in (before, now))
     for _ in range(SECANTS):
         if abs(off) < WITHIN:
             break
         slope = max((off - off_before) / (now - before), LEAST_SLOPE)
         step = float(np.clip(-off / slope, -1.0, 1.0))
         before, off_before, now = now, off, now + step
-        off = apart(times(now)) / distance - 1
+        off = distance(times(now)) / wanted - 1
     return times(now), float(np.exp(now))
 
 
@@ -221,8 +237,8 @@ def _drawn(neutral: Correlation, random: np.random.Generator) -> Correlation:
 
 
 def _interval(values: list[float], trials: list[Trial]) -> dict[str, float]:
-    """The mean of a value a trial, with a 95 % interval by bootstrap over the letters, and how
-    likely such letters' means are where nothing is to be found (Wilcoxon, two-sided).
+    """The mean of a value of each trial, its 95 % interval by bootstrap over letters, and the
+    p-value of the letters' means (Wilcoxon, two-sided).
     """
     each: dict[str, list[float]] = {}
     for value, trial in zip(values, trials, strict=True):
@@ -258,7 +274,7 @@ class Joints:
 
     def along(self, trajectory: Array) -> Array:
         """Joints (M, 7) [rad] for the tool (M, 3) [cm], as the paper moves them: q + J^+ (xi' -
-        xi), from the posture's nearest at the start.
+        xi), from the solution nearest to the posture.
         """
         metres = trajectory / 100
         here = self._arm.at(self._posture)

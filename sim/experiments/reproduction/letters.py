@@ -20,13 +20,13 @@ WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
 TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
-HALF_CM = 12.5  # of what is drawn of a letter, either way
+HALF_CM = 12.5  # half of the width and height of a drawn letter
 SETS = {"model": "modelled", "recorded": "recorded"}
 NEAR_S = 0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
 
 
 class Case(NamedTuple):
-    """Desired points: times (V,) [s], and where the pen is to be, (V, 2) [cm]."""
+    """Desired points: times (V,) [s], and positions of the pen (V, 2) [cm]."""
 
     name: str
     times: Array

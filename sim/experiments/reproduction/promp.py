@@ -17,7 +17,7 @@ from sim.experiments.reproduction.writing import DURATION_S, TIMES
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, Array, Options, Results, pyplot
 from sim.experiments.rivals.promp import BASES, RIDGE, learned_promp
 
-COLUMNS = 5  # of the figure
+COLUMNS = 5  # letters in a row of the figure
 COLOURS = {"kmp": ADAPTED, "promp": OTHER}
 STYLES = (
     ("o-", ADAPTED),
@@ -37,7 +37,7 @@ PER_DIMENSION = (3, 5, 10)  # basis functions along each input
 MOST_BYTES = 2**30  # for the covariance of the weights; beyond it, it is not made
 ELL, LAMBDA, COMPONENTS, POINTS = 2.0, 0.1, 20, 200
 SAMPLES, DEMONSTRATIONS = 200, 5
-SAMPLE_DEVIATION = 0.003  # of a sample as a reference point: lambda Sigma is about WEIGHT_RIDGE
+SAMPLE_DEVIATION = 0.003  # deviation of a sample as reference point: lambda Sigma is about WEIGHT_RIDGE
 WEIGHT_RIDGE = 1e-6  # the functions are known without noise
 FUNCTIONS = EXPERIMENTS["promp"].seeds.evaluation["functions"]  # times and errors are averaged over them
 OUTPUTS = 3
@@ -226,8 +226,8 @@ def _grid(inputs: int, each: int) -> Callable[[Array], Array]:
 
 
 def _promp(designs: list[Array], y: Array, query: Array) -> Array:
-    """What a ProMP with such basis functions, rows of demonstrations (200, B) with outputs (H, 200,
-    O), predicts at the rows of a query (M, B): (M, O).
+    """Predictions (M, O) at the rows of a query (M, B) by a ProMP with the basis functions of
+    demonstrations (200, B) and outputs (H, 200, O).
 
     The weights' mean is the ridge regression of all demonstrations, each demonstration's weights
     that of what the mean leaves of it: few demonstrations do not reach every basis function, and
@@ -242,7 +242,7 @@ def _promp(designs: list[Array], y: Array, query: Array) -> Array:
     weights = [
         (mean + ridge(design, wanted - design @ mean)).ravel() for design, wanted in zip(designs, y, strict=True)
     ]
-    covariance = np.cov(np.array(weights).T)  # of all weights: what conditioning needs
+    covariance = np.cov(np.array(weights).T)  # conditioning needs that of all weights
     assert covariance.shape == (mean.size,) * 2
     return np.asarray(query @ mean)
 

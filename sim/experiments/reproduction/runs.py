@@ -8,50 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from kmp import Correlation, Gaussians, improve
+from kmp import Gaussians
 from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.reproduction.correlation import (
-    BASES,
-    DURATION_S,
-    EXPLORATION,
-    POINTS,
-    ROLLOUTS,
-    SHARPNESS,
-    SHOWN,
-    TIMES,
-    UPDATES,
-    VIA_STEP_CM,
-    VIA_VARIANCE,
-    Joints,
-    letter,
-)
+from sim.experiments.reproduction import correlation
+from sim.experiments.reproduction.correlation import SHARPNESS, SHOWN, TIMES
 from sim.experiments.results import OTHER, Array, Options, Results, pyplot
 
 SEARCHES = EXPERIMENTS["runs"].seeds.evaluation["searches"]
-VIA_ROW = 50  # of 100 along the letter
+VIA_ROW = 50  # row of the via-point, of 100 along the letter
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    one, joints = letter(SHOWN), Joints()
-    place = one.base.mean(TIMES[VIA_ROW : VIA_ROW + 1, None])[0] + VIA_STEP_CM * np.array([0.0, 0.6, 0.8])
-    desired = Gaussians(place[None], VIA_VARIANCE * np.eye(3)[None])
-    primitive = one.base.adapt(TIMES[VIA_ROW : VIA_ROW + 1, None], desired, tolerance=DURATION_S / POINTS)
-    neutral = Correlation.neutral(np.linspace(0, DURATION_S, BASES)[:, None], width=DURATION_S / BASES, outputs=3)
-    updates, costs, misses = max(2, round(UPDATES * options.share)), [], []
+    one, joints, at = correlation.letter(SHOWN), correlation.Joints(), TIMES[VIA_ROW : VIA_ROW + 1, None]
+    place = one.base.mean(at)[0] + correlation.VIA_STEP_CM * np.array([0.0, 0.6, 0.8])
+    desired = Gaussians(place[None], correlation.VIA_VARIANCE * np.eye(3)[None])
+    primitive = one.base.adapt(at, desired, tolerance=correlation.DURATION_S / correlation.POINTS)
+
+    def reward(trajectory: Array) -> float:
+        return float(np.exp(-SHARPNESS * joints.cost(trajectory)))
+
+    updates, costs, misses = max(2, round(correlation.UPDATES * options.share)), [], []
     for seed in SEARCHES.share(options.share, least=2):
-        found = improve(
-            primitive,
-            lambda trajectory: float(np.exp(-SHARPNESS * joints.cost(trajectory))),
-            TIMES[:, None],
-            correlation=neutral,
-            exploration=EXPLORATION,
-            updates=updates,
-            rollouts=ROLLOUTS,
-            seed=seed,
-        )
+        found = correlation.searched(primitive, reward, correlation.unlearned(), updates=updates, seed=seed)
         costs.append(-np.log(found.rewards) / SHARPNESS)
-        misses.append(float(np.linalg.norm(found.primitive.mean(TIMES[VIA_ROW : VIA_ROW + 1, None])[0] - place)))
+        misses.append(float(np.linalg.norm(found.primitive.mean(at)[0] - place)))
         results.say(f"run {seed}: {costs[-1][0]:.2f} to {costs[-1][-1]:.2f} rad")
     each = np.array(costs)
     numbers = {

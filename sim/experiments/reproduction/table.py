@@ -18,7 +18,7 @@ from sim.experiments.reproduction.promp import conditioned
 from sim.experiments.reproduction.writing import DURATION_S, TIMES
 from sim.experiments.results import ADAPTED, DESIRED, OTHER, Array, ExperimentError, Options, Results, pyplot
 
-WEIGHTS = 20  # of the DMP, for each of x and y: as many as ProMP has basis functions
+WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
 METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}
 SHOWN = ("B", "G")
 

@@ -46,7 +46,7 @@ TARGETS: dict[str, list[tuple[float, float]]] = {
 }
 TARGET_STD_CM, PLACE_STD_CM, SIZE_STD, SLANT_STD, TEMPO_STD = 0.35, 0.3, 0.04, 0.04, 0.05
 SMALLEST_CURVATURE = 0.05  # [1/cm] below it the pen gains no more speed
-STARTING_SHARE = 0.12  # of the way, in which the pen comes to speed
+STARTING_SHARE = 0.12  # share of the path on which the pen accelerates
 
 
 def write(letter: str, *, count: int = DEMONSTRATIONS, seed: int) -> Array:

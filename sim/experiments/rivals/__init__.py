@@ -1,1 +1,1 @@
-"""What the service is compared with: other ways to predict the tool, and other ways to follow."""
+"""Rivals of the service: other predictions of the tool, and other followers of a target."""

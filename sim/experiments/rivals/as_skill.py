@@ -89,7 +89,7 @@ def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: 
 
 
 def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
-    """What is placed as a skill in a bench, made from `skill`; a rival is never far from its data.
+    """A placed model as a skill in a bench, made from `skill`; a rival is never far from its data.
 
     A rival over time starts with the hands, and its motion is that of its means in time.
     """

@@ -26,8 +26,8 @@ from sim.experiments.open_loop import frames, targets
 from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
-SETTLE_TICKS = 1500  # in which the tool goes to where the hands first want it ...
-RESTING_EVERY = 5  # ... which are seen every so many of them
+SETTLE_TICKS = 1500  # before a sequence the tool moves to its first target
+RESTING_EVERY = 5  # ticks from one sample to the next meanwhile
 
 
 class Followed(NamedTuple):
@@ -48,8 +48,8 @@ Follower: TypeAlias = Callable[[Moving], Followed]
 
 
 def ours(skill: Skill, settings: Settings) -> Follower:
-    """The service's core, tick by tick; it never holds for being far from the demonstrations, and
-    keeps no distance from people and things, as no rival does.
+    """The service's core, tick by tick. Like the rivals, it never holds because hands are far from
+    the demonstrations, and keeps no distance from people and things.
     """
     skill = replace(skill, threshold=math.inf)
     settings = msgspec.structs.replace(
@@ -69,7 +69,7 @@ def ours(skill: Skill, settings: Settings) -> Follower:
 
 
 def _ticks(hands: Moving) -> Iterator[Tick]:
-    """Hands that rest at their start, and then what the tracker says, each tick what has come."""
+    """Hands at rest at their start, then the tracker's samples, at the tick of their arrival."""
     count, resting = len(hands.stamps), np.arange(-SETTLE_TICKS, 0, RESTING_EVERY) * PERIOD_S
     stamps = np.concatenate([resting, hands.stamps])
     samples = np.vstack([np.tile(hands.truth[0], (len(resting), 1)), hands.samples])
@@ -95,18 +95,18 @@ class _Chain:
 
     def __init__(self, skill: Skill, settings: Settings) -> None:
         self.skill, self.settings = skill, settings
-        # Rivals plan no stop: nothing slows a tool that is far from its target.
+        # Rivals plan no stop: the speed of a tool far from its target is not reduced.
         eager = Closing(settings.tool.acceleration / 2, settings.tool.max_speed, far_damping=0.0)
         self.arm = Arm(settings, robot_description(settings), eager)
         self.limiter = Limiter(settings.joints, settings.period_s)
         self.orientation = skill.orientation
 
     def targets(self, samples: Array) -> Array:
-        """What the skill makes of samples (M, 6): (M, 3) [m]."""
+        """Targets (M, 3) [m] of the skill for samples (M, 6)."""
         return targets(self.skill, samples, self.settings)
 
     def start(self, position: Vector) -> tuple[Vector, Vector, Vector]:
-        """The joints at rest with the tool at a position."""
+        """Joints at rest with the tool at a position."""
         q = np.array(self.settings.arm.posture)
         dq, ddq = np.zeros((2, len(q)))
         for _ in range(2000):
@@ -119,7 +119,7 @@ class _Chain:
         q, dq, ddq = self.start(setpoints[0, 0])
         tool, joints, limited = np.empty((len(setpoints), 3)), np.empty((len(setpoints), len(q))), 0
         for k, (position, velocity) in enumerate(setpoints):
-            # not at the acceleration that ours passes on: a time-optimal one leaps
+            # Without the acceleration that ours passes on: a time-optimal one jumps.
             wanted = self.arm.step(q, position, velocity, self.orientation, moving=dq)
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
             tool[k], joints[k] = self.arm.at(q).position, dq
@@ -133,13 +133,13 @@ def _followed(tool: Array, joints: Array, limited: int) -> Followed:
 
 
 def _newest(hands: Moving) -> Array:
-    """Which sample is the newest at each tick (N,)."""
+    """Index of the newest sample at each tick (N,)."""
     at = np.ceil(hands.stamps / PERIOD_S - 1e-9)
     return np.maximum(np.searchsorted(at, np.arange(len(hands.truth)), side="right") - 1, 0)
 
 
 def one_euro(hands: Moving, least_hz: float, beta: float) -> Array:
-    """The samples through a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
+    """Samples behind a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
     speed.
     """
     out, x, speed = np.empty_like(hands.samples), hands.samples[0].copy(), np.zeros(6)
@@ -159,7 +159,7 @@ def _share(cut_hz: float, interval_s: float) -> float:
 
 
 def chase(skill: Skill, settings: Settings, *, least_hz: float, beta: float) -> Follower:
-    """A One-Euro filter, then Ruckig to the newest target, which it takes to be at rest."""
+    """A One-Euro filter, then Ruckig to the newest target, assumed at rest."""
     tool = settings.tool
     axis_speed = tool.max_speed / math.sqrt(3)
 
@@ -173,7 +173,7 @@ def chase(skill: Skill, settings: Settings, *, least_hz: float, beta: float) -> 
 
 
 def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
-    """MoveIt Servo's way: inverse kinematics of the newest target, then a Butterworth filter and
+    """As MoveIt Servo: inverse kinematics of the newest target, then a Butterworth filter and
     Ruckig on the joints.
 
     The filter is the first-order one of its plug-in, with its coefficient.
@@ -210,7 +210,7 @@ def unsmoothed(skill: Skill, settings: Settings) -> Follower:
 
 
 def truth(skill: Skill, settings: Settings) -> Follower:
-    """Where the truth wants the tool, straight to inverse kinematics: what the arm makes of it."""
+    """The target of the true hands straight to inverse kinematics: the arm alone."""
 
     def follow(hands: Moving) -> Followed:
         chain = _Chain(skill, settings)
@@ -221,7 +221,7 @@ def truth(skill: Skill, settings: Settings) -> Follower:
 
 
 def _by_ruckig(wanted: Array, limits: tuple[list[float], list[float], list[float]]) -> Array:
-    """States (N, 3, D) of a time-optimal chase of positions (N, D), each taken to be at rest."""
+    """States (N, 3, D) of a time-optimal chase of positions (N, D), each assumed at rest."""
     size = wanted.shape[1]
     solver, question, profile = Ruckig(size, PERIOD_S), InputParameter(size), Trajectory(size)
     question.synchronization = Synchronization.No

@@ -12,14 +12,14 @@ from service.core.skill.skill import Skill
 from sim.experiments.people.moving_hands import PERIOD_S, Moving
 from sim.experiments.results import Array
 
-REACH_S = 0.5  # of the filters into the past
+REACH_S = 0.5  # length of the filters
 LEAST_OUTPUT_HZ = 90  # a slower tracker's samples are filtered to a multiple of its rate
 WEIGHTS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6)  # [s⁶] of squared jerk against squared error
 
 
 class Floor(NamedTuple):
-    """One of them: error, and acceleration and jerk as multiples of the truth's, all root mean
-    squares.
+    """A filter's error, and acceleration and jerk as multiples of the truth's, all root mean
+    square.
     """
 
     error_rms_mm: float
@@ -68,9 +68,7 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
 
 
 def _rows(samples: Array, outputs: Array, up: int, taps: int) -> Array:
-    """What each output is made of: the newest samples, in the columns of its phase between two of
-    them.
-    """
+    """Inputs of each output: the newest samples, in the columns of its phase between two."""
     rows = np.zeros((len(outputs), taps * up))
     for row, output in enumerate(outputs):
         newest, phase = divmod(int(output), up)

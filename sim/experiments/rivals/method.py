@@ -73,7 +73,7 @@ class Placed(Protocol):
 
 
 class Model(Protocol[Scene_contra]):
-    """What a method learned from demonstrations."""
+    """The result of learning from demonstrations."""
 
     def place(self, scene: Scene_contra) -> Placed | Skill:
         """The model, or a skill of the service, in a scene."""

@@ -83,7 +83,7 @@ class LearnedMixture:
 
 
 def log_density(mixture: GaussianMixture, hands: Array) -> Array:
-    """Of hands (T, 6) under a mixture of hands and more: (T,) [nat]."""
+    """Log density (T,) [nat] of hands (T, 6) under a mixture of hands and more."""
     logs = np.log(mixture.weights) + np.stack(
         [
             log_normal(hands, mean[:6], covariance[:6, :6])

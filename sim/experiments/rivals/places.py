@@ -24,7 +24,7 @@ class NoDemonstrations:
     """Kernel regression through via-points and start alone; it never holds, as no data are near."""
 
     ell: float = 5.0  # [1/m²] of exp(-ell |s - s'|²)
-    deviation_m: float = 0.2  # of the tool far from all via-points
+    deviation_m: float = 0.2  # deviation of the tool far from all via-points
 
     def learn(self, demonstrations: Sequence[Shown]) -> NoDemonstrations:
         """Nothing is learned."""
