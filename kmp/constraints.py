@@ -49,11 +49,9 @@ class LinearConstraints(Immutable):
         normals = numbers("constraints.normals", self.normals, len(inputs), "O")
         for j in np.flatnonzero(~normals.any(axis=1))[:1]:
             raise ValueError(f"constraints.normals[{j}] is 0, and must have a direction.")
-        object.__setattr__(self, "inputs", inputs)
-        object.__setattr__(self, "normals", normals)
-        object.__setattr__(self, "bounds", numbers("constraints.bounds", self.bounds, len(inputs)))
-        points = Functionals.checked(inputs, self.directions)
-        object.__setattr__(self, "directions", points.directions)
+        bounds = numbers("constraints.bounds", self.bounds, len(inputs))
+        directions = Functionals.checked(inputs, self.directions).directions
+        self.__dict__.update(inputs=inputs, normals=normals, bounds=bounds, directions=directions)
 
     def __len__(self) -> int:
         return len(self.inputs)

@@ -32,9 +32,7 @@ class Gaussians(Immutable):
 
     def __post_init__(self) -> None:
         mean = numbers("mean", self.mean, "N", "O")
-        n, outputs = mean.shape
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "covariance", covariances("covariance", self.covariance, n, outputs))
+        self.__dict__.update(mean=mean, covariance=covariances("covariance", self.covariance, *mean.shape))
 
     @classmethod
     def of(cls, mean: ArrayLike, *, deviation: ArrayLike) -> Gaussians:

@@ -41,9 +41,8 @@ class GaussianMixture(Immutable):
         if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
             raise ValueError(f"weights: {brief(weights)} given; needed are numbers of sum 1, none below 0.")
         means = numbers("means", self.means, len(weights), "I+O")
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "means", means)
-        object.__setattr__(self, "covariances", covariances("covariances", self.covariances, *means.shape))
+        checked = covariances("covariances", self.covariances, *means.shape)
+        self.__dict__.update(weights=weights, means=means, covariances=checked)
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:

@@ -149,7 +149,6 @@ class KMP(Predictor, Plotted):
         or the equations cannot be solved to working precision.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
-        check_gaussians("desired", desired)
         check_pairs("desired", via, desired, self.outputs)
         if tolerance is None:
             tolerance = self.base.spacing / 2
@@ -235,7 +234,6 @@ class KMP(Predictor, Plotted):
         """
         added = numbers("inputs", inputs, "M", self._dimensions)
         check_some("inputs", added)
-        check_gaussians("reference", reference)
         check_pairs("reference", added, reference, self.outputs)
         before: Solution = self.base.inner.solution
         points = Functionals.checked(added, directions)

@@ -157,8 +157,7 @@ class PeriodicKernel(_OneInput):
     period: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ell", positive("ell", self.ell))
-        object.__setattr__(self, "period", positive("period", self.period))
+        self.__dict__.update(ell=positive("ell", self.ell), period=positive("period", self.period))
 
     @cached_property
     def prior_variance(self) -> Array:

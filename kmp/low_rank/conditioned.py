@@ -55,7 +55,7 @@ class Conditioned(Expansion):
     of `Solution`.
     """
 
-    _not_pickled = frozenset({"database", "_added_points", "_lifted", "_neglected"})
+    _not_pickled = frozenset({"database", "_added_points", "_neglected"})
 
     base: LowRank
     changes: Changes
@@ -146,11 +146,6 @@ class Conditioned(Expansion):
         return Database(self.changes.functionals, self.changes.points)
 
     @cached_property
-    def _lifted(self) -> Array:
-        """z (x) I (r D, U O) of the U points."""
-        return kron_identity(self._z, self.base.w.shape[1])
-
-    @cached_property
     def _neglected(self) -> Array:
         """The kernel's residual between the V added points: k - z^T z (V C, V C)."""
         points, z = self.changes.functionals, self._z[:, : self._added_columns]
@@ -178,9 +173,10 @@ class Conditioned(Expansion):
         first = len(self.base.database) - len(self.changes.replaced)
         check_resolved(parameters, self._added_points, first=first, name=name, both=True)
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
-        cross, _ = lapack.dtrtrs(base_factor, self._lifted, lower=1)
+        d = self.base.w.shape[1]
+        cross, _ = lapack.dtrtrs(base_factor, kron_identity(self._z, d), lower=1)
         matrix = penalty * (cross.T @ cross)
-        neglected = kron_identity(self._neglected, self.base.w.shape[1])
+        neglected = kron_identity(self._neglected, d)
         matrix[: len(neglected), : len(neglected)] += neglected
         blocks = matrix.reshape(count, -1, count, len(matrix) // count)
         points = np.arange(count)

@@ -37,8 +37,7 @@ class AffineMean(Immutable):
                 f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} given, "
                 f"(O, I) and (O,) needed."
             )
-        object.__setattr__(self, "matrix", matrix)
-        object.__setattr__(self, "offset", offset)
+        self.__dict__.update(matrix=matrix, offset=offset)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -5,17 +5,6 @@ A reference is a normal distribution of the output at each of N inputs. A primit
 `gaussian_process`: for inputs of many dimensions; `correlation`: its covariances, from a reward.
 """
 
-from kmp.references.correlation import Correlation, Improvement, improve
 from kmp.references.frames import CoordinateFrame, LocalKMP
-from kmp.references.gaussian_process import gaussian_process_reference
-from kmp.references.superposition import superposed
 
-__all__ = [
-    "CoordinateFrame",
-    "Correlation",
-    "Improvement",
-    "LocalKMP",
-    "gaussian_process_reference",
-    "improve",
-    "superposed",
-]
+__all__ = ["CoordinateFrame", "LocalKMP"]

@@ -47,9 +47,8 @@ class Correlation(Immutable):
     theta: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centres", numbers("centres", self.centres, "B", "I"))
-        object.__setattr__(self, "width", positive("width", self.width))
-        object.__setattr__(self, "theta", numbers("theta", self.theta, len(self.centres), "O"))
+        centres, width = numbers("centres", self.centres, "B", "I"), positive("width", self.width)
+        self.__dict__.update(centres=centres, width=width, theta=numbers("theta", self.theta, len(centres), "O"))
 
     @classmethod
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:

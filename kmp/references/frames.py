@@ -40,8 +40,7 @@ class CoordinateFrame(Immutable):
         matrix = numbers("matrix", self.matrix, len(offset), len(offset))
         if np.linalg.cond(matrix) > 1e12:
             raise ValueError(f"matrix: {brief(matrix)} given, and it must have an inverse.")
-        object.__setattr__(self, "offset", offset)
-        object.__setattr__(self, "matrix", matrix)
+        self.__dict__.update(matrix=matrix, offset=offset)
 
     @classmethod
     def at(cls, origin: ArrayLike) -> CoordinateFrame:
