@@ -149,7 +149,7 @@ class Conditioned(Expansion):
     def _neglected(self) -> Array:
         """The kernel's residual between the V added points: k - z^T z (V C, V C)."""
         points, z = self.changes.functionals, self._z[:, : self._added_columns]
-        return between(self.hyperparameters.kernel, points, points) - z.T @ z
+        return frozen(between(self.hyperparameters.kernel, points, points) - z.T @ z)
 
     def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features z (M, r, C) and L^-1 z (M, r D, O)."""
