@@ -38,15 +38,10 @@ from kmp.predictor import Uncertainty
 from kmp.primitive import KMP
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction
-from kmp.references import (
-    CoordinateFrame,
-    Correlation,
-    Improvement,
-    LocalKMP,
-    gaussian_process_reference,
-    improve,
-    superposed,
-)
+from kmp.references.correlation import Correlation, Improvement, improve
+from kmp.references.frames import CoordinateFrame, LocalKMP
+from kmp.references.gaussian_process import gaussian_process_reference
+from kmp.references.superposition import superposed
 from kmp.selection import Learned, Score, learn
 from kmp.storage import Stored, load, save
 from kmp.time_kernels import PeriodicKernel, VelocityKernel

@@ -1,5 +1,6 @@
-"""Functions over arrays compiled by Numba where that is installed: cached on disk, without
-`fastmath`, so that sums keep their order.
+"""Compilation of functions over arrays by Numba, where Numba is installed.
+
+Compiled code is cached on disk. `fastmath` is off, so that sums keep their order.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ except ImportError:
 
 AVAILABLE = njit is not None
 PLAIN = njit is None or bool(config.DISABLE_JIT)
-"""Whether functions run as plain Python, as a debugger wants them."""
+"""True if functions run as plain Python, as a debugger needs."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """The function, compiled at its first call; its plain Python stays at hand as `.py_func`.
+    """The function, compiled at its first call; `.py_func` is the function as written.
 
     The first compilation of this package's own functions is announced by the logger `kmp`.
 
-    Where no folder can be written to, it is compiled anew at each start. Without Numba it is the
-    function itself.
+    If no cache folder can be written, each start compiles again. Without Numba the function is
+    returned unchanged.
     """
     if njit is None:
         return function
@@ -39,7 +40,7 @@ def compiled(function: F) -> F:
 if njit is not None:
 
     class _Announcement(event.Listener):  # type: ignore[misc]
-        """Says once that functions of this package are compiled, as the caller waits for that."""
+        """One message, before the first compilation, because the caller waits for it."""
 
         def on_start(self, event: Any) -> None:
             function = event.data["dispatcher"].py_func
@@ -50,7 +51,7 @@ if njit is not None:
                 )
 
         def on_end(self, event: Any) -> None:
-            """Nothing to say."""
+            """Ignore the end of a compilation."""
 
         made = False
 

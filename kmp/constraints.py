@@ -1,4 +1,4 @@
-"""Linear inequality constraints: what the mean must obey, whatever the demonstrations say.
+"""Linear inequality constraints g_j . xi(s_j) >= b_j on the mean.
 
 Huang and Caldwell, A Linearly Constrained Nonparametric Framework for Imitation Learning, ICRA 2020
 (arXiv 1909.07374, "LC-KMP").
@@ -21,21 +21,22 @@ from kmp.functionals import Functionals
 from kmp.kernel import between
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, mean_of
+from kmp.solution import ErrorBounds, Expansion, mean_of
 
-_VIOLATION = 1e-9  # of a constraint [unit of the outputs], at most, where its normal has norm 1
-_ENOUGH = 1e-13  # at which the search ends, where rounding allows
-_ROUNDS = 30  # of choosing which constraints act
-_RIDGE = 1e-12  # of the largest eigenvalue, for the start of the search only
+_VIOLATION = 1e-9  # [unit of the outputs] largest violation, for a normal of norm 1
+_CONVERGED = 1e-13  # [unit of the outputs] the search ends at this violation of active constraints
+_ROUNDS = 30  # the search ends after this number of active sets
+_RIDGE = 1e-12  # least eigenvalue over the largest one, at the start of the search only
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearConstraints(Immutable):
-    """J constraints g_j . xi(s_j) >= b_j: a plane that the output must stay on one side of.
+    """J constraints g_j . xi(s_j) >= b_j: the output is on one side of a plane.
 
-    inputs (J, I), normals g (J, O), bounds b (J,) [unit of the outputs, where g has norm 1]. Where
-    a row of `directions` (J, I) is not zero, of the derivative along it instead: a limit of speed.
-    Read-only. Raises ValueError if shapes do not agree, a number is not finite, or a normal is 0.
+    inputs (J, I), normals g (J, O), bounds b (J,) [unit of the outputs, if g has norm 1]. If a row
+    of `directions` (J, I) is not zero, the constraint is on the derivative along it: a limit of
+    speed. Read-only. Raises ValueError if shapes do not agree, a number is not finite, or a normal
+    is 0.
     """
 
     inputs: Array
@@ -48,22 +49,20 @@ class LinearConstraints(Immutable):
         normals = numbers("constraints.normals", self.normals, len(inputs), "O")
         for j in np.flatnonzero(~normals.any(axis=1))[:1]:
             raise ValueError(f"constraints.normals[{j}] is 0, and must have a direction.")
-        object.__setattr__(self, "inputs", inputs)
-        object.__setattr__(self, "normals", normals)
-        object.__setattr__(self, "bounds", numbers("constraints.bounds", self.bounds, len(inputs)))
-        points = Functionals.checked(inputs, self.directions)
-        object.__setattr__(self, "directions", points.directions)
+        bounds = numbers("constraints.bounds", self.bounds, len(inputs))
+        directions = Functionals.checked(inputs, self.directions).directions
+        self.__dict__.update(inputs=inputs, normals=normals, bounds=bounds, directions=directions)
 
     def __len__(self) -> int:
         return len(self.inputs)
 
     @property
     def functionals(self) -> Functionals:
-        """Where they are, and of what."""
+        """The values and derivatives that are constrained."""
         return Functionals(self.inputs, self.directions)
 
     def joined(self, other: LinearConstraints) -> LinearConstraints:
-        """These and the others. Raises ValueError if they have other inputs or outputs."""
+        """These constraints, then the others. Raises ValueError if I or O differs."""
         check_kind("other", other, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
         shapes = [(one.inputs.shape[1], one.normals.shape[1]) for one in (self, other)]
         if shapes[0] != shapes[1]:
@@ -74,12 +73,13 @@ class LinearConstraints(Immutable):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Constrained(Immutable):
+class Constrained(Expansion):
     """The dense solution with J constraints on its mean; LC-KMP, section III.
 
-    The mean is the one of the least cost (4) among those that obey. It is f + sum_j a_j P(., s_j)
-    g_j with the posterior covariance P = k - k (K + lambda Sigma)^-1 k^T and the multipliers
-    a >= 0, which are 0 where a constraint does not act. The covariance is as without constraints.
+    The mean has the least cost (4) of those that satisfy the constraints. It is f + sum_j a_j
+    P(., s_j) g_j with the unconstrained mean f, the posterior covariance P = k - k (K + lambda
+    Sigma)^-1 k^T and the multipliers a >= 0, which are 0 for inactive constraints. The covariance
+    is the unconstrained one.
     The members are those of `Solution`.
     """
 
@@ -102,14 +102,9 @@ class Constrained(Immutable):
         """The N reference points, then the J constraints."""
         return Functionals.concatenated([self.solution.functionals, self.constraints.functionals])
 
-    @property
-    def centres(self) -> Array:
-        """(N + J, I) where they are."""
-        return self.functionals.inputs
-
     @cached_property
     def weights(self) -> Array:
-        """(N + J, O) the weights of the kernels there."""
+        """(N + J, O) the weights of their kernels."""
         constraints, outputs = self.constraints, self.hyperparameters.outputs
         kernel, c = self.hyperparameters.kernel, self.hyperparameters.kernel.channels
         normals = constraints.normals.reshape(len(constraints), c, -1)
@@ -156,9 +151,6 @@ class Constrained(Immutable):
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Constrained:
         return Constrained(self.solution.with_hyperparameters(hyperparameters), self.constraints)
 
-    def with_weights(self, weights: Array) -> Self:
-        return self._with_cached(weights=weights)
-
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         return self.solution.to_arrays()
 
@@ -167,10 +159,10 @@ class Constrained(Immutable):
 
 
 def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
-    """a >= 0 with a slack >= 0 where a is 0, and of 0 where it is not.
+    """Multipliers a >= 0 (J,): the slack is 0 where a > 0, and >= 0 elsewhere.
 
-    The slack moves by stiffness (J, J) times a. Which constraints act comes from a quadratic
-    programme; what is left is mended by the slack that the mean itself has.
+    slack(a) = slack(0) + stiffness (J, J) a. Non-negative least squares gives the active
+    constraints; Newton steps with the slack of the mean itself then remove rounding.
     """
     size = np.sqrt(np.maximum(np.diagonal(stiffness), np.finfo(np.float64).tiny))
     scaled = stiffness / np.outer(size, size)
@@ -182,7 +174,7 @@ def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
     for _ in range(_ROUNDS):
         left = slack(found)
         acts = (found > 0) | (left < 0)
-        if not acts.any() or np.abs(left[acts]).max() <= _ENOUGH:
+        if not acts.any() or np.abs(left[acts]).max() <= _CONVERGED:
             break
         step = np.linalg.lstsq(scaled[np.ix_(acts, acts)], -left[acts] / size[acts], rcond=1e-13)[0] / size[acts]
         found = found.copy()

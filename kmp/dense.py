@@ -1,7 +1,12 @@
-"""The exact solution of equation (9), by one Cholesky factor of K + lambda Sigma.
+"""The exact solution of equation (9), by a Cholesky factor of K + lambda Sigma.
 
-It has N O rows; or N C, where no covariance tells the D outputs of a channel apart: what is
-factorised is then the same matrix D times over.
+alpha = (K (x) I + lambda Sigma)^-1 (mu - m), of N O rows with O = C D. If every Sigma_n is S_n (x)
+I with S_n (C, C) and I of size D, the matrix is the same for each of the D outputs: one factor of
+N C rows then serves them all (`distinct` = 1, else D).
+
+A primitive with changed points shares its base's factor L (p, p). Points added are a border
+(Golub and Van Loan, section 4.2): [[L, 0], [B^T, M]] with B = L^-1 A and M M^T = C - B^T B. Points
+removed, with unit columns E, leave the inverse L^-T (I - Q Q^T) L^-1 with L^-1 E = Q R.
 """
 
 from __future__ import annotations
@@ -15,24 +20,25 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from kmp.arrays.checks import Array
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
 from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
 from kmp.kernel import between
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, check_resolved
+from kmp.solution import ErrorBounds, Expansion, check_resolved
 
-_SHARED = 0.75  # of the points: where fewer come before the first change, a border costs more than a fit
-_TAKEN = 0.125  # of the points: where more are taken out of the factor, that costs more than a fit
-_COLUMNS = 64  # of a factor, copied at once
+_LEAST_SHARED = 0.75  # a border is faster than a fit if at least this share of points precedes the first change
+_MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
+_COLUMNS = 64  # columns of a factor that are copied at once
 
 
-class _Taken(NamedTuple):
-    """The rows that are taken out of what a Cholesky factor L is of: with E the unit columns of
-    these, the inverse of the rest is that of L L^T with I - Q Q^T between L^-T and L^-1, where
-    L^-1 E = Q R.
+class _Removed(NamedTuple):
+    """Rows removed from a matrix L L^T of which L is known.
+
+    With the unit columns E of these rows and L^-1 E = Q R, the inverse of the remaining matrix is
+    that part of L^-T (I - Q Q^T) L^-1.
     """
 
     rows: NDArray[np.intp]  # (q,)
@@ -41,76 +47,78 @@ class _Taken(NamedTuple):
     root: Array  # R (q, q)
 
     @classmethod
-    def out_of(cls, base: Array, rows: NDArray[np.intp]) -> _Taken:
-        """These rows out of L (p, p)."""
+    def out_of(cls, base: Array, rows: NDArray[np.intp]) -> _Removed:
+        """These rows (q,), removed from L L^T (p, p)."""
         unit = np.zeros((len(base), len(rows)), order="F")
         unit[rows, np.arange(len(rows))] = 1.0
         span, root = np.linalg.qr(lapack.dtrtrs(base, unit, lower=1)[0])
         return cls(frozen(rows), frozen(np.delete(np.arange(len(base)), rows)), frozen(span), frozen(root))
 
-    def forth(self, base: Array, right: Array, there: Array | None = None) -> Array:
-        """(I - Q Q^T) L^-1 times (p - q, J), whatever would be `there` (q, J), in the rows taken.
+    def projected(self, base: Array, right: Array, removed: Array | None = None) -> Array:
+        """(I - Q Q^T) L^-1 x (p, J), for the remaining rows of x (p - q, J).
 
-        Best is what the others let expect, None: little is left to project, and few digits lost.
+        The result does not depend on the other rows of x, `removed` (q, J), but its
+        rounding does. None chooses them so that Q^T L^-1 x is 0 before rounding.
         """
-        every = np.zeros((len(base), right.shape[1]), order="F")
-        every[self.kept] = right
-        if there is None:
-            found, _ = lapack.dtrtrs(base, every, lower=1)
-            there = -lapack.dtrtrs(self.root, self.span.T @ found)[0]
-        every[self.rows] = there
-        found, _ = lapack.dtrtrs(base, every, lower=1)
+        padded = np.zeros((len(base), right.shape[1]), order="F")
+        padded[self.kept] = right
+        if removed is None:
+            found, _ = lapack.dtrtrs(base, padded, lower=1)
+            removed = -lapack.dtrtrs(self.root, self.span.T @ found)[0]
+        padded[self.rows] = removed
+        found, _ = lapack.dtrtrs(base, padded, lower=1)
         return np.asarray(found - self.span @ (self.span.T @ found))
 
 
 class _Bordered(NamedTuple):
-    """A Cholesky factor [[L, 0], [B^T, M]], whose L is that of another and not copied; where rows
-    are taken out of that, B is `_Taken.forth` of the border.
+    """A Cholesky factor [[L, 0], [B^T, M]], whose L is shared with the base.
+
+    If rows are removed from L L^T, B is `_Removed.projected` of the border.
     """
 
     base: Array  # L (p, p)
     border: Array  # B (p, m)
     corner: Array  # M (m, m)
-    taken: _Taken | None
+    removed: _Removed | None
 
     def solve(self, right: Array) -> Array:
-        """The inverse of what is factorised times (p - q + m, J)."""
+        """The inverse of the factorised matrix times (p - q + m, J)."""
         shared = len(right) - len(self.corner)
-        if self.taken is None:
-            forth, _ = lapack.dtrtrs(self.base, right[:shared], lower=1)
+        if self.removed is None:
+            forward, _ = lapack.dtrtrs(self.base, right[:shared], lower=1)
         else:
-            forth = self.taken.forth(self.base, right[:shared])
-        last, _ = lapack.dpotrs(self.corner, right[shared:] - self.border.T @ forth, lower=1)
-        first, _ = lapack.dtrtrs(self.base, forth - self.border @ last, lower=1, trans=1)
-        return np.concatenate([first if self.taken is None else first[self.taken.kept], last])
+            forward = self.removed.projected(self.base, right[:shared])
+        last, _ = lapack.dpotrs(self.corner, right[shared:] - self.border.T @ forward, lower=1)
+        first, _ = lapack.dtrtrs(self.base, forward - self.border @ last, lower=1, trans=1)
+        return np.concatenate([first if self.removed is None else first[self.removed.kept], last])
 
     def whole(self) -> Array:
-        """The factor as one (p + m, p + m)."""
+        """The factor as one array (p + m, p + m)."""
         p, n = len(self.base), sum(self.border.shape)
-        factor = np.zeros((n, n), order="F")  # as LAPACK reads it, or each use would copy it
-        for a in range(0, p, _COLUMNS):  # what lies above the diagonal stays untouched, and costs no memory
+        factor = np.zeros((n, n), order="F")  # LAPACK's order: each use would copy another
+        for a in range(0, p, _COLUMNS):  # pages above the diagonal are not written, and take no memory
             factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
         factor[p:, :p], factor[p:, p:] = self.border.T, self.corner
         return frozen(factor)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Dense(Immutable):
-    """The solution for N points; the factors are made when first asked for.
+class Dense(Expansion):
+    """The solution for N points, whose factors are computed when first used.
 
     The members are those of `Solution`.
     """
 
-    # A copy in another process predicts at once; only `adapted` would need the factors again.
+    # A copy in another process predicts without the factors; only `adapted` computes them again.
     _not_pickled = frozenset({"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver"})
 
     hyperparameters: Hyperparameters
     database: Database
     base: Dense | None = None
-    """The solution that shares the first `same` points, and so rows of the factors."""
+    """The solution whose factors this one shares: of the first `same` points."""
     same: int = 0
     gone: NDArray[np.intp] | None = None
-    """The base's points that are not among these; None: those from the `same` on."""
+    """The base's points that were removed; None: all from index `same` on."""
 
     representation: ClassVar[Literal["dense"]] = "dense"
     error_bounds: ClassVar[ErrorBounds] = ErrorBounds(0.0, 0.0)
@@ -119,11 +127,6 @@ class Dense(Immutable):
     def functionals(self) -> Functionals:
         """The N reference points."""
         return self.database.functionals
-
-    @property
-    def centres(self) -> Array:
-        """(N, I) where they are."""
-        return self.database.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -134,7 +137,7 @@ class Dense(Immutable):
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
         columns, solver = (
-            right.reshape(len(self.database) * self.hyperparameters.kernel.channels * self.apart, -1),
+            right.reshape(len(self.database) * self.hyperparameters.kernel.channels * self.distinct, -1),
             self._mean_solver,
         )
         solution = (
@@ -149,26 +152,26 @@ class Dense(Immutable):
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self.inverse_factor.times_one(row.T)
-        own = self._prior_covariance if prior is None else kron_identity(prior, self.apart)
-        return self._of_all(np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1)))
+        own = self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
+        return self._for_all_outputs(np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1)))
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
-        return self._of_all(np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots))
+        return self._for_all_outputs(np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots))
 
     def adapted(self, changes: Changes) -> Dense:
-        """The base's solution with these changes; they share the points before the first change."""
+        """The base's solution with these changes; it shares the base's factor if that is faster."""
         base = self.base or self
         count, gone = len(base.database), changes.replaced
         database, first = base.database.changed(changes), int(gone[0]) if len(gone) else count
-        if count - first > 2 * len(gone) and len(gone) <= _TAKEN * count:
+        if count - first > 2 * len(gone) and len(gone) <= _MOST_REMOVED * count:
             found = Dense(self.hyperparameters, database, base, count - len(gone), gone)
-            if found.apart >= base.apart:
+            if found.distinct >= base.distinct:
                 return found
-        return Dense(self.hyperparameters, database, base, first if first >= _SHARED * count else 0)
+        return Dense(self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0)
 
     def extended(self, database: Database) -> Dense:
-        """The solution of a database that begins with this one's: the factors grow by a border."""
+        """The solution of a database that begins with this one: the factors get a border."""
         bordered = Dense(self.hyperparameters, database, self, len(self.database))
         factors = {"_mean_solver": bordered.mean_factor, "_covariance_solver": bordered.covariance_factor}
         return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
@@ -176,36 +179,33 @@ class Dense(Immutable):
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
         return Dense(hyperparameters, self.database)
 
-    def with_weights(self, weights: Array) -> Self:
-        return self._with_cached(weights=weights)
-
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         return {}
 
     @cached_property
-    def apart(self) -> int:
-        """Outputs of a channel that the factors hold each for itself: all D, or 1 for all."""
+    def distinct(self) -> int:
+        """The number of outputs of a channel in the factors: D, or 1 if one factor serves all."""
         c, d = self.hyperparameters.kernel.channels, self.hyperparameters.channel_outputs
         covariance = self.database.reference.covariance
         first = covariance.reshape(-1, c, d, c, d)[:, :, 0, :, 0]
         return 1 if np.array_equal(covariance, kron_identity(first, d)) else d
 
-    def _of_all(self, covariance: Array) -> Array:
-        """Covariances (..., O, O) of those (..., C apart, C apart) of the outputs held apart."""
-        alike = self.hyperparameters.channel_outputs // self.apart
+    def _for_all_outputs(self, covariance: Array) -> Array:
+        """Covariances (..., O, O), of (..., C distinct, C distinct) in the factors."""
+        alike = self.hyperparameters.channel_outputs // self.distinct
         return kron_identity(covariance, alike) if alike > 1 else covariance
 
     @cached_property
     def _prior_covariance(self) -> Array:
-        return frozen(kron_identity(self.hyperparameters.kernel.prior_variance, self.apart))
+        return frozen(kron_identity(self.hyperparameters.kernel.prior_variance, self.distinct))
 
     @cached_property
     def inverse_factor(self) -> InverseCholeskyFactor:
-        return InverseCholeskyFactor.of(self.covariance_factor, self.apart)
+        return InverseCholeskyFactor.of(self.covariance_factor, self.distinct)
 
     @cached_property
     def mean_factor(self) -> Array:
-        """The lower Cholesky factor (N C apart, N C apart) of K (x) I + lambda Sigma."""
+        """The lower Cholesky factor of K (x) I + lambda Sigma: N C distinct rows and columns."""
         return self._whole("mean_factor", self._mean_solver)
 
     @cached_property
@@ -219,10 +219,10 @@ class Dense(Immutable):
     def _whole(self, name: str, solver: Array | _Bordered) -> Array:
         if isinstance(solver, np.ndarray):
             return solver
-        if solver.taken is None:
+        if solver.removed is None:
             return solver.whole()
-        anew: Array = getattr(Dense(self.hyperparameters, self.database), name)
-        return anew
+        fitted: Array = getattr(Dense(self.hyperparameters, self.database), name)
+        return fitted
 
     @cached_property
     def _mean_solver(self) -> Array | _Bordered:
@@ -237,19 +237,19 @@ class Dense(Immutable):
         return self._factorised(parameters.lambda_covariance, self.base.covariance_factor if self.base else None)
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array | _Bordered:
-        """The factor; with the base's in it, and not copied, where no point was taken out."""
+        """The Cholesky factor with this lambda, bordering the base's if that is shared."""
         rows = self._rows(penalty)
-        if base_factor is not None and self.base is not None and self.base.apart != self.apart:
+        if base_factor is not None and self.base is not None and self.base.distinct != self.distinct:
             d = self.hyperparameters.channel_outputs
-            base_factor = kron_identity(base_factor, d) if self.apart == d else base_factor[::d, ::d]
+            base_factor = kron_identity(base_factor, d) if self.distinct == d else base_factor[::d, ::d]
         if base_factor is None or self.same == 0:
-            # In place: the rows are symmetric, so that their transpose is as LAPACK reads it.
+            # In place: the matrix is symmetric, and its transpose has LAPACK's order.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
             found: Array | _Bordered = frozen(factor)
         else:
             found, info = self._bordered(rows, base_factor)
         if info:
-            point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.apart)
+            point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.distinct)
             raise ValueError(
                 f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
                 f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
@@ -257,25 +257,25 @@ class Dense(Immutable):
         return found
 
     def _bordered(self, rows: Array, base_factor: Array) -> tuple[_Bordered, int]:
-        """The base's factor with these rows, less those of points that are gone; LAPACK's info."""
-        p, taken = rows.shape[1] - len(rows), None
+        """The base's factor bordered by these rows, without removed points; LAPACK's info."""
+        p, removed = rows.shape[1] - len(rows), None
         columns = rows[:, :p].T
         if self.gone is None or self.base is None:
             shared = np.asfortranarray(base_factor[:p, :p])
             border, _ = lapack.dtrtrs(shared, columns, lower=1)
         else:
             shared, kernel = np.asfortranarray(base_factor), self.hyperparameters.kernel
-            o, gone = kernel.channels * self.apart, self.base.database.functionals.take(self.gone)
-            taken = _Taken.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
-            there = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
-            border = taken.forth(shared, columns, kron_identity(there, self.apart))
+            o, gone = kernel.channels * self.distinct, self.base.database.functionals.take(self.gone)
+            removed = _Removed.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
+            across = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
+            border = removed.projected(shared, columns, kron_identity(across, self.distinct))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
-        return _Bordered(frozen(shared), frozen(border), frozen(corner), taken), info
+        return _Bordered(frozen(shared), frozen(border), frozen(corner), removed), info
 
     def _rows(self, penalty: float) -> Array:
-        """The rows of K (x) I + lambda Sigma that the base does not share: all columns."""
+        """The rows of K (x) I + lambda Sigma that the base does not share, with all columns."""
         kernel, same = self.hyperparameters.kernel, self.same
-        c, d, every = kernel.channels, self.apart, self.hyperparameters.channel_outputs
+        c, d, outputs = kernel.channels, self.distinct, self.hyperparameters.channel_outputs
         o = c * d
         points, count, changed = self.database.functionals, len(self.database), len(self.database) - same
         rows = np.zeros((changed, c, d, count, c, d))
@@ -284,6 +284,6 @@ class Dense(Immutable):
             rows[:, :, i, :, :, i] = k
         diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        covariance = self.database.reference.covariance[same:].reshape(changed, c, every, c, every)[:, :, :d, :, :d]
+        covariance = self.database.reference.covariance[same:].reshape(changed, c, outputs, c, outputs)[:, :, :d, :, :d]
         blocks[diagonal, :, diagonal + same, :] += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)

@@ -23,13 +23,13 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     """A `KMP` of samples X (N, I) and y (N,) or (N, O), by scikit-learn's rules.
 
     `ell` [1 / (unit of X)^2] is one number, one for each input (I,), or "scale": 1 / (I x the
-    variance of X). `noise` is the deviation of a sample of y, as a share of y's own. `components`
-    None takes each sample as a reference point of that noise; a number takes the regression of a
-    mixture of so many at each sample (the paper, section II-A), from `random_state`. `lambda_mean`
-    and `lambda_covariance` are those of `KMP.fit` where the variance of y is 1. Far from the
-    samples the mean returns to that of y.
+    variance of X). `noise` is the deviation of a sample of y over the deviation of y. With
+    `components` None, each sample is a reference point of that noise; with a number, the reference
+    is the regression of a mixture of that many components at each sample (the paper, section II-A),
+    with the seed `random_state`. `lambda_mean` and `lambda_covariance` are those of `KMP.fit` for a
+    variance of y of 1. Far from the samples, the mean returns to the mean of y.
 
-    After `fit`: `primitive_`, with all that a `KMP` can do, and `n_features_in_`.
+    After `fit`: the `KMP` as `primitive_`, and `n_features_in_`.
     """
 
     def __init__(
@@ -55,15 +55,15 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:  # noqa: N803
-        """Fits the primitive to samples X (N, I) and y (N,) or (N, O).
+        """Fit the primitive to samples X (N, I) and y (N,) or (N, O).
 
-        Raises ValueError as `KMP.fit` does, and where scikit-learn's own checks do.
+        Raises ValueError as `KMP.fit` and scikit-learn's checks do.
         """
         inputs, outputs = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
         self._one_output = outputs.ndim == 1
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
         spread = outputs.var(axis=0)
-        spread = np.where(spread > 0, spread, 1.0)  # an output that never changes
+        spread = np.where(spread > 0, spread, 1.0)  # a constant output
         variance = squared("noise", self.noise) * np.diag(spread)
         if self.components is None:
             reference = Gaussians(outputs, np.tile(variance, (len(inputs), 1, 1)))
@@ -86,7 +86,7 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def predict(self, X: ArrayLike, return_std: bool = False) -> Any:  # noqa: N803
-        """The mean at X (M, I): (M,) or (M, O), as y was; and with `return_std` the deviations too.
+        """The mean at X (M, I), of y's shape (M,) or (M, O); with `return_std` also the deviations.
 
         Raises NotFittedError before `fit`, and ValueError as `KMP.predict` does.
         """

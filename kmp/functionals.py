@@ -1,4 +1,4 @@
-"""What is known of the output, or asked: its value at an input, or its derivative there."""
+"""Linear functionals of the output: xi(s), or the derivative d/dt xi(s + t v) at t = 0."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kmp.arrays.immutable import Immutable, frozen
 
 
 class Derivatives(NamedTuple):
-    """Which of R functionals are derivatives, and along what."""
+    """The functionals that are derivatives, among R, and their directions."""
 
     rows: NDArray[np.intp]  # (R',) their indices, ascending
     along: Array  # (R', I) their directions, in the kernel's coordinates
@@ -25,8 +25,8 @@ class Derivatives(NamedTuple):
 class Functionals(Immutable):
     """N linear functionals of the output: its value at an input, or its derivative there.
 
-    A Gaussian process that is known by its derivatives is one still: its kernel between two
-    functionals is the kernel of values, derived by either input along either direction.
+    The kernel between two derivatives along u and v is u^T (d^2 k(s, s') / ds ds') v (Rasmussen and
+    Williams 2006, section 9.4).
     """
 
     inputs: Array  # (N, I)
@@ -55,7 +55,7 @@ class Functionals(Immutable):
         return len(self.inputs)
 
     def take(self, index: NDArray[Any] | slice) -> Functionals:
-        """The chosen ones, in the index's order."""
+        """The chosen functionals, in the order of the index."""
         directions = None if self.directions is None else frozen(self.directions[index].copy())
         return Functionals(frozen(self.inputs[index].copy()), directions)
 
@@ -66,7 +66,7 @@ class Functionals(Immutable):
 
     @cached_property
     def values(self) -> NDArray[np.bool_]:
-        """(N,) whether each is a value."""
+        """(N,) true for a value, false for a derivative."""
         if self.directions is None:
             return frozen(np.ones(len(self), dtype=bool))
         return frozen(np.asarray(~self.directions.any(axis=1)))

@@ -1,4 +1,4 @@
-"""Normal distributions as one value: the reference's mu_n and Sigma_n, via-points, predictions."""
+"""Normal distributions N(mu_n, Sigma_n) as one value: references, via-points, predictions."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from kmp.arrays.checks import Array, brief, check_finite, check_kind, numbers, p
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 
-_SYMMETRIC = 1e-9  # of the largest entry: what rounding leaves in a covariance meant to be symmetric
+_SYMMETRIC = 1e-9  # largest asymmetry that counts as rounding, as a share of the largest entry
 _EXACT = 1e-200  # [unit^2] the variance that stands for an exact output
-_EXACT_BELOW = 1e-150  # [unit^2] a turned or scaled exact output's variance is below it too
+_EXACT_BELOW = 1e-150  # [unit^2] a smaller variance is exact: rotation and scaling enlarge _EXACT
 _MACHINE = float(np.finfo(np.float64).eps)
 
 
@@ -32,9 +32,7 @@ class Gaussians(Immutable):
 
     def __post_init__(self) -> None:
         mean = numbers("mean", self.mean, "N", "O")
-        n, outputs = mean.shape
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "covariance", covariances("covariance", self.covariance, n, outputs))
+        self.__dict__.update(mean=mean, covariance=covariances("covariance", self.covariance, *mean.shape))
 
     @classmethod
     def of(cls, mean: ArrayLike, *, deviation: ArrayLike) -> Gaussians:
@@ -61,7 +59,7 @@ class Gaussians(Immutable):
 
     @property
     def exact(self) -> NDArray[np.bool_]:
-        """(N, O) which outputs are exact: of a deviation of 0 in `of`."""
+        """(N, O) true where an output is exact: its deviation in `of` was 0."""
         return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) < _EXACT_BELOW)
 
     def __len__(self) -> int:
@@ -73,9 +71,9 @@ class Gaussians(Immutable):
         return int(self.mean.shape[1])
 
     def __getitem__(self, index: int | slice | NDArray[Any] | Sequence[int]) -> Gaussians:
-        """Some of them, as NumPy would choose: one too is a `Gaussians`, of N = 1.
+        """The distributions that NumPy's indexing chooses; a single one is a `Gaussians` of N = 1.
 
-        Raises IndexError beyond the last.
+        Raises IndexError if an index is out of range.
         """
         chosen = np.arange(len(self))[index]
         return self.take(np.atleast_1d(chosen))
@@ -84,13 +82,13 @@ class Gaussians(Immutable):
         return f"Gaussians({len(self)} over {self.outputs} outputs)"
 
     def take(self, index: NDArray[Any] | slice) -> Gaussians:
-        """The chosen distributions, in the index's order. Raises IndexError beyond the last."""
+        """The chosen distributions, in the order of the index. Raises IndexError out of range."""
         return unchecked(self.mean[index].copy(), self.covariance[index].copy())
 
     def affine(self, matrix: ArrayLike, offset: ArrayLike) -> Gaussians:
         """The distributions of A x + b: (A mu + b, A Sigma A^T), with A (P, O) and b (P,).
 
-        Raises ValueError if the shapes are others, or the rank is lower than P.
+        Raises ValueError if the shapes do not agree, or the rank of A is below P.
         """
         a = numbers("matrix", matrix, "P", self.outputs)
         b = numbers("offset", offset, len(a))
@@ -98,10 +96,10 @@ class Gaussians(Immutable):
         return Gaussians(self.mean @ a.T + b, covariance)
 
     def product(self, *others: Gaussians) -> Gaussians:
-        """The normalised product with others, one by one: the surer a factor, the more it counts.
+        """The normalised products with others, element by element; a small variance weighs more.
 
-        Sigma = (sum_l Sigma_l^-1)^-1, mu = Sigma sum_l Sigma_l^-1 mu_l. Raises ValueError if a
-        factor has another shape.
+        Sigma = (sum_l Sigma_l^-1)^-1, mu = Sigma sum_l Sigma_l^-1 mu_l. Raises ValueError if the
+        shapes differ.
         """
         factors = (self, *others)
         for other in others:
@@ -125,7 +123,7 @@ class Gaussians(Immutable):
 
 
 def unchecked(mean: Array, covariance: Array) -> Gaussians:
-    """Gaussians of arrays that are right by construction: not checked, not copied, but frozen."""
+    """Gaussians of arrays that are correct by construction: frozen, not checked, not copied."""
     self = object.__new__(Gaussians)
     self.__dict__.update(mean=frozen(mean), covariance=frozen(covariance))
     return self
@@ -138,14 +136,14 @@ def fused_mean(covariance: Array, precisions: Sequence[NDArray[Any]], factors: S
 
 
 def check_gaussians(name: str, value: object, outputs: int | None = None) -> None:
-    """Raises ValueError unless the value is `Gaussians`, over so many outputs."""
+    """Raise ValueError unless the value is `Gaussians`, over this number of outputs."""
     check_kind(name, value, Gaussians, "Gaussians(mean (N, O), covariance (N, O, O))")
     if outputs is not None and isinstance(value, Gaussians) and value.outputs != outputs:
         raise ValueError(f"{name}: normals over {value.outputs} outputs given, {outputs} needed.")
 
 
 def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> None:
-    """Raises ValueError unless there is one normal over that many outputs for each input (N, I)."""
+    """Raise ValueError unless each input (N, I) has one normal, over this number of outputs."""
     check_gaussians(name, points)
     if points.mean.shape != (len(inputs), outputs):
         n, given = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
@@ -164,7 +162,7 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
     own = np.diagonal(covariance, axis1=1, axis2=2)
     alone = np.count_nonzero(covariance, axis=2) == 1
-    exact = alone & (own > 0) & (own < _EXACT_BELOW)  # `Gaussians.of` makes these, and others beside them
+    exact = alone & (own > 0) & (own < _EXACT_BELOW)  # exact outputs of `Gaussians.of`, beside others that are not
     filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
     try:
         smallest = np.linalg.eigvalsh(filled)[:, 0]

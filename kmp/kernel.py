@@ -1,4 +1,7 @@
-"""The kernels that stand for the basis functions: how alike two inputs are. Equation (7).
+"""Kernels k(s, s'), the inner products of the basis functions: equation (7) of the paper.
+
+GaussianKernel: k(s, s') = exp(-ell |s - s'|^2). In the coordinates x = stretch * s with r = x - x':
+dk/dx = -2 scale r k and d^2 k / dx dx' = (2 scale I - 4 scale^2 r r^T) k.
 
 A kernel has C channels: 1 where the outputs are values, 2 where they are a value and its rate. Rows
 and columns of its matrices are (point, channel), the channel running faster, so that the O = C D
@@ -22,12 +25,12 @@ from kmp.functionals import Derivatives, Functionals
 
 
 class Kernel(Protocol):
-    """What a primitive asks of its kernel. R centres, I inputs, C channels, D outputs a channel.
+    """The members that a primitive uses. R centres, I inputs, C channels, D outputs a channel.
 
     `values`, `row`, `jacobian` and `curvature` serve one query s, where microseconds count. They
-    are functions of arrays alone, in the coordinates x = stretch * s, in which one scale serves all
-    inputs: of the offsets x - x_r (R, I) from the centres, of the values (R,) there, and of which
-    centres stand for derivatives.
+    are functions of arrays in the coordinates x = stretch * s, in which one scale holds for all
+    inputs: the offsets x - x_r (R, I) from the centres, the values k (R,), and the centres that are
+    derivatives.
     """
 
     @property
@@ -40,40 +43,41 @@ class Kernel(Protocol):
 
     @property
     def period(self) -> float | None:
-        """After which inputs are the same again [unit of the inputs]; None where none are."""
+        """The period of the inputs [unit of the inputs]; None without one."""
 
     @property
     def prior_variance(self) -> Array:
         """k(s, s) (C, C), the same at every input."""
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raises ValueError where the kernel does not go with so many inputs and outputs."""
+        """Raise ValueError if the kernel does not fit this number of inputs and outputs."""
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
-        """The scale, and the stretch (I,) of each input."""
+        """The scale, and the stretch (I,) of the inputs."""
 
     def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
-        """k(a, b) for every pair: (A, I), (B, I) -> (A C, B C).
+        """k(a, b) of every pair: (A, I), (B, I) -> (A C, B C).
 
-        Derived by a along directions (A, I), by b along (B, I), where a direction is not zero.
+        Where a direction in `along_a` (A, I) or `along_b` (B, I) is not zero, the derivative of k
+        by a or b along it.
         """
 
     def variances(self, along: Array) -> Array:
-        """The diagonals (N, C) of k of functionals with itself, for directions (N, I)."""
+        """k (N, C) of N functionals with themselves, for directions (N, I); zero for a value."""
 
     @staticmethod
     def values(offsets: Array, scale: float) -> Array:
-        """k of values (R,), of the distance alone."""
+        """k (R,) of the offsets, as if all centres were values."""
 
     @staticmethod
     def row(offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None) -> Array:
-        """k(s, s_r): (R,) where C is 1, else (C, R C)."""
+        """k(s, s_r): (R,) if C is 1, else (C, R C)."""
 
     @staticmethod
     def jacobian(
         offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
     ) -> Array:
-        """d/dx of sum_r k(s, s_r) w_r, with the weights' rows (D, R C): (O, I)."""
+        """d/dx sum_r k(s, s_r) w_r (O, I), of weights w as rows (D, R C)."""
 
     @staticmethod
     def curvature(
@@ -84,16 +88,16 @@ class Kernel(Protocol):
         direction: Array,
         derivatives: Derivatives | None = None,
     ) -> Array:
-        """d^2/dt^2 of that sum at x + t v for t = 0, with v (I,) and the weights (R C, D): (O,)."""
+        """d^2/dt^2 of that sum (O,) at x + t v for t = 0, of v (I,) and weights (R C, D)."""
 
 
 def between(kernel: Kernel, a: Functionals, b: Functionals) -> Array:
-    """k of every pair of functionals: (A C, B C)."""
+    """k (A C, B C) of every pair of functionals."""
     return kernel(a.inputs, b.inputs, a.directions, b.directions)
 
 
 def variances(kernel: Kernel, functionals: Functionals) -> Array:
-    """k of each functional with itself: the diagonals (N, C)."""
+    """k (N, C) of each functional with itself."""
     if functionals.directions is None:
         return np.broadcast_to(np.diagonal(kernel.prior_variance), (len(functionals), kernel.channels))
     return kernel.variances(functionals.directions)
@@ -135,7 +139,7 @@ class GaussianKernel(Immutable):
         return frozen(np.ones((1, 1)))
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raises ValueError unless there is one ell for each input, or one for all."""
+        """Raise ValueError unless there is one ell for each input, or one for all."""
         if np.ndim(self.ell) and np.size(self.ell) != inputs:
             raise ValueError(
                 f"kernel's ell: {np.size(self.ell)} values given, 1 or {inputs} needed for {inputs} inputs."
@@ -154,7 +158,7 @@ class GaussianKernel(Immutable):
             return k
         i, u = directed(along_a, stretch)
         j, v = directed(along_b, stretch)
-        origin = y[:1].sum(axis=0)  # what is subtracted from each other should be small
+        origin = y[:1].sum(axis=0)  # a shift to the first point, as differences of small numbers round less
         x, y = x - origin, y - origin
         left = 2 * scale * (u @ y.T - np.vecdot(x[i], u)[:, None])  # (I', B)
         right = 2 * scale * (x @ v.T - np.vecdot(y[j], v))  # (A, J')
@@ -219,7 +223,7 @@ def unstretched(inputs: int) -> Array:
 
 
 def directed(along: Array | None, stretch: Array) -> tuple[NDArray[np.intp], Array]:
-    """Which of the directions are not zero, and these in the kernel's coordinates (I', I)."""
+    """Indices (I',) of the directions that are not zero, and these, stretched (I', I)."""
     if along is None:
         return np.empty(0, dtype=np.intp), np.empty((0, len(stretch)))
     rows = np.flatnonzero(along.any(axis=1))

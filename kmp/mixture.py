@@ -1,6 +1,7 @@
-"""The joint distribution of inputs and outputs in the demonstrations, and the reference from it.
+"""Gaussian mixture of the demonstrations, and the reference by mixture regression.
 
-The paper, section II-A.
+P(s, xi) = sum_l pi_l N([s, xi]; mu_l, Sigma_l). The reference at s has the mean and the covariance
+of P(xi | s). The paper, section II-A; Cohn, Ghahramani, Jordan 1996 for the regression.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
-_ITERATIONS = 1000
+_ITERATIONS = 1000  # EM stops after this many steps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture(Immutable):
     """P(s, xi) = sum_l pi_l N(mu_l, Sigma_l), K components over I + O dimensions. Read-only.
 
-    weights (K,), means (K, I+O) [unit], covariances (K, I+O, I+O) [unit^2]. Raises ValueError if
-    the weights are not of sum 1 or one is below 0, and as `Gaussians` does.
+    weights pi (K,), means mu (K, I+O) [unit], covariances Sigma (K, I+O, I+O) [unit^2]. Raises
+    ValueError if the sum of the weights is not 1 or one is below 0, and as `Gaussians` does.
     """
 
     weights: Array
@@ -40,9 +41,8 @@ class GaussianMixture(Immutable):
         if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
             raise ValueError(f"weights: {brief(weights)} given; needed are numbers of sum 1, none below 0.")
         means = numbers("means", self.means, len(weights), "I+O")
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "means", means)
-        object.__setattr__(self, "covariances", covariances("covariances", self.covariances, *means.shape))
+        checked = covariances("covariances", self.covariances, *means.shape)
+        self.__dict__.update(weights=weights, means=means, covariances=checked)
 
     @classmethod
     def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
@@ -52,18 +52,20 @@ class GaussianMixture(Immutable):
         where the unit is the metre. The same seed gives the same mixture, whatever the number of
         threads.
 
-        Raises ValueError if the shape is another, a number is not finite, there are fewer samples
-        than components, or a parameter is out of its range.
+        Raises ValueError if the shape differs, a number is not finite, there are fewer samples than
+        components, or a parameter is out of its range.
         """
         return mixture_of(samples, components=components, seed=seed, regularization=regularization)
 
     def regress(self, inputs: ArrayLike) -> Gaussians:
         """xi | s at each input (N, I): N normals, by Gaussian mixture regression.
 
-        They have the conditional mixture's mean and covariance; by the law of total variance, that
-        is the covariance within the components and that of their means about the mean.
+        With the shares h_l = pi_l N(s; mu_l^s, Sigma_l^ss) / sum_j pi_j N(s; mu_j^s, Sigma_j^ss),
+        the means m_l = mu_l^xi + Sigma_l^xis (Sigma_l^ss)^-1 (s - mu_l^s) and the covariances
+        C_l = Sigma_l^xixi - Sigma_l^xis (Sigma_l^ss)^-1 Sigma_l^sxi of the components given s:
+        mu = sum_l h_l m_l, Sigma = sum_l h_l (C_l + (m_l - mu)(m_l - mu)^T).
 
-        Raises ValueError if the shape is another, a number is not finite, or no output is left.
+        Raises ValueError if the shape differs, a number is not finite, or no output remains.
         """
         s = numbers("inputs", inputs, "N", "I")
         i = self._checked_dimensions(s.shape[1])
@@ -71,7 +73,7 @@ class GaussianMixture(Immutable):
         root = np.linalg.cholesky(self.covariances[:, :i, :i])  # (K, I, I)
         white = np.linalg.solve(root, to_input.transpose(1, 2, 0))  # (K, I, N)
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        with np.errstate(divide="ignore"):  # a component of weight 0 has no share
+        with np.errstate(divide="ignore"):  # log 0 of a component of weight 0: its share is 0
             log_share = np.log(self.weights) - 0.5 * (log_det + (white**2).sum(axis=1).T)  # (N, K)
         share = np.exp(log_share - logsumexp(log_share, axis=1, keepdims=True))
 
@@ -80,16 +82,16 @@ class GaussianMixture(Immutable):
         means = self.means[:, i:] + np.einsum("nki,kio->nko", to_input, gain)
         within = self.covariances[:, i:, i:] - across.transpose(0, 2, 1) @ gain  # (K, O, O)
         mean = np.einsum("nk,nko->no", share, means)
-        apart = means - mean[:, None, :]
+        offsets = means - mean[:, None, :]
         covariance = np.einsum("nk,kop->nop", share, within)
-        covariance = covariance + np.einsum("nk,nko,nkp->nop", share, apart, apart)
+        covariance = covariance + np.einsum("nk,nko,nkp->nop", share, offsets, offsets)
         check_finite("inputs", mean, "far outside the mixture: its mean there")
         return Gaussians(mean, symmetric(covariance))
 
     def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
-        """Inputs (count, I) drawn from the marginal P(s), with I = `dimensions`: a reference's.
+        """Inputs (count, I) of a reference, drawn from the marginal P(s), with I = `dimensions`.
 
-        Raises ValueError if the count is below 1, or no output is left.
+        Raises ValueError if the count is below 1, or no output remains.
         """
         whole("count", count)
         i = self._checked_dimensions(whole("dimensions", dimensions, least=0))
@@ -115,7 +117,7 @@ def mixture_of(
     regularization: float,
     start: GaussianMixture | None = None,
 ) -> GaussianMixture:
-    """`GaussianMixture.fit`, from a mixture of nearly the same samples instead of k-means."""
+    """`GaussianMixture.fit`, whose EM begins at `start` instead of k-means if that is given."""
     data = numbers("samples", samples, "M", "I+O")
     check_some("samples", data.T)
     added = positive("regularization", regularization)
@@ -124,7 +126,7 @@ def mixture_of(
     if len(data) < components:
         given = f"{len(data)} samples given for {components} components"
         raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
-    # Imported here: scikit-learn loads slowly, and whoever only predicts needs none of it.
+    # scikit-learn loads slowly, and predictions do not need it.
     from sklearn.mixture import GaussianMixture as Estimator
     from threadpoolctl import threadpool_limits
 
@@ -144,10 +146,10 @@ def mixture_of(
         **known,
     )
     try:
-        with threadpool_limits(1):  # k-means adds up its threads' shares in whatever order they end
+        with threadpool_limits(1):  # k-means sums its threads' results in the order in which they finish
             found = estimator.fit(data)
         return GaussianMixture(found.weights_, found.means_, symmetric(found.covariances_))
-    except ValueError:  # a covariance that is not positive definite
+    except ValueError:  # a covariance is not positive definite
         raise ValueError(
             f"samples: with regularization {added:g} no mixture of {components} components was found, as one of their "
             "covariances is singular. Give a larger regularization, or fewer components."

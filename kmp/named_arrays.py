@@ -1,4 +1,4 @@
-"""A primitive as named arrays, exact to the bit: what its file holds."""
+"""A primitive as named arrays, exact to the bit, as a file holds them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OF_LOW_RANK = ("pivots", "information", "features")
 
 
 def to_arrays(primitive: KMP) -> dict[str, NDArray[Any]]:
-    """All that `from_arrays` needs, by name: base, via-points, fitted weights, parameters."""
+    """The arrays for `from_arrays`, by name: base, via-points, fitted weights, parameters."""
     base, changes, solution = primitive.base.inner.solution, primitive.inner.changes, primitive.inner.solution
     parameters = base.hyperparameters
     arrays = {
@@ -67,11 +67,11 @@ def to_arrays(primitive: KMP) -> dict[str, NDArray[Any]]:
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> KMP:
-    """The primitive that `to_arrays` gave these arrays for, with its very weights.
+    """The primitive of the arrays of `to_arrays`, with the stored weights.
 
-    Other names are left alone. The factors are made when `predict` or `adapt` first asks for them,
-    and come out the same bit for bit, given the same libraries and kind of processor. Raises
-    ValueError if an array is missing, or the arrays do not go together.
+    Other names are ignored. `predict` and `adapt` compute the factors when they first need them, to
+    the same bits with the same libraries and kind of processor. Raises ValueError if an array is
+    missing, or the arrays do not belong together.
     """
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())

@@ -1,4 +1,4 @@
-"""Orientation as a skill: unit quaternions in a tangent space, with angular velocity.
+"""Skills whose output is an orientation: unit quaternions in a tangent space.
 
 Huang et al., Generalized Orientation Learning in Robot Task Space, ICRA 2019, and Toward
 Orientation Learning and Adaptation in Cartesian Space, T-RO 2021 ("T-RO"). zeta = log(q conj(q_a))
@@ -22,14 +22,14 @@ from kmp.primitive import KMP, checked_primitive
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
 _CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
-_UNIT = 1e-3  # of the norm: what is farther from 1 was not meant to be a unit quaternion
-_FREE = 1e6  # times the largest variance of the reference: the deviation of a rate that may be any
+_UNIT = 1e-3  # a norm farther from 1 is an error of the caller
+_FREE = 1e6  # variance of a rate that is not prescribed, over the largest one of the reference
 
 
 def continuous(quaternions: ArrayLike) -> Array:
-    """The same orientations (T, 4), of norm 1, with signs that make neighbours near. x y z w.
+    """The same orientations (T, 4), of norm 1, with signs so that q_t . q_(t+1) >= 0. x y z w.
 
-    Raises ValueError if the shape is another, a number is not finite, or a norm is far from 1.
+    Raises ValueError if the shape differs, a number is not finite, or a norm is far from 1.
     """
     q = _unit("quaternions", quaternions).copy()
     signs = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
@@ -38,7 +38,7 @@ def continuous(quaternions: ArrayLike) -> Array:
 
 
 def multiplied(a: Array, b: Array) -> Array:
-    """The products a b (..., 4): first b, then a. x y z w. Raises ValueError if shapes differ."""
+    """The products a b (..., 4): rotation b, then a. Raises ValueError if shapes differ."""
     a, b = real("a", a), real("b", b)
     for name, one, other in (("a", a, b), ("b", b, a)):
         if one.shape[-1:] != (4,) or (one.ndim > 1 and other.ndim > 1 and one.shape != other.shape):
@@ -54,9 +54,9 @@ def multiplied(a: Array, b: Array) -> Array:
 def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
     """zeta = log(q conj(q_a)) (T, 3) [rad, half the angle], for q (T, 4), q_a (4,).
 
-    T-RO, section II. Signs count as they are given. Raises ValueError if a shape is another, a
-    number is not finite, a norm is far from 1, or q = -q_a, where the angle of rotation would be
-    360 degrees.
+    zeta = angle * axis for q conj(q_a) = (axis sin(angle), cos(angle)). T-RO, section II. q and -q
+    differ here. Raises ValueError if a shape differs, a number is not finite, a norm is far from
+    1, or q = -q_a, where the angle of rotation would be 360 degrees.
     """
     q_a = _unit("auxiliary", auxiliary, 4)
     q = multiplied(_unit("quaternions", quaternions), q_a * _CONJUGATE)
@@ -71,7 +71,8 @@ def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
 def exp(zeta: Array, auxiliary: Array) -> Array:
     """q = exp(zeta) q_a (T, 4) for zeta (T, 3) [rad, half the angle], q_a (4,). x y z w.
 
-    T-RO, section II. Raises ValueError if a shape is another.
+    exp(zeta) = (zeta sin|zeta| / |zeta|, cos|zeta|). T-RO, section II. Raises ValueError if a shape
+    differs.
     """
     zeta, auxiliary = numbers("zeta", zeta, "T", 3), numbers("auxiliary", auxiliary, 4)
     angle = np.linalg.norm(zeta, axis=1, keepdims=True)
@@ -80,10 +81,11 @@ def exp(zeta: Array, auxiliary: Array) -> Array:
 
 
 def rotation_per_zeta(zeta: ArrayLike) -> Array:
-    """J (3, 3): small rotations [rad] and angular velocities are J times changes of zeta (3,).
+    """J (3, 3): a small rotation [rad], or angular velocity, is J times the change of zeta (3,).
 
-    Twice the left Jacobian of the rotation by 2 zeta: exact where the papers take differences over
-    a step of time. Raises ValueError if the shape is another or a number is not finite.
+    Twice the left Jacobian of SO(3) at v = 2 zeta: J = 2 (I + (1 - cos|v|) / |v|^2 [v] + (|v| -
+    sin|v|) / |v|^3 [v]^2) with the cross product matrix [v]. The papers take finite differences in
+    time instead. Raises ValueError if the shape differs or a number is not finite.
     """
     vector = 2 * numbers("zeta", zeta, 3)
     angle = float(np.linalg.norm(vector))
@@ -99,10 +101,10 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
 class OrientationKMP(Immutable):
     """A skill whose output is an orientation: a primitive of zeta, over time with its rate.
 
-    Learn it so: make each demonstration's quaternions `continuous`, take `log` with a common
-    auxiliary quaternion (any in the midst of them), learn a reference of zeta (with its rate, and a
-    VelocityKernel, if driven by time), and fit the primitive. Raises ValueError if the primitive
-    has other outputs, or the auxiliary quaternion is none.
+    To learn one: make each demonstration's quaternions `continuous`, take `log` with a common
+    auxiliary quaternion near the middle of them, learn a reference of zeta (over time with its rate
+    and a VelocityKernel), and fit the primitive. Raises ValueError if the primitive has other
+    outputs, or the auxiliary quaternion is not one.
     """
 
     primitive: KMP
@@ -121,9 +123,10 @@ class OrientationKMP(Immutable):
         return exp(self.primitive.mean(queries)[:, :3], self.auxiliary)
 
     def predict(self, queries: ArrayLike) -> tuple[Array, Array]:
-        """The orientations (M, 4) at queries (M, I), and covariances (M, 3, 3) [rad^2] about them.
+        """The orientations (M, 4) at queries (M, I), and covariances J Sigma J^T (M, 3, 3) [rad^2].
 
-        The covariances are of small rotations, in the world. Raises ValueError as `KMP.predict`.
+        The covariances are those of small rotations in the world, with J of `rotation_per_zeta`.
+        Raises ValueError as `KMP.predict`.
         """
         found = self.primitive.predict(queries)
         zeta = found.mean[:, :3]
@@ -133,8 +136,8 @@ class OrientationKMP(Immutable):
     def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
         """omega (3,) [rad/s] at one query (I,) that moves with (I,) [unit of the inputs / s].
 
-        Over time the velocity of the input is 1. Raises ValueError if a shape is another or a
-        number is not finite.
+        omega = J dzeta/dt with J of `rotation_per_zeta`. If the input is time, its velocity is 1.
+        Raises ValueError if a shape differs or a number is not finite.
         """
         still = np.zeros(self.primitive.inputs.shape[1])
         moving = self.primitive.predict_motion(query, velocity, still, covariance=False)
@@ -152,13 +155,13 @@ class OrientationKMP(Immutable):
     ) -> OrientationKMP:
         """A new skill that also goes through orientations (V, 4) at inputs (V, I). x y z w.
 
-        Of q and -q, the nearer is taken. `covariance` (3, 3) or (V, 3, 3) [rad^2] is of small
-        rotations; 0 stands for the least that rounding does not hide. Skills over time take angular
-        velocities too, (V, 3) [rad/s] with their covariance [(rad/s)^2]; left out, they are free.
-        `tolerance` [unit of the inputs] is that of `KMP.adapt`.
+        Of q and -q, the one nearer to the skill's present mean is used. `covariance` (3, 3) or
+        (V, 3, 3) [rad^2] is that of small rotations; 0 is the least that rounding does not hide.
+        Skills with rates take angular velocities too, (V, 3) [rad/s] with their covariance
+        [(rad/s)^2]; None leaves them free. `tolerance` [unit of the inputs] is that of `KMP.adapt`.
 
-        Raises ValueError as that does, if a quaternion is none, or if rates do not go with the
-        skill.
+        Raises ValueError as `KMP.adapt` does, if a quaternion has another norm than 1, or if rates
+        are given to a skill without.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
         if tolerance is not None:
@@ -188,10 +191,11 @@ class OrientationKMP(Immutable):
 
     @staticmethod
     def _turned(name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
-        """Covariances (V, 3, 3) of zeta or its rate, of those given of rotations; 0 means exact.
+        """Covariances J^-1 S J^-T (V, 3, 3) of zeta or its rate, of S of rotations; 0 is exact.
 
-        `least` is the least variance of zeta that rounding does not hide. A rotation's is at most 4
-        times that of zeta. Raises ValueError where a covariance is none, or is too small.
+        `back` is J^-1 (V, 3, 3). `least` is the least variance of zeta that rounding does not hide;
+        a rotation's is at most 4 times that of zeta. Raises ValueError if a covariance is not
+        positive definite, or too small.
         """
         count, given = len(back), real(name, covariance)
         given = numbers(name, np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given, count, 3, 3)
@@ -211,7 +215,7 @@ class OrientationKMP(Immutable):
         return OrientationKMP(self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary)
 
     def _nearest(self, inputs: Array, quaternions: Array) -> Array:
-        """zeta (V, 3) of the signs that are nearer to what the skill does there now."""
+        """zeta (V, 3) of q or -q, whichever is nearer to the skill's present mean."""
         signs = np.where((self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
         return log(signs * quaternions, self.auxiliary)
 

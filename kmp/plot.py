@@ -1,4 +1,4 @@
-"""What a primitive predicts, drawn by Matplotlib: over its input, or one output over another."""
+"""Pictures of a primitive by Matplotlib: outputs over the input, or one output over another."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.path import Path
 
-_QUERIES = 200  # along the input, where none are given
-_REGIONS = ((2, 0.18, "2 deviations"), (1, 0.35, "1 deviation"))  # times, opacity; from back to front
+_QUERIES = 200  # number of queries along the input, if none are given
+_REGIONS = ((2, 0.18, "2 deviations"), (1, 0.35, "1 deviation"))  # multiple, opacity; back to front
 _REFERENCE: dict[str, Any] = {"color": "0.55", "markersize": 3, "linestyle": "", "marker": ".", "zorder": 3}
 _VIA_POINT: dict[str, Any] = {"color": "0.1", "markersize": 5, "linestyle": "", "marker": "o", "zorder": 5}
-_CIRCLE = np.linspace(0, 2 * np.pi, 49)
+_CIRCLE = np.linspace(0, 2 * np.pi, 49)  # [rad] the points of an ellipse
 
 
 class Points(NamedTuple):
@@ -31,7 +31,7 @@ class Points(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What is drawn beside the predictions, and what the kernel has: its channels, its period."""
+    """The points that are drawn with the predictions, and the kernel's channels and period."""
 
     references: Points
     via_points: Points
@@ -48,7 +48,7 @@ class Plotted:
 
     @abstractmethod
     def to_plot(self) -> Shown:
-        """What is drawn beside the predictions."""
+        """The points that are drawn with the predictions."""
 
     def plot(
         self,
@@ -61,20 +61,20 @@ class Plotted:
         input_unit: str = "",
         output_unit: str = "",
     ) -> list[Axes]:
-        """Draws the predictions at queries (M, I) with Matplotlib, the extra `plot`.
+        """Draw the predictions at queries (M, I) with Matplotlib, the extra `plot`.
 
         The mean, the regions of 1 and 2 deviations, the references, and the via-points with 2
-        deviations. Points that are derivatives are left out. Over the input, one axes an output;
-        with `plane` (i, j) output j over output i in one, where the regions are the ellipses of all
-        queries. A single input needs no queries: they go from the first reference to the last, or
-        once round. Of more inputs a path is needed, and without `plane` its points are counted.
+        deviations. Derivatives are left out. Over the input, one axes per output; with `plane`
+        (i, j) output j over output i in one axes, where the regions are the ellipses of all
+        queries. For a single input the queries default to the range of the references, or one
+        period. For more inputs a path is required, and without `plane` the x axis is its index.
 
-        `axes` are drawn into, and keep what their axes are called, else new ones of pyplot; they
-        are returned. `label` is the mean's in the legend, `outputs` (O,) are the outputs' names,
-        units are written beside them.
+        The drawing uses `axes`, whose labels it keeps, or new axes of pyplot; it returns them.
+        `label` is the mean's in the legend, `outputs` (O,) are the outputs' names, and the units
+        follow the names.
 
-        Raises ModuleNotFoundError without Matplotlib, and ValueError if the shape of the queries is
-        another, a number is not finite, or there are other numbers of axes, names or outputs.
+        Raises ModuleNotFoundError without Matplotlib, and ValueError if the shape of the queries
+        differs, a number is not finite, or the number of axes, names or outputs is wrong.
         """
         try:
             from matplotlib import pyplot as plt
@@ -133,7 +133,7 @@ def _named(name: str, unit: str) -> str:
 
 
 def _titles(outputs: Sequence[str] | None, shown: Shown, input_unit: str, unit: str) -> list[str]:
-    """What stands beside each output's axis; those of the second channel are rates."""
+    """The label of each output's axis; outputs of the second channel are rates."""
     count = shown.references.normals.outputs
     values = count // shown.channels
     names = [f"output {i}" if i < values else f"rate of output {i - values}" for i in range(count)]
@@ -152,7 +152,7 @@ def _draw_over_input(axes: Axes, s: Array, found: Gaussians, shown: Shown, i: in
     for times, opacity, said in _REGIONS:
         style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
         axes.fill_between(at, mean - times * deviation, mean + times * deviation, label=said, **style)
-    if alone:  # else no axis tells where they are
+    if alone:  # with more inputs, no axis shows their position
         known, via = shown.references, shown.via_points
         axes.plot(known.inputs[:, 0], known.normals.mean[:, i], label="reference", **_REFERENCE)
         if len(via.normals):
@@ -177,18 +177,19 @@ def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], la
 
 
 def _ellipses(normals: Gaussians, plane: list[int], times: int) -> Path:
-    """All ellipses as one path, so that what several cover is as opaque as what one does."""
+    """All ellipses as one path, so that overlaps are not more opaque."""
     from matplotlib.path import Path
 
     values, vectors = np.linalg.eigh(normals.covariance[:, plane][:, :, plane])
-    vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None] ** np.array([1, 0])  # all one way round
+    # All ellipses have the same sense of rotation.
+    vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None] ** np.array([1, 0])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     around = normals.mean[:, None, plane] + times * (np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)], 1) @ root.mT)
     return Path.make_compound_path(*(Path(one, closed=True) for one in around))
 
 
 def _add_legend(axes: Axes) -> None:
-    """Above the axes; what was drawn twice is named once."""
+    """Add the legend above the axes; a label that occurs twice is shown once."""
     handles, labels = axes.get_legend_handles_labels()
     named = dict(zip(reversed(labels), reversed(handles), strict=True))
     look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}

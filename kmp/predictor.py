@@ -1,6 +1,7 @@
-"""What a primitive says at queries: the mean, its derivatives, and how sure it is.
+"""Predictions of a primitive at queries: mean, derivatives, covariance, samples.
 
-The paper, section II-B.
+Mean xi(s) = k(s) w + m(s), equation (8) of the paper, section II-B. Covariance N / lambda_c (k(s,
+s) I - k (K + lambda_c Sigma)^-1 k^T), IJRR 2019.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
 from kmp.solution import BLOCK, Solution, least_variances, mean_at
 
-_RESIDUAL = 1e-10  # share of k(s, s) that rounding may leave, for the uncertainty that is distance
+_RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,46 +40,46 @@ class Inner(Immutable):
     solution: Solution
     changes: Changes
     count: int
-    """N of the covariance: the points of the base."""
+    """N of the covariance: the number of points of the base."""
 
     @classmethod
     def of_base(cls, solution: Solution) -> Inner:
-        """The inside of a primitive that nothing was changed in."""
+        """The inside of a primitive without changes."""
         database: Database = solution.database
         return cls(solution, database.unchanged(), len(database))
 
     @cached_property
     def query(self) -> Query:
-        """Arrays of a single query, in the layout that the compiled loops read."""
+        """The arrays of a single query."""
         return Query.of(self.solution, self.count)
 
     @cached_property
     def compiled_query(self) -> CompiledQuery | None:
-        """The same as compiled loops, where Numba is installed and knows the kernel; else None."""
+        """The same for compiled loops; None without Numba, or for a kernel that they lack."""
         return CompiledQuery.of(self.query)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(Immutable):
-    """The covariance of `predict` as the sum of two, each (M, O, O) [unit of the outputs^2]."""
+    """The covariance of `predict` as a sum of two, each (M, O, O) [unit of the outputs^2]."""
 
     variability: Array
-    """How much the demonstrations differ from each other there."""
+    """The part by differences between the demonstrations."""
     distance: Array
-    """How far the query is from the data: what would remain if each reference point were exact."""
+    """The part by distance from the data: it remains if each reference point is exact."""
 
 
 class Predictor(Immutable):
     """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
 
     inner: Inner
-    """Access to arrays and solutions for other packages of this project; these may change."""
+    """Arrays and solutions, for other packages of this project; they may change."""
 
     def mean(self, queries: ArrayLike) -> Array:
         """xi(s) at queries (M, I): (M, O) [unit of the outputs]. Equation (8).
 
-        One query alone may differ by rounding from the same in a set. Where Numba is installed,
-        compiled loops serve. Raises ValueError if the shape is another or a number is not finite.
+        Without Numba, a query alone and the same query in a set may differ by rounding. Raises
+        ValueError if the shape differs or a number is not finite.
         """
         s = real("queries", queries)
         if (found := self._compiled_mean(s)) is not None:
@@ -92,9 +93,9 @@ class Predictor(Immutable):
         """xi(s) with its covariance at queries (M, I): M normals.
 
         The mean is that of `mean`, bit for bit. Covariance: N / lambda_c (k(s, s) I - k (K +
-        lambda_c Sigma)^-1 k^T), IJRR 2019. The first prediction inverts the triangular factor: make
-        one before there is a deadline. Raises ValueError if the shape is another, a number is not
-        finite, or what was stored cannot be solved here.
+        lambda_c Sigma)^-1 k^T), IJRR 2019. The first prediction inverts the triangular factor:
+        predict once before a deadline matters. Raises ValueError if the shape differs, a number is
+        not finite, or a stored primitive cannot be solved with these libraries.
         """
         s = real("queries", queries)
         compiled = self.inner.compiled_query if s.shape[:1] == (1,) else None
@@ -112,8 +113,8 @@ class Predictor(Immutable):
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
 
-        Its blocks on the diagonal are the covariances of `predict`; the others tell how queries go
-        together: a path is one draw. (M O)^2 numbers. Raises ValueError as `predict` does.
+        The blocks on the diagonal are the covariances of `predict`, the others those between
+        queries, so that one draw is a path. (M O)^2 numbers. Raises ValueError as `predict` does.
         """
         s = self._checked_many(queries)
         if len(s) == 0:
@@ -142,14 +143,14 @@ class Predictor(Immutable):
         *,
         covariance: bool = True,
     ) -> MotionPrediction:
-        """xi at one query (I,), and how it moves with the input: all from one kernel row.
+        """xi at one query (I,) and its motion with the input, from one kernel row.
 
-        The input's velocity (I,) [unit of the inputs / s] and its acceleration (I,) [unit of the
-        inputs / s^2] give those of the output. The numbers are those of `predict`, `jacobian` and
-        `curvature`: but for rounding where Numba is installed, whose compiled loops then serve, bit
-        for bit where it is not. The covariance takes longer than all else, and can be left out.
+        The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
+        inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
+        those of `predict`, `jacobian` and `curvature`: bit for bit without Numba, to rounding with
+        it. The covariance takes longer than all else, and can be left out.
 
-        Raises ValueError if a shape is another or a number is not finite.
+        Raises ValueError if a shape differs or a number is not finite.
         """
         s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
         compiled = self.inner.compiled_query
@@ -163,7 +164,8 @@ class Predictor(Immutable):
     def jacobian(self, query: ArrayLike) -> Array:
         """dxi/ds at one query (I,): (O, I) [unit of the outputs / unit of the inputs].
 
-        Equation (8), derived. Raises ValueError if the shape is another or a number is not finite.
+        The derivative of equation (8). Raises ValueError if the shape differs or a number is not
+        finite.
         """
         s, compiled = real("query", query), self.inner.compiled_query
         if compiled is not None and s.shape == (self._dimensions,) and (found := compiled.jacobian(s)) is not None:
@@ -171,9 +173,9 @@ class Predictor(Immutable):
         return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
 
     def jacobians(self, queries: ArrayLike) -> Array:
-        """dxi/ds at queries (M, I): (M, O, I). The numbers are `jacobian`'s, but for rounding.
+        """dxi/ds at queries (M, I): (M, O, I), equal to `jacobian` but for rounding.
 
-        Raises ValueError if the shape is another or a number is not finite.
+        Raises ValueError if the shape differs or a number is not finite.
         """
         s = self._checked_many(queries)
         batches = [self.inner.query.jacobians(s[a : a + BLOCK]) for a in range(0, len(s), BLOCK)]
@@ -182,18 +184,18 @@ class Predictor(Immutable):
     def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
         """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
 
-        Equation (8), derived twice. Where v is the velocity of the input [unit of the inputs / s],
-        this is the part of the output's acceleration [unit of the outputs / s^2] that the velocity
-        makes. Raises ValueError if a shape is another or a number is not finite.
+        The second derivative of equation (8). If v is the velocity of the input [unit of the
+        inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
+        Raises ValueError if a shape differs or a number is not finite.
         """
         s, v = self._one_query(query), self._checked("direction", direction)
         return self.inner.query.curvature(self.inner.query.row(s), v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
-        """The covariance at queries (M, I), split: how demonstrations vary, how far they are.
+        """The covariance at queries (M, I), by its causes: differing demonstrations, distance.
 
-        The second is what IJRR 2019's covariance would be with Sigma = 0. Raises ValueError if the
-        shape is another or a number is not finite.
+        The part by distance is IJRR 2019's covariance with Sigma = 0. Raises ValueError if the
+        shape differs or a number is not finite.
         """
         s = self._checked_many(queries)
         total = self.predict(s).covariance
@@ -222,7 +224,8 @@ class Predictor(Immutable):
     def least_variance(self) -> float:
         """Least variance of a via-point's values that rounding does not hide [unit of outputs^2].
 
-        A rate's, with a `VelocityKernel`, is 2 ell times that. `adapt` refuses smaller ones.
+        With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
+        smaller variances.
         """
         parameters, anywhere = self.inner.solution.hyperparameters, Functionals(np.zeros((1, self._dimensions)))
         penalty = parameters.lambda_covariance
@@ -232,12 +235,12 @@ class Predictor(Immutable):
 
     @property
     def prior_mean(self) -> Array | AffineMean:
-        """(O,) [unit of the outputs] what the mean returns to off the inputs, or departs from."""
+        """(O,) [unit of the outputs], to which the mean returns far from the data, or affine."""
         return self.inner.solution.hyperparameters.prior_mean
 
     @property
     def prior_offset(self) -> Array:
-        """(O,) [unit of the outputs] the prior mean at inputs of 0: all of a constant one."""
+        """(O,) [unit of the outputs] the prior mean at inputs of 0."""
         return self.inner.solution.hyperparameters.prior_offset
 
     @property
@@ -247,17 +250,17 @@ class Predictor(Immutable):
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
-        """How the primitive is solved."""
+        """The kind of solution."""
         return self.inner.solution.representation
 
     @property
     def weights(self) -> Array:
-        """Those of equation (8): alpha (N, O) of equation (9), or those of the low rank centres."""
+        """The weights of equation (8): alpha (N, O) of equation (9), or of the low rank centres."""
         return self.inner.solution.weights
 
     @property
     def centres(self) -> Array:
-        """(N, I) what the weights belong to: reference points that stay, and via-points."""
+        """The inputs (N, I) to which the weights belong: reference points and via-points."""
         return self.inner.solution.centres
 
     @property
@@ -265,14 +268,14 @@ class Predictor(Immutable):
         """Upper bound of the distance between the mean and equation (9)'s [unit of the outputs].
 
         It holds at any query, and is 0 for the dense solution. For the low rank it is 5 to 100
-        times the error itself. Far from the points the low rank errs most: where it predicts near
-        them, `error_bound_at_points` is the lower one.
+        times the error itself. The error is largest far from the points; for queries near them,
+        `error_bound_at_points` is lower.
         """
         return self.inner.solution.error_bounds.anywhere
 
     @property
     def error_bound_at_points(self) -> float:
-        """As `error_bound`, at the reference points and via-points alone [unit of the outputs].
+        """As `error_bound`, but at the reference points and via-points only [unit of the outputs].
 
         For the low rank it is 10 to 1000 times the error itself.
         """
@@ -287,18 +290,18 @@ class Predictor(Immutable):
         return int(self.inner.solution.database.inputs.shape[1])
 
     def _rows(self, queries: Array, directions: Array | None = None) -> Array:
-        """k of M queries, or their derivatives, and what is known: (M C, R C)."""
+        """k (M C, R C) between M queries, or derivatives there, and the solution's functionals."""
         return between(self.kernel, Functionals(queries, directions), self.inner.solution.functionals)
 
     def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
-        """The mean (M, O) by compiled loops, and the last kernel row; None if they do not serve."""
+        """The mean (M, O) by compiled loops, and the last kernel row; None if these cannot."""
         compiled = self.inner.compiled_query
         if compiled is None or queries.ndim != 2 or queries.shape[1] != self._dimensions or len(queries) == 0:
             return None
         return compiled.mean(queries)
 
     def _wrapped(self, queries: Array) -> Array:
-        """The queries, within the period where there is one: no seam, not even rounding's."""
+        """The queries modulo the period, if any: rounding then differs nowhere in the period."""
         period = self.kernel.period
         return queries if period is None else queries % period
 

@@ -1,6 +1,8 @@
-"""The kernelized movement primitive: the output at any input, and how sure it is.
+"""The kernelized movement primitive: fitting, adaptation, files.
 
-The paper, sections II-B and II-C.
+The mean minimises sum_n (xi(s_n) - mu_n)^T Sigma_n^-1 (xi(s_n) - mu_n) + lambda |xi|^2, equation
+(4) of the paper, section II-B; its weights are alpha = (K + lambda Sigma)^-1 (mu - m), equation
+(9). Adaptation is Algorithm 1, section II-C.
 """
 
 from __future__ import annotations
@@ -41,17 +43,17 @@ from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
 
-_REACH_STEPS = 300  # distances at which a via-point's effect is looked at
-_FREE = 1e6  # [unit of the outputs / unit of the inputs] the deviation of a rate that may be any
+_REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
+_FREE = 1e6  # [unit of the outputs / unit of the inputs] deviation of a rate that is not prescribed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class KMP(Predictor, Plotted):
     """A skill: a reference database, the via-points in it, and its solution.
 
-    Made by `fit`, `adapt` and `load`. N points in all, I inputs, O outputs. Immutable, so
-    that threads may share it. What is fitted depends on the database and the parameters alone, bit
-    for bit, however the primitive came about; after `extended`, but for rounding.
+    `fit`, `adapt` and `load` return one. N points in all, I inputs, O outputs. Immutable, so that
+    threads may share it. The fitted numbers depend on database and parameters only, bit for bit;
+    after `extended`, to rounding.
     """
 
     inner: Inner
@@ -79,20 +81,18 @@ class KMP(Predictor, Plotted):
     ) -> KMP:
         """The primitive of a reference database: inputs (N, I), N normals over O outputs.
 
-        `prior_mean` (O,) [unit of the outputs] is what the mean returns to far from the inputs, the
-        origin by default; an `AffineMean` is what it departs from there and elsewhere. The
-        covariance heeds neither. `lambda_covariance` None is `lambda_mean`; another value costs a
-        second factor.
+        The mean returns to `prior_mean` (O,) [unit of the outputs] far from the inputs; None is 0.
+        An `AffineMean` depends on the input. The covariance does not depend on it.
+        `lambda_covariance` None is `lambda_mean`; another value costs a second factor.
 
-        Where a row of `directions` (N, I) [unit of the inputs] is not zero, that normal is of the
+        If a row of `directions` (N, I) [unit of the inputs] is not zero, the normal is that of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction.
 
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
-        (4) on at most `rank` features of the kernel, which leave a share of at most
-        `rank_tolerance` of it at the inputs. "auto" is low rank where that is the faster one: over
-        time from about 200 points on, for more inputs from 1500 numbers N O on, if the rank is low
-        and no digits are lost. A rank that did not suffice is said in a `RankReached` warning, with
-        the accuracy lost.
+        (4) on at most `rank` features of the kernel, whose residual at the inputs is at most
+        `rank_tolerance` of k(s, s). "auto" is low rank where that is faster: over time from about
+        200 points, over more inputs from N O = 1500, if the rank is low and no digits are lost. If
+        the rank does not suffice, a `RankReached` warning states the accuracy lost.
 
         Raises ValueError if there is no point, shapes do not agree, a number is not finite, a
         parameter is out of its range, or the equations cannot be solved to working precision.
@@ -129,27 +129,26 @@ class KMP(Predictor, Plotted):
         """A new primitive that also goes through desired points: inputs (V, I), V normals.
 
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
-        point of the *base's* reference takes the place of its nearest one (of all, where several
-        are equally near); any other is inserted. None is `base.spacing / 2`: evenly spaced points
-        are then replaced one by one. The order of the desired points does not matter. Earlier
-        via-points stay: to be rid of them, adapt `base` anew. N of the covariance stays the base's,
-        so that teaching here changes nothing elsewhere.
+        point of the *base's* reference replaces the nearest one (all of them, if several are
+        equally near); any other is inserted. None is `base.spacing / 2`: evenly spaced points are
+        then replaced one by one. The order of the desired points does not matter. Earlier
+        via-points remain; to remove them, adapt `base` again. N of the covariance remains that of
+        the base, so that the covariance far away does not change.
 
         Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows.
 
-        Where a row of `directions` (V, I) [unit of the inputs] is not zero, that normal is of the
+        If a row of `directions` (V, I) [unit of the inputs] is not zero, the normal is that of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
-        of the output, where the direction is that of the input. It is inserted, and replaces
+        of the output, if the direction is the velocity of the input. It is inserted, and replaces
         nothing.
 
-        A desired point that is then missed by more than 3 of its deviations, and by more than 0.001
-        (1 mm, where the unit is the metre), is named in a `ViaPointMissed` warning.
+        A `ViaPointMissed` warning names the desired points that the mean misses by more than 3 of
+        their deviations and by more than 0.001 (1 mm, if the unit is the metre).
 
         Raises ValueError if shapes do not agree, a number is not finite, the tolerance is below 0,
         or the equations cannot be solved to working precision.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
-        check_gaussians("desired", desired)
         check_pairs("desired", via, desired, self.outputs)
         if tolerance is None:
             tolerance = self.base.spacing / 2
@@ -163,9 +162,9 @@ class KMP(Predictor, Plotted):
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
         """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
 
-        `deviation` [unit of the outputs / unit of the inputs] is how sure each entry is. So one
-        via-point says what lies about it: the output follows an input there (ones), or does not
-        heed it (zeros). What is not known of a Jacobian is left out by `adapt` along `directions`.
+        `deviation` [unit of the outputs / unit of the inputs] is that of each entry. One via-point
+        then determines its surroundings: the output follows an input there (ones), or does not
+        depend on it (zeros). To prescribe only some columns, use `adapt` along `directions`.
 
         Raises ValueError as `adapt` does.
         """
@@ -181,12 +180,12 @@ class KMP(Predictor, Plotted):
         return adapted
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
-        """A new primitive whose mean obeys these constraints too, to 1e-9. LC-KMP.
+        """A new primitive whose mean satisfies these constraints too, to 1e-9. LC-KMP.
 
-        They hold at the inputs that they are given at; between them the mean may cross a little, so
-        give them closer than the kernel is long. Later via-points obey them, and `base` is without.
-        The covariance is as without. The constraints need the dense representation: a low rank
-        primitive of up to 6000 numbers N O is solved anew for them.
+        They hold at their inputs; between these the mean may cross a little, so choose them closer
+        together than the kernel's length. They also hold after later adaptations; `base` does not
+        have them. The covariance ignores them. Constraints need the dense representation: a low
+        rank primitive with N O up to 6000 is solved again as dense.
 
         Raises ValueError if shapes do not agree, or the constraints cannot be met together.
         """
@@ -224,18 +223,17 @@ class KMP(Predictor, Plotted):
         return self._on(fitted)
 
     def extended(self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None) -> KMP:
-        """A new primitive that knows M points more: inputs (M, I), M normals, as `fit` takes them.
+        """A new primitive with M more reference points: inputs (M, I), M normals, as in `fit`.
 
-        It is what `fit` would make of all points, to rounding: the dense factors grow, at the cost
-        of N^2 M, where those of a new fit cost (N + M)^3; a low rank is fitted anew. Parameters,
-        via-points, the points that these replaced, and constraints stay. N of the covariance counts
-        the new points.
+        It equals a `fit` of all points, to rounding. The dense factors grow at the cost N^2 M,
+        against (N + M)^3 for a new fit; a low rank is fitted again. Parameters, via-points, the
+        points that these replaced, and constraints remain. N of the covariance counts the new
+        points.
 
         Raises ValueError if there is no point, and as `fit` does.
         """
         added = numbers("inputs", inputs, "M", self._dimensions)
         check_some("inputs", added)
-        check_gaussians("reference", reference)
         check_pairs("reference", added, reference, self.outputs)
         before: Solution = self.base.inner.solution
         points = Functionals.checked(added, directions)
@@ -277,7 +275,7 @@ class KMP(Predictor, Plotted):
         return changed
 
     def to_plot(self) -> Shown:
-        """Its references and via-points that are values."""
+        """The reference points and via-points that are values, not derivatives."""
         known, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
         values = known.functionals.values
         before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
@@ -285,7 +283,7 @@ class KMP(Predictor, Plotted):
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
     def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
-        """Writes the primitive, and the units of its numbers, to an .npz file: as `kmp.save` does.
+        """Write the primitive and the units of its numbers to an .npz file, as `kmp.save` does.
 
         Raises OSError if the file cannot be written.
         """
@@ -309,9 +307,9 @@ class KMP(Predictor, Plotted):
         return KMP(Inner(solution.solved(), changes, base.inner.count), base)
 
     def with_lambda_covariance(self, lambda_covariance: float) -> KMP:
-        """This primitive with another lambda of the covariance: the mean stays, bit for bit.
+        """This primitive with another lambda of the covariance; the mean keeps its bits.
 
-        A larger lambda_covariance makes the predicted deviations smaller far from the points.
+        A larger lambda_covariance gives smaller predicted deviations far from the points.
         Raises ValueError if it is not above 0, or the equations cannot be solved with it.
         """
         other = positive("lambda_covariance", lambda_covariance)
@@ -326,10 +324,10 @@ class KMP(Predictor, Plotted):
     def adapt_many(
         self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
     ) -> tuple[KMP, ...]:
-        """A new primitive for each of several pairs of inputs (V, I) and V normals, as by `adapt`.
+        """A new primitive for each pair of inputs (V, I) and V normals, as by `adapt`.
 
-        Each is adapted from this primitive, not from the one before it: several goals to choose
-        from, several people, several rollouts. Raises ValueError as `adapt` does.
+        Each is adapted from this primitive: for alternative goals, people or rollouts. Raises
+        ValueError as `adapt` does.
         """
         pairs = parts_of("points", points)
         for i, one in enumerate(pairs):
@@ -340,13 +338,13 @@ class KMP(Predictor, Plotted):
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
         """Distances (I,) [unit of the inputs] up to which a via-point at `query` (I,) matters.
 
-        An exact via-point is inserted at the query (I,), some distance off the mean there. Along
-        each input, either way and within the range of the reference points, this is the largest
-        distance at which the mean moves by at least `share` of that. It depends on ell, on lambda
-        and on how certain the reference is.
+        An exact via-point is inserted at the query, 1 [unit of the outputs] off the mean there.
+        Along each input, in both directions and within the range of the reference points, this is
+        the largest distance at which the mean moves by at least `share` of its move at the query.
+        It depends on ell, lambda and the covariances of the reference.
 
-        Raises ValueError if the shape is another, a number is not finite, or the share is not
-        between 0 and 1.
+        Raises ValueError if the shape differs, a number is not finite, or the share is not between
+        0 and 1.
         """
         s = self._one_query(query)
         if not 0 < positive("share", share) < 1:
@@ -364,27 +362,27 @@ class KMP(Predictor, Plotted):
                 (adapted.mean(flat := path.reshape(-1, len(s))) - self.mean(flat))[:, :values], axis=1
             )
             matters = moved.reshape(2, -1) >= share * moved[0]
-            if self.kernel.period is None:  # beyond the data the mean is an extrapolation
+            if self.kernel.period is None:  # outside the data the mean extrapolates
                 matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (path[:, :, i] <= self.inputs[:, i].max())
             found[i] = r[matters.any(axis=0)].max(initial=0.0)
         return found
 
     @cached_property
     def spacing(self) -> float:
-        """Median distance from a point of the reference to its nearest other one [unit of inputs].
+        """Median distance of a reference point to its nearest neighbour [unit of the inputs].
 
-        Points that are derivatives, or equal to another, are left out; 0 where there is one point.
+        Derivatives and repeated points are left out; 0 if there is one point.
         """
         return self.inner.solution.database.spacing(self.kernel.period)
 
     @property
     def base(self) -> KMP:
-        """The primitive before any adaptation: itself, if there was none."""
+        """The primitive before any adaptation; the primitive itself if it was not adapted."""
         return self._base or self
 
     @property
     def inputs(self) -> Array:
-        """(N, I) the reference points: the base's that were not replaced, then the via-points."""
+        """Inputs (N, I) of the base's points that were not replaced, then of the via-points."""
         return self.inner.solution.database.inputs
 
     @property
@@ -394,12 +392,12 @@ class KMP(Predictor, Plotted):
 
     @property
     def via_inputs(self) -> Array:
-        """(V, I) where the via-points are."""
+        """Inputs (V, I) of the via-points."""
         return self.inner.changes.inputs
 
     @property
     def via_directions(self) -> Array:
-        """(V, I) along which a via-point is of the derivative; zero where it is of the value."""
+        """Directions (V, I) of via-points that are derivatives; zero for a value."""
         return self.inner.changes.functionals.along
 
     @property
@@ -409,7 +407,7 @@ class KMP(Predictor, Plotted):
 
 
 def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:
-    """Distances (I,) along each input, at which the kernel has fallen to exp(-9); half a period."""
+    """Distances (I,) along each input at which the kernel is exp(-9); at most half a period."""
     if kernel.period is not None:
         return np.full(inputs, kernel.period / 2)
     scale, stretch = kernel.coordinates(inputs)
@@ -417,6 +415,6 @@ def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:
 
 
 def checked_primitive(value: object, name: str = "primitive") -> KMP:
-    """The value. Raises ValueError unless it is a `KMP`."""
+    """The value as a `KMP`. Raises ValueError if it is none."""
     check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
     return cast(KMP, value)

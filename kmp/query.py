@@ -1,7 +1,10 @@
-"""One query at a time: the mean, its motion and its covariance, from one kernel row.
+"""Mean, derivatives and covariance at one query, from one kernel row.
 
-What a query touches is made ready once, as contiguous read-only arrays. From there on arrays go in
-and arrays come out, so that compiled functions can take the place of these.
+With w (R C, D) the weights: xi(s) = k(s) w + m(s), equation (8); J = dxi/ds; for an input that
+moves with v and a, d xi/dt = J v and d^2 xi/dt^2 = J a + d^2 xi(s + t v)/dt^2. Covariance N /
+lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T), IJRR 2019.
+
+The arrays that a query reads are prepared once. `kmp.loops.query` computes the same by loops.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from kmp.solution import Solution
 
 
 class MotionPrediction(NamedTuple):
-    """The output at one query whose input moves. I inputs, O outputs."""
+    """The output at one query, and its motion with the input. I inputs, O outputs."""
 
     mean: Array
     """(O,) [unit of the outputs]"""
@@ -30,7 +33,7 @@ class MotionPrediction(NamedTuple):
     acceleration: Array
     """(O,) [unit of the outputs / s^2] the Jacobian times the input's, plus the curvature."""
     covariance: Array | None
-    """(O, O) [unit of the outputs^2] of the mean; None where it was not asked for."""
+    """(O, O) [unit of the outputs^2]; None if it was not requested."""
     jacobian: Array
     """(O, I) [unit of the outputs / unit of the inputs] d mean / d input."""
     curvature: Array
@@ -38,7 +41,7 @@ class MotionPrediction(NamedTuple):
 
 
 class KernelRow(NamedTuple):
-    """What R centres say of one query."""
+    """The kernel between one query and R centres."""
 
     query: Array  # (I,)
     offsets: Array  # (R, I) x - x_r, in the kernel's coordinates
@@ -48,7 +51,7 @@ class KernelRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Query(Immutable):
-    """A solution made ready for one query at a time: R centres, C channels, D outputs a channel."""
+    """The arrays of a solution for one query: R centres, C channels, D outputs a channel."""
 
     solution: Solution
     kernel: Kernel
@@ -63,9 +66,9 @@ class Query(Immutable):
 
     @classmethod
     def of(cls, solution: Solution, count: int) -> Query:
-        """The solution, for a base of N = `count` points, ready.
+        """The arrays of a solution, of a base of N = `count` points.
 
-        Raises ValueError if it cannot be solved.
+        Raises ValueError if the solution cannot be computed.
         """
         parameters, centres = solution.hyperparameters, solution.centres
         scale, stretch = parameters.kernel.coordinates(centres.shape[1])
@@ -85,7 +88,7 @@ class Query(Immutable):
 
     @cached_property
     def unstretched(self) -> bool:
-        """Whether the kernel's coordinates are the inputs themselves."""
+        """True if the kernel's coordinates are the inputs themselves."""
         return bool((self.stretch == 1.0).all())
 
     @cached_property
@@ -120,8 +123,8 @@ class Query(Immutable):
         """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
         functionals, kernel, i = self.solution.functionals, self.kernel, len(self.stretch)
         if isinstance(kernel, GaussianKernel) and self.derivatives is None:
-            # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. Differences lose
-            # few digits, as the origin is in the midst of the centres.
+            # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
+            # at the mean of the centres, the differences lose few digits.
             found = between(kernel, Functionals(queries), functionals) @ self._moments
             x = queries * self.stretch - self._origin
             pulls, moments = found[:, : self.weights.shape[1], None], found[:, self.weights.shape[1] :]
@@ -139,7 +142,7 @@ class Query(Immutable):
 
     @cached_property
     def _moments(self) -> Array:
-        """(R, O + O I) the weights, and their products with the centres, from the origin."""
+        """(R, O + O I) the weights w_r, and w_r (x_r - origin)."""
         products = self.weights[:, :, None] * (self.centres - self._origin)[:, None, :]
         return frozen(np.hstack([self.weights, products.reshape(len(products), -1)]))
 
@@ -149,7 +152,7 @@ class Query(Immutable):
         return self.kernel.curvature(row.offsets, row.values, self.scale, self.weights, direction, self.derivatives)
 
     def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
-        """All of these for a query (I,), and its velocity and acceleration."""
+        """All of these for a query (I,), its velocity (I,) and acceleration (I,)."""
         row = self.row(query)
         jacobian, curvature = self.jacobian(row), self.curvature(row, velocity)
         return MotionPrediction(

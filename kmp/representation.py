@@ -1,4 +1,8 @@
-"""Which way the costs of a database are solved: exactly, or on features of the kernel."""
+"""Choice between the dense solution, of cost (N O)^3, and the low rank, of cost N O r^2.
+
+Over one input the rank r is about 8 + 3.5 range sqrt(ell); the low rank is the faster solution
+below a share of N.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +17,12 @@ from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
 
-_TINY = 450  # numbers N O up to which the dense solution takes a millisecond at most
-_SMALL = 1500  # numbers N O up to which a look for the rank of several inputs costs more than it may save
-LARGE = 6000  # numbers N O above which the dense solution takes seconds and 300 MB
-_LOW_SMALL, _LOW = 0.2, 0.45  # rank over N C up to which the low rank solution is the faster one
-_RANK_AT_0, _RANK_PER_LENGTH = 8.0, 3.5  # rank = 8 + 3.5 range sqrt(ell) of one input, measured
-_ROUNDING = 1e-12  # share of k(s, s) that rounding may leave, whatever is required
+_TINY = 450  # N O up to which the dense solution takes at most a millisecond
+_SMALL = 1500  # N O up to which finding the rank of several inputs costs more than it can save
+LARGE = 6000  # N O above which the dense solution takes seconds and 300 MB
+_LOW_EXPECTED, _LOW = 0.2, 0.45  # the low rank is faster below these r / (N C), estimated and found
+_RANK_AT_0, _RANK_PER_LENGTH = 8.0, 3.5  # measured: r = 8 + 3.5 range sqrt(ell) over one input
+_ROUNDING = 1e-12  # a residual of this share of k(s, s) is rounding, and always allowed
 
 
 def solved(
@@ -28,18 +32,19 @@ def solved(
     rank: int,
     tolerance: float,
 ) -> Solution:
-    """The database solved. Warns `RankReached` where the rank does not suffice."""
+    """The solution of the database. Warns `RankReached` if the rank does not suffice."""
     size = database.reference.mean.size
     if representation == "dense" or (representation == "auto" and not _may_be_low(parameters, database)):
         return Dense(parameters, database).solved()
     optional = representation == "auto" and size <= LARGE
     most = min(rank, int(_LOW * len(database) * parameters.kernel.channels)) if optional else rank
-    features, residual, made = Features.made(parameters.kernel, database.functionals, rank=most, tolerance=tolerance)
+    points, kernel = database.functionals, parameters.kernel
+    features, residual, values = Features.with_values(kernel, points, rank=most, tolerance=tolerance)
     reached = len(features.pivots) >= most
     enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
     if optional and not (enough and is_resolved(parameters, database)):
         return Dense(parameters, database).solved()
-    solution = LowRank.fit(parameters, database, features, made=made).solved()
+    solution = LowRank.fit(parameters, database, features, values=values).solved()
     if not enough:
         off = solution.error_bounds.at_points
         warnings.warn(
@@ -53,7 +58,7 @@ def solved(
 
 
 def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
-    """True if the low rank may be the faster solution, judged before any feature is computed."""
+    """True if the low rank may be the faster solution, estimated before features exist."""
     size, kernel = database.reference.mean.size, parameters.kernel
     if size <= _TINY or size > _SMALL:
         return size > _SMALL
@@ -61,4 +66,4 @@ def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
         return False
     length = np.ptp(database.inputs) if kernel.period is None else kernel.period
     expected = _RANK_AT_0 + _RANK_PER_LENGTH * length * np.sqrt(np.max(kernel.ell))
-    return bool(expected <= _LOW_SMALL * len(database) * kernel.channels)
+    return bool(expected <= _LOW_EXPECTED * len(database) * kernel.channels)

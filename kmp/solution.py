@@ -1,24 +1,29 @@
-"""What a solution of the costs is: all that a primitive asks of one, whichever way it was found."""
+"""The solved problem as a protocol, its mean, and checks of its conditioning.
+
+Mean, equation (8): xi(s) = sum_r k(s, s_r) w_r + m(s), over R centres s_r with weights w_r (O,) and
+the prior mean m. Conditioning: lambda times the least eigenvalue of Sigma_n must be at least 1e-11
+of k(s_n, s_n), or rounding would hide it.
+"""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array
+from kmp.arrays.immutable import Immutable
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
 from kmp.kernel import between, variances
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
 
-BLOCK = 256  # queries at once
-_RESOLVED = 1e-11  # lambda Sigma as a share of k(s, s), at which the covariance has 3 digits still
-
-
-_ROUND_UP = 1.01  # what two digits in a message may lack
+BLOCK = 256  # queries computed at once: their kernel rows fit into the processor's cache
+_RESOLVED = 1e-11  # least lambda Sigma / k(s, s): the covariance then has 3 correct digits
+_ROUND_UP = 1.01  # factor on a least variance, because a message shows two digits of it
 
 
 class ErrorBounds(NamedTuple):
@@ -27,11 +32,28 @@ class ErrorBounds(NamedTuple):
     at_points: float
     """At the reference points."""
     anywhere: float
-    """At any query. Of a kernel with rates, the largest of the two channels' units counts."""
+    """At any query. For a kernel with rates, in the larger of the two channels' units."""
+
+
+class Expansion(Immutable):
+    """An expansion in the kernels of R functionals."""
+
+    @property
+    @abstractmethod
+    def functionals(self) -> Functionals:
+        """The R functionals."""
+
+    @property
+    def centres(self) -> Array:
+        """Their inputs (R, I)."""
+        return self.functionals.inputs
+
+    def with_weights(self, weights: Array) -> Self:
+        return self._with_cached(weights=weights)
 
 
 class Solution(Protocol):
-    """A database solved for its mean and its covariance; immutable. O outputs, C channels.
+    """A database solved for mean and covariance; immutable. O outputs, C channels.
 
     The mean is an expansion in R kernels, equation (8): xi(s) = sum_r k(s, s_r) w_r + prior mean.
     """
@@ -46,15 +68,15 @@ class Solution(Protocol):
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
-        """How the costs are solved."""
+        """The kind of solution."""
 
     @property
     def functionals(self) -> Functionals:
-        """The R values, and derivatives, that the kernels stand for."""
+        """The R functionals of which the kernels are."""
 
     @property
     def centres(self) -> Array:
-        """s_r (R, I) where they are."""
+        """Their inputs s_r (R, I)."""
 
     @property
     def weights(self) -> Array:
@@ -65,28 +87,28 @@ class Solution(Protocol):
         """Upper bounds of the distance between the mean and equation (9)'s."""
 
     def solved(self) -> Self:
-        """This solution, its weights and factors made. Raises ValueError if that fails."""
+        """This solution, with weights and factors computed. Raises ValueError if that fails."""
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C).
 
-        Of M queries together (M O, M O), with k (M C, R C) and `prior` k(s, s) (M C, M C).
+        For M queries jointly (M O, M O), with k (M C, R C) and `prior` k(s, s) (M C, M C).
         """
 
     def posterior_covariance(self, rows: Array) -> Array:
-        """Those (M, O, O) of the kernel rows (M C, R C) of M queries."""
+        """The same (M, O, O) of the kernel rows (M C, R C) of M queries, each by itself."""
 
     def adapted(self, changes: Changes) -> Solution:
-        """The solution of the database as it was before any adaptation, with these changes."""
+        """The solution of the base database, before any adaptation, with these changes."""
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Solution:
-        """The solution of this database with other parameters: of a base, and not yet solved."""
+        """The solution of a base's database with other parameters, not solved yet."""
 
     def with_weights(self, weights: Array) -> Self:
-        """This solution with weights (R, O) that were stored, so that they need not be made."""
+        """This solution with stored weights (R, O), which are then not computed."""
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """What a file must hold of the base's solution besides its database and its weights."""
+        """Arrays of the base's solution that a file holds besides database and weights."""
 
 
 def mean_at(solution: Solution, queries: Array) -> Array:
@@ -95,9 +117,9 @@ def mean_at(solution: Solution, queries: Array) -> Array:
 
 
 def mean_of(solution: Solution, queries: Functionals) -> Array:
-    """Equation (8) for M queries, derived where a query is a derivative: (M, O).
+    """Equation (8) for M functionals: (M, O).
 
-    In blocks of queries, whose kernel rows stay in the processor's cache.
+    Computed in blocks of queries, whose kernel rows stay in the processor's cache.
     """
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
@@ -117,10 +139,10 @@ def check_resolved(
     name: Literal["lambda_mean", "lambda_covariance"] = "lambda_covariance",
     both: bool = False,
 ) -> None:
-    """Raises ValueError where rounding would hide what lambda Sigma adds to k(s, s).
+    """Raise ValueError if rounding would hide lambda Sigma beside k(s, s).
 
-    The points are numbered from the `first` on; `name` says which lambda. The least variance that
-    the message names is for that lambda, or for `both`.
+    `name` is the lambda. The message numbers the points from `first`; the least variance that it
+    names is sufficient for this lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
     least = penalty * points.least_shares(parameters.kernel)
@@ -138,18 +160,18 @@ def check_resolved(
 
 
 def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
-    """True if both lambda Sigma are above the rounding of k(s, s)."""
+    """True if rounding of k(s, s) hides lambda Sigma with neither lambda."""
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     return bool((penalty * points.least_shares(parameters.kernel) >= _RESOLVED).all())
 
 
 def least_variances(parameters: Hyperparameters, points: Functionals, penalty: float) -> Array:
-    """The least variances (N, C) of each channel at N points that rounding does not hide."""
+    """Least variances (N, C) that rounding does not hide, at N points and for each channel."""
     return np.asarray(variances(parameters.kernel, points) * (_RESOLVED / penalty) * _ROUND_UP)
 
 
 def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussians) -> Gaussians:
-    """The normals of N points, with the least variances in place of those that are exact."""
+    """The normals of N points, in which exact outputs have the least variance instead of 0."""
     exact = normals.exact
     if not exact.any():
         return normals

@@ -1,4 +1,8 @@
-"""Primitives in files: without pickle, exact to the bit, with the units of their numbers."""
+"""Files of primitives and other values: .npz without pickle, exact to the bit, with units.
+
+A file has the arrays of the value, `kmp_format`, both units and a BLAKE2 checksum. The arrays of a
+primitive are those of `named_arrays`; other values are named by their fields, nested with dots.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ from kmp.references.frames import CoordinateFrame, LocalKMP
 from kmp.selection import Learned, Score
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
-_FORMAT = 1
+_FORMAT = 1  # number of the file format
 _KIND = "kind"
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
@@ -41,7 +45,7 @@ _KINDS: dict[str, Any] = {
 
 
 class Stored(NamedTuple):
-    """What a file held."""
+    """The contents of a file."""
 
     value: Any
     """A `KMP`, or another value of this package."""
@@ -50,13 +54,13 @@ class Stored(NamedTuple):
 
     @property
     def primitive(self) -> KMP:
-        """The `KMP`. Raises ValueError if the value is none."""
+        """The value as a `KMP`. Raises ValueError if it is none."""
         check_kind("the stored value", self.value, KMP, "take `value` for what is none")
         return cast(KMP, self.value)
 
 
 def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """A checksum of arrays by name, in 32 letters; an array `checksum` among them is left out."""
+    """BLAKE2b of named arrays in 32 hexadecimal digits; an array named `checksum` is left out."""
     sums = hashlib.blake2b(digest_size=16)
     for name in sorted(arrays):
         if name != "checksum":
@@ -67,10 +71,10 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: str = "") -> None:
-    """Writes a primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
+    """Write a primitive and the units of its numbers ("m", "s", "m, m/s") to an .npz file.
 
-    Or any other value of this package. The file has this very name. Raises OSError if the file
-    cannot be written, and ValueError if the value is none of this package.
+    Or any other value of this package. No suffix is added to the path. Raises OSError if the file
+    cannot be written, and ValueError if the value is of another type.
     """
     for name, given in (
         ("path", str(path) if isinstance(path, Path) else path),
@@ -89,10 +93,10 @@ def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: 
 
 
 def load(path: str | Path) -> Stored:
-    """What `save` wrote, and the units; a primitive predicts the same, bit for bit.
+    """The value that `save` wrote, and the units; a primitive predicts the same, bit for bit.
 
-    Raises OSError if the file cannot be read, and ValueError if it is not one that `save` wrote, or
-    was changed since. Files of earlier versions have no checksum, and are taken without.
+    Raises OSError if the file cannot be read, and ValueError if `save` did not write it or it was
+    changed since. Files of earlier versions have no checksum, and load without.
     """
     check_kind("path", str(path) if isinstance(path, Path) else path, str, "the file's name")
     try:
@@ -100,7 +104,7 @@ def load(path: str | Path) -> Stored:
             arrays = dict(archive)
     except OSError:
         raise
-    except Exception:  # what a damaged archive may raise is not documented, nor does it help who reads it
+    except Exception:  # NumPy documents no list of errors for damaged archives
         arrays = {}
     if "kmp_format" not in arrays:
         raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again.")
@@ -118,9 +122,9 @@ def load(path: str | Path) -> Stored:
 
 
 def value_arrays(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays of a value, its kind among them, their names behind the prefix.
+    """The arrays of a value and of its kind, with this prefix before each name.
 
-    Raises ValueError if the value is none of this package.
+    Raises ValueError if the value is not of this package.
     """
     kind = type(value).__name__
     if _KINDS.get(kind) is not type(value):
@@ -134,7 +138,7 @@ def value_arrays(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
 
 
 def value_of(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
-    """The value that `value_arrays` gave these arrays for. Raises ValueError if there is none."""
+    """The value of the arrays of `value_arrays`. Raises ValueError if its kind is unknown."""
     kind = _KINDS.get(str(arrays[prefix + _KIND]))
     if kind is None:
         raise ValueError(f"{prefix}{_KIND}: {arrays[prefix + _KIND]!s:.60} given, one of {', '.join(_KINDS)} needed.")

@@ -1,4 +1,8 @@
-"""The kernels of skills over time or a phase: with rates among the outputs, or periodic."""
+"""Kernels of one input, time or phase: with rates among the outputs, or periodic.
+
+With r = x - x' in the kernel's coordinates, each needs the derivatives d^n/dr^n of its block (C, C)
+of two points: d/dx is d/dr, and d/dx' is -d/dr.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from kmp.kernel import directed, unstretched
 
 @dataclass(frozen=True)
 class _OneInput(Immutable):
-    """A kernel of one input: all follows from its blocks' derivatives by r = x - x'."""
+    """A kernel of one input, defined by its blocks' derivatives with respect to r = x - x'."""
 
     channels: ClassVar[int] = 1
     ell: float
@@ -62,7 +66,7 @@ class _OneInput(Immutable):
     def row(
         cls, offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None, order: int = 0
     ) -> Array:
-        """The row, or its derivative of that order by x: (R,) where C is 1, else (C, R C)."""
+        """The derivative of this order of the row by x: (R,) if C is 1, else (C, R C)."""
         r = offsets[:, 0]
         blocks = cls.blocks(r, values, scale, order)
         if derivatives is not None:
@@ -94,10 +98,10 @@ class _OneInput(Immutable):
 
 @dataclass(frozen=True)
 class VelocityKernel(_OneInput):
-    """The kernel of skills over time whose 2 D outputs are a value and its rate: [xi, dxi/dt].
+    """The kernel of skills over time whose 2 D outputs are values and their rates: [xi, dxi/dt].
 
-    k(t, t') and its derivatives, exact, so that a via-point can fix the velocity too (IJRR 2019, on
-    time-driven trajectories). With r = t - t' the block of two points is
+    A via-point can then fix the velocity too (IJRR 2019, on time-driven trajectories; there the
+    derivatives are differences, here they are exact). With r = t - t' the block of two points is
     [[k, 2 ell r k], [-2 ell r k, (2 ell - 4 ell^2 r^2) k]]; `ell` in 1 / (unit of time)^2. It
     takes one input. The methods are those of `Kernel`. Raises ValueError unless ell is finite and
     above 0.
@@ -114,7 +118,7 @@ class VelocityKernel(_OneInput):
         return frozen(np.diag([1.0, 2 * self.ell]))
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raises ValueError unless there is one input, and there are as many rates as values."""
+        """Raise ValueError unless there are one input and as many rates as values."""
         if inputs != 1 or outputs % 2:
             raise ValueError(
                 f"kernel: {inputs} inputs and {outputs} outputs given; value and rate over time need "
@@ -131,7 +135,7 @@ class VelocityKernel(_OneInput):
 
     @staticmethod
     def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
-        r = np.where(values > 0, r, 0.0)  # far away all is 0, where infinity times 0 would be no number
+        r = np.where(values > 0, r, 0.0)  # k is 0 far away, where r k would be infinity times 0
         # k^(n+1) = -2 ell (r k^(n) + n k^(n-1)); d/dt is d/dr and d/dt' is -d/dr.
         k = [values, -2 * scale * r * values]
         for n in range(1, order + 2):
@@ -142,31 +146,30 @@ class VelocityKernel(_OneInput):
 
 @dataclass(frozen=True)
 class PeriodicKernel(_OneInput):
-    """k(t, t') = exp(-ell (T / pi)^2 sin^2(pi (t - t') / T)): the same again after each period T.
+    """k(t, t') = exp(-ell (T / pi)^2 sin^2(pi (t - t') / T)), periodic with the period T.
 
     Near to t it is the Gaussian kernel of the same `ell` [1 / (unit of time)^2]; `period` T [unit
     of time], 2 pi for a phase in radians. MacKay, Introduction to Gaussian Processes, 1998. A
-    rhythmic skill has no seam: all predictions at t and t + T are the same. It takes one input. The
+    rhythmic skill has no seam: predictions at t and t + T are equal. It takes one input. The
     methods are those of `Kernel`. Raises ValueError unless both are finite and above 0.
     """
 
     period: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ell", positive("ell", self.ell))
-        object.__setattr__(self, "period", positive("period", self.period))
+        self.__dict__.update(ell=positive("ell", self.ell), period=positive("period", self.period))
 
     @cached_property
     def prior_variance(self) -> Array:
         return frozen(np.ones((1, 1)))
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raises ValueError unless there is one input."""
+        """Raise ValueError unless there is one input."""
         if inputs != 1:
             raise ValueError(f"kernel: {inputs} inputs given; a periodic kernel needs 1, the time or a phase.")
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
-        """In radians."""
+        """The scale ell (T / pi)^2, and the stretch 2 pi / T to radians."""
         return self.ell * (self.period / np.pi) ** 2, frozen(np.full(inputs, 2 * np.pi / self.period))
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""What the values of this package demand of the numbers they are made of, and what it warns of."""
+"""Checks of arguments, each a ValueError that names the argument, and the package's warnings."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 class ViaPointMissed(UserWarning):
-    """A via-point is missed by more than its own deviation allows."""
+    """The mean misses a via-point by more than the via-point's deviation allows."""
 
 
 class RankReached(UserWarning):
-    """The rank was too low for the data, and accuracy was lost."""
+    """The rank was too low for the data, so the low rank solution lost accuracy."""
 
 
 def real(name: str, value: ArrayLike) -> Array:
-    """The value as an array, without a copy if it is one. Raises ValueError unless it is real."""
+    """The value as an array of float64, not copied if it is one. Raises ValueError if not real."""
     try:
         given = np.asarray(value)
     except ValueError:
@@ -36,9 +36,9 @@ def real(name: str, value: ArrayLike) -> Array:
 
 
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
-    """A read-only copy of `value` of the given shape, where a word stands for any length.
+    """A read-only copy of `value`, which must have this shape; a word stands for any length.
 
-    Raises ValueError if the shape is another or a number is not real and finite.
+    Raises ValueError if the shape differs or a number is not real and finite.
     """
     array = np.array(real(name, value), dtype=np.float64, order="C")
     check_shape(name, array, *shape)
@@ -46,12 +46,12 @@ def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     return frozen(array)
 
 
-_LARGEST = 1e150  # of a number: sums of squares of larger ones may be infinite
-_SHOWN = 60  # characters of a value in a message
+_LARGEST = 1e150  # the sum of squares of larger numbers may be infinite
+_SHOWN = 60  # a message shows at most this many characters of a value
 
 
 def brief(value: object) -> str:
-    """The value as a message shows it: an array by its shape where it is long."""
+    """The value as a message shows it: cut to 60 characters, a long array as its shape."""
     text = " ".join(repr(value.tolist() if isinstance(value, np.ndarray) else value).split())
     if len(text) <= _SHOWN:
         return text
@@ -61,10 +61,10 @@ def brief(value: object) -> str:
 
 
 def check_finite(name: str, array: Array, what: str = "") -> None:
-    """Raises ValueError unless every number is finite, and so is its square."""
+    """Raise ValueError unless every number and its square are finite."""
     flat = array.ravel()
     with np.errstate(over="ignore"):
-        if math.isfinite(np.dot(flat, flat)):  # quicker than a look at each number
+        if math.isfinite(np.dot(flat, flat)):  # faster than checking each number
             return
         of = f"{name}: {what} " if what else name
         for place in np.argwhere(~(np.abs(array) <= _LARGEST))[:1].tolist():
@@ -73,7 +73,7 @@ def check_finite(name: str, array: Array, what: str = "") -> None:
 
 
 def check_shape(name: str, array: Array, *shape: int | str) -> None:
-    """Raises ValueError unless the array has that shape, where a word stands for any length."""
+    """Raise ValueError unless the array has this shape; a word stands for any length."""
     if array.shape == shape:
         return
     if array.ndim == len(shape) and all(n == m or isinstance(n, str) for n, m in zip(shape, array.shape, strict=True)):
@@ -83,7 +83,7 @@ def check_shape(name: str, array: Array, *shape: int | str) -> None:
 
 
 def positive(name: str, value: float | Array) -> float:
-    """The value as a float. Raises ValueError unless it is one number, finite and above zero."""
+    """The value as a float. Raises ValueError unless it is one finite number above 0."""
     given = real(name, value)
     check_shape(name, given)
     number = float(given)
@@ -93,7 +93,7 @@ def positive(name: str, value: float | Array) -> float:
 
 
 def not_negative(name: str, value: float | Array) -> float:
-    """The value as a float. Raises ValueError unless it is one number, and not below zero."""
+    """The value as a float. Raises ValueError unless it is one number of at least 0."""
     given = real(name, value)
     check_shape(name, given)
     if not given >= 0:
@@ -102,7 +102,7 @@ def not_negative(name: str, value: float | Array) -> float:
 
 
 def squared(name: str, deviation: float | Array) -> float:
-    """The variance. Raises ValueError unless the deviation is above zero, and its square too."""
+    """The variance of a deviation. Raises ValueError unless both are finite and above 0."""
     variance = float(np.square(positive(name, deviation)))
     if not 0 < variance < math.inf:
         raise ValueError(f"{name} is {deviation:g}, and its square must be a number above 0.")
@@ -110,18 +110,18 @@ def squared(name: str, deviation: float | Array) -> float:
 
 
 def seeded(value: object) -> int:
-    """The seed. Raises ValueError unless it is a whole number of 32 bits, not below zero."""
+    """The seed. Raises ValueError unless it is a whole number from 0 to 2^32 - 1."""
     return whole("seed", value, least=0, most=2**32 - 1)
 
 
 def check_some(name: str, values: Sized) -> None:
-    """Raises ValueError if there is none."""
+    """Raise ValueError if the values are empty."""
     if len(values) == 0:
         raise ValueError(f"{name}: none given, at least 1 needed.")
 
 
 def parts_of(name: str, value: Any, kind: type | None = None, how: str = "") -> list[Any]:
-    """The parts, each of that kind. Raises ValueError unless there is one at least."""
+    """The parts as a list. Raises ValueError if there is none, or one is not of this kind."""
     if not isinstance(value, (list, tuple)) and np.ndim(value if isinstance(value, np.ndarray) else 0) == 0:
         raise ValueError(f"{name}: {type(value).__name__} given, a list needed.")
     check_some(name, value)
@@ -132,7 +132,7 @@ def parts_of(name: str, value: Any, kind: type | None = None, how: str = "") -> 
 
 
 def whole(name: str, value: object, *, least: int = 1, most: int = 2**31 - 1) -> int:
-    """The value as an integer. Raises ValueError unless it is one, from the least to the most."""
+    """The value as an int. Raises ValueError unless it is whole and from `least` to `most`."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
         raise ValueError(f"{name} is {brief(value)}, and must be a whole number.")
     if value < least:
@@ -143,13 +143,13 @@ def whole(name: str, value: object, *, least: int = 1, most: int = 2**31 - 1) ->
 
 
 def check_kind(name: str, value: object, kind: type, how: str) -> None:
-    """Raises ValueError unless the value is of that kind; `how` says how one is made."""
+    """Raise ValueError unless the value is of this kind; `how` shows how to make one."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: {type(value).__name__} given, {kind.__name__} needed: {how}.")
 
 
 def one_of(name: str, value: object, words: Sequence[str]) -> None:
-    """Raises ValueError unless the value is one of the words."""
+    """Raise ValueError unless the value is one of the words."""
     if not isinstance(value, str) or value not in words:
         *most, last = map(repr, words)
         raise ValueError(f"{name}: {brief(value)} given, {', '.join(most)} or {last} needed.")
@@ -165,7 +165,7 @@ def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
 
 
 def checked_demonstrations(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:
-    """Inputs (T, I) and outputs (T, O) of each. Raises ValueError if one has no sample."""
+    """Inputs (T, I) and outputs (T, O) of each demonstration. Raises ValueError if one is empty."""
     data: list[tuple[Array, Array]] = []
     for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):
         inputs, outputs = pair(f"demonstrations[{h}]", demonstration)

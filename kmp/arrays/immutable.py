@@ -1,4 +1,4 @@
-"""Values that never change: threads may share them, and copies are as read-only as they are."""
+"""Immutable values, which threads may share: their arrays are read-only, in copies as well."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-_SHOWN = 3  # of a tuple
+_SHOWN = 3  # `repr` shows the items of tuples up to this length
 _Some = TypeVar("_Some", bound=NDArray[Any])
 
 
@@ -19,13 +19,13 @@ def frozen(array: _Some) -> _Some:
 
 
 class Immutable:
-    """A value whose arrays are read-only, after copying and unpickling too (as NumPy's are not)."""
+    """A value whose arrays stay read-only after copying and unpickling; NumPy's own do not."""
 
     _not_pickled: ClassVar[frozenset[str]] = frozenset()
-    """Cached properties that a pickle leaves out: large, and made again when asked for."""
+    """Cached properties that a pickle leaves out: they are large and can be computed again."""
 
     def __repr__(self) -> str:
-        """The fields in one line, arrays by their shapes."""
+        """The fields in one line, arrays as their shapes."""
         fields = (f"{name}={_short(value)}" for name, value in self.__dict__.items() if name in self._fields())
         return f"{type(self).__name__}({', '.join(fields)})"
 
@@ -41,7 +41,7 @@ class Immutable:
         self.__dict__.update(state)
 
     def _with_cached(self, **known: object) -> Self:
-        """A copy of this value that knows some of its cached properties from the start."""
+        """A copy of this value in which these cached properties are already set."""
         other = copy.copy(self)
         other.__dict__.update(known)
         return other

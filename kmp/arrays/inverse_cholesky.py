@@ -1,4 +1,7 @@
-"""The inverse of a Cholesky factor, with which a query's covariance costs one multiplication."""
+"""The inverse L^-1 of a Cholesky factor, by which a query's covariance costs one product.
+
+k (L L^T)^-1 k^T = R R^T with the root R = (L^-1 (k^T (x) I))^T.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from scipy.linalg import lapack
 from kmp.arrays.checks import Array
 from kmp.arrays.immutable import Immutable, frozen
 
-_BANDS = 4  # with 4, five eighths of the square are kept
+_BANDS = 4  # L^-1 is stored as 4 bands of rows, which hold 5/8 of the square
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,7 +40,7 @@ class InverseCholeskyFactor(Immutable):
         bands = (
             np.ascontiguousarray(rows[a * d : b * d, :b].transpose(0, 2, 1)).reshape(-1, b)
             for a, b in pairwise(edges)
-            if a < b  # fewer points than bands
+            if a < b  # a band is empty where there are fewer points than bands
         )
         return cls(d, tuple(frozen(band) for band in bands))
 

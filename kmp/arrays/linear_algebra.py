@@ -1,4 +1,4 @@
-"""Operations on stacks of small matrices that several modules need."""
+"""Operations on stacks of small matrices: symmetric part, Kronecker product, projection."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MACHINE = float(np.finfo(np.float64).eps)
 
 
 def symmetric(matrices: Array) -> Array:
-    """The symmetric parts (..., n, n). A symmetric matrix is returned as it is, bit for bit."""
+    """The symmetric parts (A + A^T) / 2 (..., n, n). A symmetric matrix keeps its bits."""
     return np.asarray((matrices + matrices.swapaxes(-1, -2)) / 2)
 
 
@@ -23,13 +23,14 @@ def kron_identity(blocks: Array, copies: int) -> Array:
 
 
 def nearest_positive_semidefinite(covariance: Array) -> Array:
-    """The nearest positive semi-definite matrices (M, n, n): rounding can leave some just below.
+    """The nearest positive semi-definite matrices (M, n, n), against eigenvalues rounded below 0.
 
-    Eigenvalues are raised to the machine's precision, so that the result has a Cholesky factor.
+    V max(diag(lambda), eps) V^T of the symmetric part V diag(lambda) V^T, with the machine's
+    precision eps, so that the result has a Cholesky factor (Higham 1988).
     """
     covariance = symmetric(covariance)
     if len(covariance) == 1 and lapack.dpotrf(covariance[0])[1] == 0:
-        return covariance  # as below, without NumPy's overhead
+        return covariance  # the same answer as below, without NumPy's overhead
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:

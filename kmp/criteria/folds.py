@@ -1,8 +1,8 @@
-"""What is learned from all demonstrations but one, and how well it predicts that one.
+"""Leave-one-out folds: errors on a demonstration, of a primitive learned from the others.
 
-A fold is asked for many hyper-parameters. All lambdas of one kernel share what does not depend on
-them: for the mean of one input the features of the kernel, which are few; for the covariance one
-eigendecomposition.
+Each fold evaluates many hyper-parameters. The lambdas of one kernel share an eigendecomposition
+Sigma^-1/2 K Sigma^-1/2 = V diag(v) V^T, so that (K + lambda Sigma)^-1 = Sigma^-1/2 V diag(1 / (v +
+lambda)) V^T Sigma^-1/2; over one input that of the kernel's features, which are fewer.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import check_resolved
 
-_FEW = 0.25  # of the points: more features than that cost more than they save
-_LEFT = 1e-13  # of k(s, s), that the features may leave: rounding
+_MOST_FEATURES = 0.25  # more features than this share of the points cost more than they save
+_RESIDUAL = 1e-13  # largest residual of the features, as a share of k(s, s): rounding
 
 
 @dataclass(frozen=True)
 class Fold:
-    """What is learned from all demonstrations but one, and the points of that one."""
+    """The reference of all demonstrations but one, and the samples of the one held out."""
 
     inputs: Array
     reference: Gaussians
@@ -41,7 +41,7 @@ class Fold:
     regression_rmse: float
 
     def fitted(self, kernel: Kernel, lambda_mean: float, lambda_covariance: float | None) -> KMP:
-        """The primitive."""
+        """The primitive of the reference."""
         return KMP.fit(
             self.inputs,
             self.reference,
@@ -52,21 +52,27 @@ class Fold:
         )
 
     def rmses(self, kernel: Kernel, penalties: Sequence[float], outputs: int) -> list[float]:
-        """Of the mean at what is held out, the first outputs alone; infinite where unsolvable."""
+        """RMSE of the mean on the held-out samples, per penalty; infinite if not solvable.
+
+        Of the first `outputs` only [unit of the outputs].
+        """
         found = []
         system = _System(self, kernel)
         for penalty in penalties:
             try:
                 miss = (system.mean(penalty) - self.held_outputs)[:, :outputs]
                 found.append(float(np.sqrt((miss**2).sum(axis=1).mean())))
-            except ValueError:  # not solvable to working precision: no candidate
+            except ValueError:  # not solvable to working precision
                 found.append(np.inf)
         return found
 
     def negative_log_likelihoods(
         self, kernel: Kernel, lambda_mean: float, penalties: Sequence[float], outputs: int
     ) -> list[float]:
-        """Of what is held out, with these lambdas of the covariance; infinite where unsolvable."""
+        """Mean negative log likelihood [nat] of the held-out samples, per lambda_c.
+
+        Of the first `outputs` only; infinite if not solvable.
+        """
         system = _System(self, kernel)
         try:
             residual = (self.held_outputs - system.mean(lambda_mean))[:, :outputs]
@@ -84,19 +90,19 @@ class Fold:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """What all lambdas of one kernel share. N points, M held out, O = C D outputs, r features."""
+    """The part shared by all lambdas of a kernel. N points, M held out, O = C D, r features."""
 
     fold: Fold
     kernel: Kernel
 
     def mean(self, penalty: float) -> Array:
-        """(M, O). Raises ValueError where rounding hides lambda Sigma, or there is no solution."""
+        """The mean (M, O). Raises ValueError if not solvable, or rounding hides lambda Sigma."""
         self._check(penalty)
         target = self.fold.reference.mean - self.fold.prior_mean
         if self._features is not None:
             values, vectors = self._modes
             pulls = self._whitened(target.reshape(-1, 1))[:, 0] @ self._rows @ vectors
-            return np.asarray((self._asked_modes @ (pulls / (values + penalty))).reshape(self._shape)) + (
+            return np.asarray((self._held_modes @ (pulls / (values + penalty))).reshape(self._shape)) + (
                 self.fold.prior_mean
             )
         total, count = self._gram.copy(), len(target)
@@ -112,10 +118,10 @@ class _System:
         return np.asarray((self._across @ weights.reshape(-1, d)).reshape(self._shape)) + self.fold.prior_mean
 
     def covariance(self, penalty: float) -> Array:
-        """(M, O, O) N / lambda_c (k - k (K + lambda_c Sigma)^-1 k^T). Raises as `mean` does."""
+        """N / lambda_c (k - k (K + lambda_c Sigma)^-1 k^T) (M, O, O). Raises as `mean` does."""
         self._check(penalty)
         values, _ = self._modes
-        modes = self._asked_modes.reshape(*self._shape, -1)
+        modes = self._held_modes.reshape(*self._shape, -1)
         shrunk = 1 / (np.maximum(values, 0.0) + penalty)
         if self._features is None:
             left, sign = self._own, -1.0
@@ -137,7 +143,7 @@ class _System:
         return kron_identity(self.kernel.prior_variance, self.fold.reference.outputs // self.kernel.channels)
 
     def _whitened(self, rows: Array) -> Array:
-        """Rows (N O, J) times the inverse roots of the points' covariances."""
+        """Sigma^-1/2 times rows (N O, J), with the inverse Cholesky factors of the covariances."""
         stacked = rows.reshape(*self.fold.reference.mean.shape, -1)
         return np.asarray(self._inverse_roots @ stacked).reshape(rows.shape)
 
@@ -147,15 +153,15 @@ class _System:
 
     @cached_property
     def _features(self) -> Features | None:
-        rank, points = int(_FEW * len(self.fold.inputs)), Functionals(self.fold.inputs)
-        if rank == 0 or self.fold.inputs.shape[1] > 1:  # in more dimensions there are too many
+        rank, points = int(_MOST_FEATURES * len(self.fold.inputs)), Functionals(self.fold.inputs)
+        if rank == 0 or self.fold.inputs.shape[1] > 1:  # with more inputs the rank is too high
             return None
-        found, left = Features.of(self.kernel, points, rank=rank, tolerance=_LEFT)
-        return found if left <= _LEFT else None
+        found, left = Features.of(self.kernel, points, rank=rank, tolerance=_RESIDUAL)
+        return found if left <= _RESIDUAL else None
 
     @cached_property
     def _rows(self) -> Array:
-        """The features of the points, for each output, whitened: (N O, r D)."""
+        """Sigma^-1/2 times the features of the points, for each output: (N O, r D)."""
         assert self._features is not None
         return self._whitened(self._wide(self._features(Functionals(self.fold.inputs)).T))
 
@@ -167,12 +173,12 @@ class _System:
 
     @cached_property
     def _across(self) -> Array:
-        """k of what is held out and the points: (M C, N C)."""
+        """k between the held-out inputs and the points: (M C, N C)."""
         return between(self.kernel, Functionals(self.fold.held_inputs), Functionals(self.fold.inputs))
 
     @cached_property
     def _modes(self) -> tuple[Array, Array]:
-        """Eigenvalues and vectors of the whitened K (N O, N O), or of the features' (r D, r D)."""
+        """Eigenvalues v, vectors V of Sigma^-1/2 K Sigma^-1/2, or of the features' (r D, r D)."""
         if self._features is not None:
             values, vectors, _ = lapack.dsyevd(self._rows.T @ self._rows)
         else:
@@ -181,8 +187,8 @@ class _System:
         return values, vectors
 
     @cached_property
-    def _asked_modes(self) -> Array:
-        """What is held out, along the modes: (M O, N O) or (M O, r D)."""
+    def _held_modes(self) -> Array:
+        """k Sigma^-1/2 V of the held-out inputs (M O, N O), or z V of their features (M O, r D)."""
         if self._features is not None:
             return np.asarray(self._wide(self._features(Functionals(self.fold.held_inputs)).T) @ self._modes[1])
         across = self._whitened(np.ascontiguousarray(self._wide(self._across).T))
@@ -190,7 +196,7 @@ class _System:
 
     @cached_property
     def _residual(self) -> Array:
-        """What the features leave of k(s, s) at what is held out: (M, O, O)."""
+        """The residual of the features at the held-out inputs: (M, O, O)."""
         assert self._features is not None
         z = self._features(Functionals(self.fold.held_inputs)).T.reshape(len(self.fold.held_inputs), -1, self._rank)
         d = self.fold.reference.outputs // self.kernel.channels
@@ -202,12 +208,12 @@ class _System:
         return len(self._features.pivots)
 
     def _wide(self, matrix: Array) -> Array:
-        """x (x) I of size D, of the rows and columns of channels."""
+        """x (x) I of a matrix over channels, with I of size D."""
         return kron_identity(matrix, self.fold.reference.outputs // self.kernel.channels)
 
 
 def _negative_log_likelihood(residual: Array, covariance: Array) -> float:
-    """The mean over T points [nat]: residuals (T, O), covariances (T, O, O)."""
+    """Mean of -log N(r_t; 0, Sigma_t) [nat], of residuals r (T, O), covariances (T, O, O)."""
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, residual[:, :, None])[:, :, 0]
     log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)

@@ -1,6 +1,8 @@
-"""The hyper-parameters under which a reference is likeliest, a length for each input among them.
+"""Hyper-parameters of the greatest marginal likelihood of a reference, with one ell per input.
 
-Rasmussen and Williams 2006, sections 5.1 and 5.4.1: automatic relevance determination.
+mu ~ N(m, s^2 G) with G = K + lambda Sigma: -log p = (log det G + n (1 + log 2 pi s^2)) / 2 for the
+likeliest s^2 = (mu - m)^T G^-1 (mu - m) / n, n = N O. Rasmussen and Williams 2006, sections 5.1
+(automatic relevance determination) and 5.4.1 (gradient).
 """
 
 from __future__ import annotations
@@ -17,15 +19,15 @@ from kmp.kernel import GaussianKernel, Kernel, between
 from kmp.problem.database import Database
 from kmp.time_kernels import VelocityKernel
 
-_STARTS = (0.1, 1.0, 10.0)  # times the first ell: the likelihood has more than one peak
-_LAMBDA = 1e-2  # at the start, over the mean variance of the reference
-_LENGTHS = np.log(1e-6), np.log(1e4)  # of ell over the first one: beyond, an input says nothing or all
-_LAMBDAS = np.log(1e-7), np.log(1e3)  # of lambda over the one at the start: beyond, rounding
-_UNLIKELY = 1e12  # [nat] where there is no factor: the search goes back
+_STARTS = (0.1, 1.0, 10.0)  # factors on the initial ell, as the likelihood has several maxima
+_LAMBDA = 1e-2  # initial lambda times the mean variance of the reference
+_ELL_BOUNDS = np.log(1e-6), np.log(1e4)  # log ell / initial ell: the input has no effect, or every effect
+_LAMBDA_BOUNDS = np.log(1e-7), np.log(1e3)  # log lambda / initial lambda: rounding limits it
+_UNLIKELY = 1e12  # [nat] value without a Cholesky factor, from which the search turns back
 
 
 class MostLikely(NamedTuple):
-    """What `most_likely` found."""
+    """The hyper-parameters of the greatest likelihood."""
 
     kernel: Kernel
     lambda_mean: float
@@ -41,10 +43,10 @@ def most_likely(
     *,
     free: Literal["each", "one", "none"],
 ) -> MostLikely:
-    """The parameters of the greatest marginal likelihood of a reference, from those of a kernel.
+    """The hyper-parameters of the greatest marginal likelihood; `kernel` has the initial ell.
 
-    `free`: whether "each" ell of the kernel is sought, "one" factor of all, or "none". A lambda
-    that is given is kept. Raises ValueError if no parameters can be solved for.
+    `free`: "each" ell of the kernel, "one" common factor of all, or "none". A given lambda is kept.
+    Raises ValueError if no parameters can be solved for.
     """
     from scipy.optimize import minimize  # its import takes a quarter of a second
 
@@ -65,7 +67,7 @@ def most_likely(
         of_lengths = gradient[:-1] if free == "each" else gradient[:-1].sum(keepdims=True)
         return value, np.concatenate([of_lengths[:lengths], gradient[-1:] if lambda_mean is None else []])
 
-    bounds = [_LENGTHS] * lengths + ([_LAMBDAS] if lambda_mean is None else [])
+    bounds = [_ELL_BOUNDS] * lengths + ([_LAMBDA_BOUNDS] if lambda_mean is None else [])
     best, least = np.zeros(len(bounds)), np.inf
     for start in _STARTS if lengths else _STARTS[1:2]:
         x = np.zeros(len(bounds))
@@ -88,8 +90,8 @@ def negative_log_likelihood(
 ) -> tuple[float, Array, float] | None:
     """-log p [nat] of the reference's means, its gradient, and the likeliest s^2.
 
-    Under the covariance s^2 (K + lambda Sigma). The gradient (I + 1,) is by log ell, each, and by
-    log lambda; with one ell for all inputs (2,). None where that is not positive definite.
+    The gradient (I + 1,) is by the log of each ell and by log lambda; (2,) with one ell for all
+    inputs. None if K + lambda Sigma is not positive definite.
     """
     reference, c = points.reference, kernel.channels
     count, outputs = reference.mean.shape
@@ -108,7 +110,7 @@ def negative_log_likelihood(
     lower = lapack.dpotri(factor, lower=1)[0]
     inverse = np.tril(lower) + np.tril(lower, -1).T
     pull = (inverse - np.outer(weights, weights) / signal).reshape(count * c, d, count * c, d)
-    shared = np.einsum("idjd->ij", pull)  # what each entry of K has in the likelihood, twice
+    shared = np.einsum("idjd->ij", pull)  # twice the derivative of -log p by each entry of K
     by_lengths = [0.5 * float((shared * one).sum()) for one in _by_log_ell(kernel, points.inputs, k)]
     own = pull.reshape(count, outputs, count, outputs)[every, :, every, :]
     by_lambda = 0.5 * lambda_mean * float((own * reference.covariance).sum())
@@ -116,12 +118,12 @@ def negative_log_likelihood(
 
 
 def with_ell(kernel: Kernel, ell: Array) -> Kernel:
-    """A kernel of this kind with other ell (I,), or (1,)."""
+    """A kernel of the same class with other ell (I,), or (1,)."""
     return VelocityKernel(float(ell[0])) if isinstance(kernel, VelocityKernel) else GaussianKernel(ell)
 
 
 def _by_log_ell(kernel: Kernel, inputs: Array, k: Array) -> Iterator[Array]:
-    """The derivatives of K (N C, N C) by the logarithm of each ell."""
+    """dK / d log ell (N C, N C) for each ell."""
     ell = np.atleast_1d(np.asarray(kernel.ell, dtype=np.float64))
     if isinstance(kernel, GaussianKernel):
         columns = inputs.T[:, :, None] if len(ell) > 1 or inputs.shape[1] == 1 else inputs[None]
@@ -135,6 +137,6 @@ def _by_log_ell(kernel: Kernel, inputs: Array, k: Array) -> Iterator[Array]:
         blocks[:, 0, :, 0] *= -squares
         blocks[:, 0, :, 1] *= 1 - squares
         blocks[:, 1, :, 0] *= 1 - squares
-        # the rates' block is (2 ell - 4 ell^2 r^2) k
+        # The rates' block is (2 ell - 4 ell^2 r^2) k.
         blocks[:, 1, :, 1] = ell[0] * (2 - 8 * squares) * value - squares * blocks[:, 1, :, 1]
         yield blocks.reshape(k.shape)

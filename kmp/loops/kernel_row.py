@@ -1,5 +1,6 @@
-"""The kernel row of one query, centre by centre, for compiled loops: the Gaussian kernel, in the
-coordinates in which one scale serves all inputs.
+"""The Gaussian kernel between a query and each centre, for compiled loops.
+
+k(x, x_r) = exp(-scale |x - x_r|^2) in the coordinates x = stretch * s. The paper, section III.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from kmp.compiled import compiled
 
 @compiled
 def kernel_value(query: Array, centre: Array, scale: float, offset: Array) -> float:
-    """k(x, x_r) = exp(-scale |x - x_r|^2) of a query x (I,) and a centre, whose first I numbers are
-    x_r; x - x_r into `offset` (I,). The paper, section III.
+    """k(x, x_r) of a query x (I,) and a centre, whose first I numbers are x_r.
+
+    Writes x - x_r to `offset` (I,).
     """
     square = 0.0
     for i in range(len(query)):
@@ -26,8 +28,9 @@ def kernel_value(query: Array, centre: Array, scale: float, offset: Array) -> fl
 
 @compiled
 def add_weighted(query: Array, rows: Array, scale: float, out: Array) -> None:
-    """Adds sum_r k(x, x_r) w_r to `out` (O,), for a query x (I,) and rows (R, I + O) of a centre
-    and its weights each. Equation (8).
+    """Add sum_r k(x, x_r) w_r to `out` (O,), equation (8).
+
+    x (I,) is the query; each of the rows (R, I + O) is a centre x_r and its weights w_r.
     """
     inputs = len(query)
     offset = np.empty(inputs)

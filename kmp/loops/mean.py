@@ -1,8 +1,10 @@
-"""Equation (8) and its Jacobian as compiled loops over centres that lie beside one another, so that
-vector units take several at once.
+"""Equation (8) and its Jacobian as compiled loops that vector units can execute.
 
-A table (I + O, P) holds coordinates and weights of R centres. P is R rounded up to LANES; what is
-beyond R weighs 0. Each sum is LANES sums of every LANES-th term: its order is fixed, on every CPU.
+xi(s) = sum_r exp(-scale |x - x_r|^2) w_r + m(s) in the coordinates x = stretch * s.
+
+A table (I + O, P) holds the coordinates x_r and the weights w_r of R centres as rows. P is R
+rounded up to LANES; the padding has weight 0. Each sum consists of LANES sums of every LANES-th
+term, so that its order is the same on every CPU.
 """
 
 from __future__ import annotations
@@ -15,15 +17,15 @@ from numpy.typing import NDArray
 from kmp.arrays.checks import Array
 from kmp.compiled import compiled
 
-LANES = 4
+LANES = 4  # partial sums of each sum: a vector unit of 256 bits adds four numbers at once
 
-# exp(x) = 2^k exp(f), k whole, |f| <= ln 2 / 2, as C libraries have it, without branch or table.
+# exp(x) = 2^k exp(f) with k whole and |f| <= ln 2 / 2, as in C libraries, without branch or table.
 _LOG2_E = 1.4426950408889634
-_LN2_HIGH = 6.93147180369123816490e-01  # ends in zeros: k times it is exact
+_LN2_HIGH = 6.93147180369123816490e-01  # its last bits are 0, so that k times it is exact
 _LN2_LOW = 1.90821492927058770002e-10
-_ROUND = 6755399441055744.0  # 1.5 2^52: what is added to it becomes a whole number, in its last bits
-_LEAST = -708.0  # below it exp is less than 1e-307, and taken for 0
-_EXPONENT = 52  # bits of a number below its exponent
+_ROUND = 6755399441055744.0  # 1.5 * 2^52: x + _ROUND holds x, rounded to a whole number, in its last bits
+_LEAST = -708.0  # exp of less is below 1e-307, and set to 0
+_EXPONENT = 52  # position of the exponent in the bits of a number
 
 
 def table_of(centres: Array, weights: Array) -> Array:
@@ -36,15 +38,16 @@ def table_of(centres: Array, weights: Array) -> Array:
 
 @compiled
 def exponentials(values: Array, scale: float, steps: Array) -> None:
-    """exp(-scale v) of each value v (P,), none below 0, in its place, to a unit in the last place;
-    with room for the `steps` (P,).
+    """Replace each v >= 0 of the values (P,) by exp(-scale v), to one unit in the last place.
+
+    `steps` (P,) is working memory.
     """
     for r in range(len(values)):
         x = values[r] * -scale
         step = x * _LOG2_E + _ROUND
         k = step - _ROUND
         f = (x - k * _LN2_HIGH) - k * _LN2_LOW
-        # The series to f^13, in shares that do not wait for each other.
+        # The series to f^13, in terms that do not depend on each other.
         g = f * f
         h = g * g
         p = (0.5 + f * (1 / 6)) + g * (1 / 24 + f * (1 / 120))
@@ -60,7 +63,7 @@ def exponentials(values: Array, scale: float, steps: Array) -> None:
 
 @compiled
 def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Array) -> None:
-    """exp(-scale |x - x_r|^2), for x (I,), into `values` (P,), with `room` (P,)."""
+    """Write exp(-scale |x - x_r|^2) of x (I,) to `values` (P,). `room` (P,) is working memory."""
     inputs = len(x)
     values[:] = 0.0
     for i in range(0, inputs - 1, 2):
@@ -78,7 +81,7 @@ def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Ar
 
 @compiled
 def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scale: float, values: Array) -> None:
-    """Makes of the values at `places` (R',) their derivatives along `along` (R', I)."""
+    """Replace the values at indices `places` (R',) by derivatives along `along` (R', I)."""
     for n in range(len(places)):
         r, away = places[n], 0.0
         for i in range(len(x)):
@@ -89,7 +92,8 @@ def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scal
 @compiled
 def _sum(a: Array, b: Array) -> float:
     """sum_r a_r b_r (P,)."""
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)  # a signed index may be from the end: slower
+    # Signed indices may count from the end, which costs a check each.
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     first = second = third = fourth = 0.0
     for k in range(len(a) // LANES):
         r = np.uint64(LANES * k)
@@ -111,12 +115,11 @@ def means(
     values: Array,
     out: Array,
 ) -> bool:
-    """xi at queries (M, I) into `out` (M, O), the last one's kernel row into `values` (P,); whether
-    all is finite.
+    """Write xi at queries (M, I) to `out` (M, O), the last kernel row to `values` (P,).
 
-    `places` (R',) are the centres that stand for derivatives, along `along` (R', I); `coordinates`
-    (1 + I,) the kernel's scale, and the stretch of each input. `prior` (O, 1), or (O, 1 + I) where
-    the prior mean goes with the input, is its offset and matrix.
+    Returns true if all is finite. `places` (R',) are the indices of the centres that are
+    derivatives along `along` (R', I); `coordinates` (1 + I,) the kernel's scale and the stretch of
+    each input; `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I).
     """
     scale, stretch, outputs = coordinates[0], coordinates[1:], len(prior)
     inputs = len(stretch)
@@ -146,7 +149,7 @@ def slopes(
     prior: Array,
     out: Array,
 ) -> bool:
-    """dxi/ds at a query (I,) into `out` (O, I); whether all is finite. Else as in `means`."""
+    """Write dxi/ds at a query (I,) to `out` (O, I); true if all is finite. See `means`."""
     scale, stretch, outputs, total = coordinates[0], coordinates[1:], len(prior), 0.0
     inputs, padded = len(stretch), table.shape[1]
     x, values, pull, offsets = query * stretch, np.empty(padded), np.empty(padded), np.empty((inputs, padded))

@@ -1,7 +1,7 @@
-"""One query at a time, compiled by Numba where that is installed: loops over what the query touches
-and nothing else.
+"""Mean, derivatives and covariance at one query as compiled loops, for the Gaussian kernel.
 
-For the Gaussian kernel, whose inputs are scaled once; the covariance for the dense solution.
+The equations are those of `kmp.query`. The covariance of a dense solution is N / lambda_c (I - R
+R^T) with the root R = (L^-1 (k^T (x) I))^T, of L L^T = K + lambda_c Sigma.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from kmp.loops.kernel_row import kernel_value
 from kmp.loops.mean import means, slopes, table_of
 from kmp.query import MotionPrediction, Query
 
-MEANS = 4  # rows of a motion's output before its Jacobian: mean, velocity, acceleration, curvature
+MEANS = 4  # rows of a motion's output before the Jacobian: mean, velocity, acceleration, curvature
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledQuery(Immutable):
-    """A query's arrays for compiled loops. R centres, O outputs."""
+    """The arrays of a query for compiled loops. R centres, O outputs."""
 
     query: Query
     rows: Array
-    """(R, I + O) of each centre, in the kernel's coordinates, and its weights."""
+    """(R, I + O) each centre, in the kernel's coordinates, and its weights."""
     along: Array
-    """(R, I) the directions of the derivatives, in the kernel's coordinates, zero for a value; or
-    (0, I), where all are values."""
+    """(R, I) the directions of derivatives, in the kernel's coordinates, zero for a value; (0, I)
+    if all are values."""
     table: Array
-    """(I + O, P) the rows beside one another, as `means` takes them."""
+    """(I + O, P) the rows transposed and padded, for `means`."""
     derivatives: Derivatives
-    """Which of the centres are derivatives, if any."""
+    """The centres that are derivatives."""
 
     @classmethod
     def of(cls, query: Query) -> CompiledQuery | None:
-        """The query for compiled loops; None where there are none for it."""
+        """The query for compiled loops; None without Numba, or for another kernel."""
         if not AVAILABLE or not isinstance(query.kernel, GaussianKernel):
             return None
         inputs = len(query.stretch)
@@ -57,23 +57,24 @@ class CompiledQuery(Immutable):
 
     @cached_property
     def columns(self) -> Array | None:
-        """The columns of L^-1 from the diagonal block on, one after the other, with K + lambda_c
-        Sigma = L L^T (R A, R A); None: the covariance is the solution's own.
+        """The columns of L^-1 from the diagonal block down, one after the other.
+
+        L (R A, R A) with L L^T = K + lambda_c Sigma. None if the solution is not dense.
         """
         solution = self.query.solution
         return _packed(solution) if isinstance(solution, Dense) else None
 
     @cached_property
     def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-        """What `means` and `slopes` read besides the queries."""
+        """The arguments of `means` and `slopes` other than the queries."""
         q = self.query
         coordinates = frozen(np.concatenate([[q.scale], q.stretch]))
         return self.table, *self.derivatives, coordinates, q.prior_mean
 
     def mean(self, queries: Array) -> tuple[Array, Array] | None:
-        """xi at queries (M, I), at least one: (M, O); and the last one's kernel row (R,).
+        """xi (M, O) at M >= 1 queries (M, I), and the last query's kernel row (R,).
 
-        But for rounding as `Query.mean`; None where what was given, or comes of it, is not finite.
+        Equal to `Query.mean` but for rounding; None if a query or a result is not finite.
         """
         table, places, along, coordinates, prior = self._reads
         given = np.array(queries, np.float64, order="C")  # one type of array, and so compiled once
@@ -82,7 +83,7 @@ class CompiledQuery(Immutable):
         return (out, values[: len(self.rows)]) if finite else None
 
     def jacobian(self, query: Array) -> Array | None:
-        """As `Query.jacobian`, but for rounding; None as in `mean`."""
+        """As `Query.jacobian`, to rounding; None as in `mean`."""
         table, places, along, coordinates, prior = self._reads
         given = np.array(query, np.float64, order="C")
         out = np.empty((len(prior), len(given)))
@@ -91,9 +92,7 @@ class CompiledQuery(Immutable):
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
     ) -> MotionPrediction | None:
-        """As `Query.motion`, but for rounding; None where what was given, or comes of it, is not
-        finite.
-        """
+        """As `Query.motion`, to rounding; None as in `mean`."""
         q = self.query
         moving, values = np.empty((3, len(query))), np.empty(len(self.rows))
         moving[0], moving[1], moving[2] = query, velocity, acceleration
@@ -104,21 +103,21 @@ class CompiledQuery(Immutable):
         return MotionPrediction(out[0], out[1], out[2], found, out[MEANS:].reshape(-1, len(query)), out[3])
 
     def covariance(self, values: Array) -> Array:
-        """As `Query.covariance`, but for rounding."""
+        """As `Query.covariance`, to rounding."""
         q = self.query
         if self.columns is None or not isinstance(q.solution, Dense):
             return q.covariance(values)
-        apart = q.solution.apart
-        found = np.empty((apart, apart))
-        if not _posterior(values, self.columns, np.zeros((apart, len(values) * apart)), found):
+        distinct = q.solution.distinct
+        found = np.empty((distinct, distinct))
+        if not _posterior(values, self.columns, np.zeros((distinct, len(values) * distinct)), found):
             found = nearest_positive_semidefinite(found[None])[0]
         found *= q.covariance_scale
-        return found if apart > 1 else found[0, 0] * np.eye(len(q.prior_mean))
+        return found if distinct > 1 else found[0, 0] * np.eye(len(q.prior_mean))
 
 
 def _packed(solution: Dense) -> Array:
     inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
-    a = solution.apart
+    a = solution.distinct
     return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
 
 
@@ -126,12 +125,11 @@ def _packed(solution: Dense) -> Array:
 def _motion(
     moving: Array, rows: Array, along: Array, stretch: Array, scale: float, prior: Array, values: Array, out: Array
 ) -> bool:
-    """Equation (8), and its first and second derivatives along the motion, from one pass over the
-    centres, of which some may stand for derivatives; whether all is finite.
+    """Equation (8) and its derivatives along a motion, in one pass over the centres.
 
-    `moving` (3, I) is the query, its velocity and its acceleration; `prior` (O, 1), or (O, 1 + I)
-    where the prior mean goes with the input, is its offset and matrix; the kernel row goes into
-    `values` (R,); mean, velocity, acceleration, curvature and Jacobian into `out` (4 + I, O).
+    Returns true if all is finite. `moving` (3, I) is the query, its velocity and acceleration;
+    `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I). Writes the kernel row
+    to `values` (R,), and mean, velocity, acceleration, curvature, Jacobian to `out` (4 + I, O).
     """
     inputs, outputs, derivatives, affine = len(stretch), len(prior), len(along) > 0, prior.shape[1] > 1
     query, offset, direction = np.empty(inputs), np.empty(inputs), np.empty(inputs)
@@ -190,8 +188,9 @@ def _motion(
 
 @compiled
 def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
-    """I - k (K + lambda_c Sigma)^-1 k^T into out (O, O), by roots (O, R O) = (L^-1 (k (x) I))^T;
-    whether it is positive definite.
+    """Write I - k (K + lambda_c Sigma)^-1 k^T to `out` (O, O); true if it is positive definite.
+
+    By the roots (O, R O) = (L^-1 (k^T (x) I))^T, which must be 0 at first.
     """
     outputs, size = roots.shape
     at = 0

@@ -1,8 +1,8 @@
-"""The solution for any number of points: the cost (4) solved on features of the kernel.
+"""The low rank solution: the cost (4) minimised over r features of the kernel.
 
-With r features z(s), xi(s) = z(s) W, and W (r, D) minimises (4): an (r D x r D) system, however
-many points there are. What the features leave of the kernel, the residual, is kept where it counts:
-in the covariance, and at via-points.
+k(s, s') = z(s)^T z(s') + residual with features z (r,), so xi(s) = W^T z(s) with W (r, D) from an
+(r D x r D) system for any number of points. The residual is included in the covariance and between
+via-points. Fine and Scheinberg 2001; Rasmussen and Williams 2006, sections 8.1 and 8.3.
 """
 
 from kmp.low_rank.features import Features

@@ -1,4 +1,10 @@
-"""The low rank solution after an adaptation: a normal conditioned on a few more normals."""
+"""The low rank solution after an adaptation, by conditioning on the points that changed.
+
+The base's W has a normal distribution of covariance lambda P^-1. Conditioning it on U changes with
+features z and covariances S = Sigma (added) or -Sigma (removed) gives the system G = lambda z P^-1
+z^T + residual + lambda S (U O, U O) and W + lambda P^-1 z^T G^-1 (mu - m - z W). Rasmussen and
+Williams 2006, section A.2.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
@@ -19,37 +25,37 @@ from kmp.kernel import between
 from kmp.low_rank.error_bound import error_bounds
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, check_resolved
+from kmp.solution import ErrorBounds, Expansion, check_resolved
 
 if TYPE_CHECKING:
     from kmp.low_rank.solution import LowRank
 
 
 class _System(NamedTuple):
-    """The equations of the U changes."""
+    """The factorised system G of the U changes."""
 
     cross: Array
-    """(r D, U O) L^-1 of their features, with the factor L of the base's normal equations."""
+    """L^-1 z (r D, U O), with the features z and the factor L of the base's normal equations."""
     lu: Array
-    """(U O, U O) the factors of their covariance, given the base."""
+    """(U O, U O) the LU factors of G."""
     pivots: NDArray[np.intc]
 
     def solve(self, right: Array) -> Array:
-        # SciPy counts the given pivots from one while it solves: threads that share them would see.
+        # SciPy adds 1 to the pivots while it solves, which other threads would see.
         return np.asarray(lapack.dgetrs(self.lu, self.pivots.copy(), right)[0])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Conditioned(Immutable):
-    """The low rank solution after V points were added and R taken out: U = V + R changes.
+class Conditioned(Expansion):
+    """The low rank solution with V points added and R removed: U = V + R changes.
 
-    Adding is a term of rank O for each point. A point is taken out by adding it again with minus
-    its covariance. The kernel's residual between added points is kept, so that they are met
-    wherever they are; between them and the base's points it is neglected: it is below the square
-    root of the tolerance. The members are those of `Solution`.
+    A point is removed by adding it again with minus its covariance. The kernel's residual between
+    added points is included, so that the mean meets them anywhere; between them and the base's
+    points it is neglected, as it is below the square root of the tolerance. The members are those
+    of `Solution`.
     """
 
-    _not_pickled = frozenset({"database", "_added_points", "_lifted", "_neglected"})
+    _not_pickled = frozenset({"database", "_added_points", "_neglected"})
 
     base: LowRank
     changes: Changes
@@ -69,14 +75,9 @@ class Conditioned(Immutable):
         """The r pivots, then the V via-points."""
         return Functionals.concatenated([self.base.functionals, self.changes.functionals])
 
-    @property
-    def centres(self) -> Array:
-        """(r + V, I) where they are."""
-        return self.functionals.inputs
-
     @cached_property
     def weights(self) -> Array:
-        """(r + V, O) the weights of the kernels there."""
+        """(r + V, O) the weights of their kernels."""
         base, penalty, d = self.base, self.hyperparameters.lambda_mean, self.base.w.shape[1]
         shared = penalty == self.hyperparameters.lambda_covariance
         system = self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
@@ -112,9 +113,6 @@ class Conditioned(Immutable):
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Conditioned:
         return Conditioned(self.base.with_hyperparameters(hyperparameters), self.changes)
 
-    def with_weights(self, weights: Array) -> Self:
-        return self._with_cached(weights=weights)
-
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         return self.base.to_arrays()
 
@@ -128,7 +126,7 @@ class Conditioned(Immutable):
 
     @cached_property
     def _points(self) -> Database:
-        """The U points, the added first."""
+        """The U changed points, those added first."""
         database, replaced = self.base.database, self.changes.replaced
         functionals = Functionals.concatenated([self.changes.functionals, database.functionals.take(replaced)])
         normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
@@ -148,18 +146,13 @@ class Conditioned(Immutable):
         return Database(self.changes.functionals, self.changes.points)
 
     @cached_property
-    def _lifted(self) -> Array:
-        """z (x) I (r D, U O) of the U points."""
-        return kron_identity(self._z, self.base.w.shape[1])
-
-    @cached_property
     def _neglected(self) -> Array:
-        """The kernel between the V points added, less what the features explain (V C, V C)."""
+        """The kernel's residual between the V added points: k - z^T z (V C, V C)."""
         points, z = self.changes.functionals, self._z[:, : self._added_columns]
-        return between(self.hyperparameters.kernel, points, points) - z.T @ z
+        return frozen(between(self.hyperparameters.kernel, points, points) - z.T @ z)
 
     def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
-        """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
+        """(M, O, O), of rows (M, C, (r + V) C), features z (M, r, C) and L^-1 z (M, r D, O)."""
         m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
         columns, system = self._added_columns, self._covariance_system
         residual = (
@@ -180,9 +173,10 @@ class Conditioned(Immutable):
         first = len(self.base.database) - len(self.changes.replaced)
         check_resolved(parameters, self._added_points, first=first, name=name, both=True)
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
-        cross, _ = lapack.dtrtrs(base_factor, self._lifted, lower=1)
+        d = self.base.w.shape[1]
+        cross, _ = lapack.dtrtrs(base_factor, kron_identity(self._z, d), lower=1)
         matrix = penalty * (cross.T @ cross)
-        neglected = kron_identity(self._neglected, self.base.w.shape[1])
+        neglected = kron_identity(self._neglected, d)
         matrix[: len(neglected), : len(neglected)] += neglected
         blocks = matrix.reshape(count, -1, count, len(matrix) // count)
         points = np.arange(count)

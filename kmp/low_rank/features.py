@@ -1,7 +1,8 @@
-"""Features of the kernel: k(s, s') = z(s) z(s')^T + a residual, by pivoted Cholesky.
+"""Features of the kernel by pivoted Cholesky: k(s, s') = z(s)^T z(s') + residual.
 
-The Gaussian kernel of smooth data has a small numerical rank: r features, each made of one of the
-points (its pivot), leave at each point a share of k(s, s) below a tolerance.
+z(s) = L^-1 k(S_p, s) with pivots S_p among the points and L L^T = k(S_p, S_p). The next pivot is
+the point of the largest residual k(s, s) - |z(s)|^2, as a share of k(s, s). The Gaussian kernel has
+a small numerical rank r: few pivots bring the residual below a tolerance. Fine and Scheinberg 2001.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.kernel import Kernel, between, variances
 
-BLOCK = 8192  # inputs at once, which bounds the memory
-KEPT = 50_000_000  # numbers of features that are kept, 400 MB; more are made again for each pass
-_CANDIDATES = 4096  # inputs among which pivots are sought at once
-_ROUNDS = 6
-_MARGIN = 0.25  # of the tolerance, for the inputs that are no candidates
-_FLOOR = 1e-14  # of k(s, s): a smaller residual is rounding
+BLOCK = 8192  # inputs computed at once, which bounds the memory
+KEPT = 50_000_000  # features kept in memory, 400 MB; larger ones are computed again for each pass
+_CANDIDATES = 4096  # pivots are chosen among this number of inputs
+_ROUNDS = 6  # rounds of adding pivots where the residual exceeds the tolerance
+_MARGIN = 0.25  # the candidates must meet this share of the tolerance, so that other inputs meet it
+_FLOOR = 1e-14  # a residual below this share of k(s, s) is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Features(Immutable):
-    """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of their kernel matrix.
+    """z(s) = L^-1 k(S_p, s), with pivots S_p and the Cholesky factor L of k(S_p, S_p).
 
-    A pivot is one channel of a functional: of a kernel with rates, a value or its rate.
+    A pivot is one channel of a functional: with rates, a value or its rate.
     """
 
     kernel: Kernel
@@ -39,7 +40,7 @@ class Features(Immutable):
 
     @classmethod
     def at(cls, kernel: Kernel, pivots: Functionals, channels: NDArray[np.intp]) -> Features:
-        """The features of these r pivots, without the last if rounding hides what they add."""
+        """The features of these r pivots, without those from which on rounding hides them."""
         k = _columns(_columns(between(kernel, pivots, pivots), channels, kernel).T, channels, kernel)
         root, info = lapack.dpotrf(k, lower=1, clean=1)
         if info:
@@ -48,24 +49,23 @@ class Features(Immutable):
 
     @classmethod
     def of(cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float) -> tuple[Features, float]:
-        """`made`, without what was kept."""
-        found, residual, _ = cls.made(kernel, points, rank=rank, tolerance=tolerance)
+        """The features and the largest residual, as `with_values` returns them."""
+        found, residual, _ = cls.with_values(kernel, points, rank=rank, tolerance=tolerance)
         return found, residual
 
     @classmethod
     def spanning(cls, kernel: Kernel, points: Functionals, *, tolerance: float) -> Features:
-        """The features of N points that leave at most `tolerance` of them, whatever their rank."""
+        """The features of N points with residuals of at most `tolerance`, of any rank."""
         return cls.of(kernel, points, rank=len(points) * kernel.channels, tolerance=tolerance)[0]
 
     @classmethod
-    def made(
+    def with_values(
         cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float
     ) -> tuple[Features, float, list[Array]]:
-        """The features of N points, at most `rank`, and their largest residual at one of them.
+        """At most `rank` features of N points, their largest residual, and z of the points.
 
-        The residual is a share of k(s, s) of a channel. It is at most `tolerance`, unless the rank
-        is too low for that. The third value holds the features of the points in blocks (r, n C), if
-        these are few enough to keep.
+        The residual, a share of k(s, s) of a channel, is at most `tolerance` unless the rank is too
+        low. z is a list of blocks (r, n C), empty if they are too large to keep.
         """
         count, c = len(points), kernel.channels
         index = np.linspace(0, count - 1, min(count, _CANDIDATES // c)).astype(np.intp)
@@ -75,7 +75,7 @@ class Features(Immutable):
         z = [found(block) for block in blocks] if count * c * rank <= KEPT else []
         for n in range(_ROUNDS):
             each = zip(blocks, z, strict=True) if z else ((block, found(block)) for block in blocks)
-            residual = np.concatenate([found.left(block, one).max(axis=1) for block, one in each])
+            residual = np.concatenate([found.residual_of(block, one).max(axis=1) for block, one in each])
             worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // (2 * c)]
             worst = np.sort(worst[residual[worst] > tolerance])
             if len(worst) == 0 or len(found.pivots) >= rank or n == _ROUNDS - 1:
@@ -91,7 +91,7 @@ class Features(Immutable):
         return found, float(residual.max()), z
 
     def _grown(self, points: Functionals, z: Array) -> Array:
-        """The features of n points, of which the first (r', n C) are known."""
+        """The features (r, n C) of n points, of which the first (r', n C) are known."""
         r = len(z)
         added = between(self.kernel, points, self.pivots.take(slice(r, None)))
         columns = _columns(added, self.channels[r:], self.kernel).T
@@ -101,7 +101,7 @@ class Features(Immutable):
         return found
 
     def __call__(self, points: Functionals) -> Array:
-        """z of n points, for each channel: (r, n C)."""
+        """z (r, n C) of n points, for each channel."""
         return self.of_kernel(between(self.kernel, points, self.pivots))
 
     def of_kernel(self, rows: Array) -> Array:
@@ -110,7 +110,7 @@ class Features(Immutable):
         return np.asarray(lapack.dtrtrs(self.root, columns, lower=1)[0])
 
     def kernel_weights(self, w: Array) -> Array:
-        """The weights (r, O) of the pivots' kernels that stand for w (r, D) of the features."""
+        """The weights (r, O) of the pivots' kernels equal to w (r, D) of the features: L^-T w."""
         values = lapack.dtrtrs(self.root, w, lower=1, trans=1)[0]
         weights = np.zeros((len(w), self.kernel.channels, w.shape[1]))
         weights[np.arange(len(w)), self.channels] = values
@@ -118,16 +118,16 @@ class Features(Immutable):
 
     def residual(self, points: Functionals) -> Array:
         """k(s, s) - |z(s)|^2 of n points, for each channel, as a share of k(s, s): (n, C)."""
-        return self.left(points, self(points))
+        return self.residual_of(points, self(points))
 
-    def left(self, points: Functionals, z: Array) -> Array:
-        """The same, of points whose features (r, n C) are known."""
+    def residual_of(self, points: Functionals, z: Array) -> Array:
+        """The residual (n, C), of n points whose features (r, n C) are known."""
         shares = 1 - (z * z).sum(axis=0).reshape(len(points), -1) / variances(self.kernel, points)
         return np.asarray(np.maximum(shares, _FLOOR))
 
 
 def _columns(rows: Array, channels: NDArray[np.intp], kernel: Kernel) -> Array:
-    """Of rows (n, r C) the columns of these channels (r,): (n, r)."""
+    """The columns (n, r) of rows (n, r C) that belong to these channels (r,)."""
     if kernel.channels == 1:
         return rows
     return np.asfortranarray(rows[:, np.arange(len(channels)) * kernel.channels + channels])
@@ -136,10 +136,10 @@ def _columns(rows: Array, channels: NDArray[np.intp], kernel: Kernel) -> Array:
 def _pivots(
     kernel: Kernel, points: Functionals, rank: int, tolerance: float, known: Array | None = None
 ) -> NDArray[np.intp]:
-    """The best pivots among the channels of N points, as numbers below N C.
+    """Pivots among the channels of N points, as indices below N C.
 
-    They are chosen greedily: the next is where the share of the residual is largest. `known` (r',
-    N C) are the features of pivots that there are already.
+    Greedy: the next is where the residual is largest, as a share of k(s, s). `known` (r', N C) are
+    the features of earlier pivots.
     """
     c, deviation = kernel.channels, np.sqrt(variances(kernel, points)).ravel()
     count = len(deviation)

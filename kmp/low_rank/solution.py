@@ -1,4 +1,9 @@
-"""The low rank solution of a database, by the normal equations of the cost (4)."""
+"""The low rank solution of a database, by the normal equations of the cost (4).
+
+P vec(W) = sum_n (z_n^T (x) I) Sigma_n^-1 (mu_n - m_n) with P = sum_n z_n^T z_n (x) Sigma_n^-1 +
+lambda I (r D, r D), z_n a row. Covariance: N / lambda_c (k(s, s) - |z|^2 + lambda_c z P_c^-1 z^T),
+with lambda_c in P_c. Rasmussen and Williams 2006, sections 8.3.1 and 8.3.4.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from kmp.arrays.checks import Array, brief, numbers
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
 from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
@@ -21,16 +26,19 @@ from kmp.low_rank.error_bound import error_bounds
 from kmp.low_rank.features import BLOCK, KEPT, Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, check_resolved
+from kmp.solution import ErrorBounds, Expansion, check_resolved
 
-RANK = 400
-TOLERANCE = 4e-12  # share of k(s, s) that the features may leave at a reference point
-_REFINEMENTS = 2  # of W, against the rounding of the normal equations
+RANK = 400  # default of the largest number of features
+TOLERANCE = 4e-12  # default of the largest residual at a reference point, as a share of k(s, s)
+_REFINEMENTS = 2  # iterative refinements of W, against the rounding of the normal equations
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LowRank(Immutable):
-    """The solution on r features, with the members of `Solution`; factors are made when used."""
+class LowRank(Expansion):
+    """The solution on r features; factors are computed when first used.
+
+    The members are those of `Solution`.
+    """
 
     _not_pickled = frozenset({"mean_factor", "covariance_factor"})
 
@@ -38,10 +46,10 @@ class LowRank(Immutable):
     database: Database
     features: Features
     information: Array
-    """(r D, r D) sum_n z_n^T z_n (x) Sigma_n^-1: what the points say, whatever lambda is."""
-    w: Array  # W (r, D), the features' weights
+    """(r D, r D) sum_n z_n^T z_n (x) Sigma_n^-1, which does not depend on lambda."""
+    w: Array  # W (r, D), the weights of the features
     base: LowRank | None = None
-    """The solution that was adapted, where so much changed that this one was fitted anew."""
+    """The solution before adaptation, if so many points changed that this one is a new fit."""
 
     representation: ClassVar[Literal["low_rank"]] = "low_rank"
 
@@ -53,13 +61,12 @@ class LowRank(Immutable):
         features: Features,
         base: LowRank | None = None,
         *,
-        made: Sequence[Array] = (),
+        values: Sequence[Array] = (),
     ) -> LowRank:
-        """The solution, of features that were `made`, or not yet.
+        """The solution. `values` are the features of the points in blocks, if they are known.
 
-        Raises ValueError if the normal equations cannot be solved.
-
-        Or, as it is what the features leave of the kernel, if lambda Sigma is lost beside k(s, s).
+        Raises ValueError if the normal equations cannot be solved, or rounding hides lambda Sigma
+        beside k(s, s), of which the features leave a residual.
         """
         check_resolved(hyperparameters, database, name="lambda_mean", both=True)
         r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
@@ -69,8 +76,8 @@ class LowRank(Immutable):
         blocks = [slice(i, i + BLOCK) for i in range(0, len(points), BLOCK)]
 
         def lifted(start: int) -> Array:
-            if made:
-                return made[start // BLOCK].T.reshape(-1, c, r)
+            if values:
+                return values[start // BLOCK].T.reshape(-1, c, r)
             return features(points.take(slice(start, start + BLOCK))).T.reshape(-1, c, r)
 
         z = cache(lifted) if len(points) * c * r <= KEPT else lifted
@@ -96,7 +103,7 @@ class LowRank(Immutable):
         database: Database,
         arrays: Mapping[str, NDArray[Any]],
     ) -> LowRank:
-        """The solution that gave these arrays. Raises ValueError if they do not go together."""
+        """The solution of stored arrays. Raises ValueError if they do not belong together."""
         pivots = numbers("pivots", arrays["pivots"], "r", database.inputs.shape[1])
         r, d = len(pivots), hyperparameters.channel_outputs
         information = numbers("information", arrays["information"], r * d, r * d)
@@ -117,11 +124,6 @@ class LowRank(Immutable):
     def functionals(self) -> Functionals:
         """The r pivots."""
         return self.features.pivots
-
-    @property
-    def centres(self) -> Array:
-        """(r, I) where they are."""
-        return self.features.pivots.inputs
 
     @cached_property
     def weights(self) -> Array:
@@ -148,12 +150,12 @@ class LowRank(Immutable):
         return self.residual_covariance(z.transpose(0, 2, 1) @ z) + self.hyperparameters.lambda_covariance * within
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
-        """The base's solution conditioned on these changes, or fitted anew if they are many."""
+        """The base's solution conditioned on these changes, or a new fit if they are many."""
         base = self.base or self
         changed = len(changes.replaced) + len(changes.inputs)
         if changed * base.features.kernel.channels <= len(base.centres):
             return Conditioned(base, changes)
-        # So many changes cost more, and lose more digits, than a new solution.
+        # Conditioning on more changes than features costs more, and loses more digits, than a fit.
         database = base.database.changed(changes)
         rank = max(RANK, len(base.centres) + len(changes.inputs) * base.features.kernel.channels)
         features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
@@ -162,11 +164,8 @@ class LowRank(Immutable):
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> LowRank:
         return LowRank(hyperparameters, self.database, self.features, self.information, self.w)
 
-    def with_weights(self, weights: Array) -> Self:
-        return self._with_cached(weights=weights)
-
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """The pivots, the information and W of the base."""
+        """The pivots, the information matrix and W of the base."""
         base = self.base or self
         arrays = {"pivots": base.centres, "information": base.information, "features": base.w}
         if base.functionals.directions is not None:
@@ -176,25 +175,25 @@ class LowRank(Immutable):
         return arrays
 
     def whitened_one(self, row: Array) -> tuple[Array, Array]:
-        """The features (r, C) of one query's kernel row; L^-1 of them, with P = L L^T: (O, r D)."""
+        """The features (r, C) of one query's kernel row, and L^-1 times these (O, r D)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(row[..., : len(self.centres) * c])
         return z.reshape(len(self.centres), -1), self.inverse_factor.times_one(z)
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
-        """The features (M, r, C) of M queries' kernel rows; L^-1 of them: (M, r D, O)."""
+        """The features (M, r, C) of M queries' kernel rows, and L^-1 times these (M, r D, O)."""
         c = self.features.kernel.channels
         z = self.features.of_kernel(rows[:, : len(self.centres) * c])
         return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.inverse_factor.times_many(z, c)
 
     def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
-        """k(s, s) less what the features explain (..., C, C), for each output: (..., O, O)."""
+        """k(s, s) minus what the features have explained (..., C, C), per output (..., O, O)."""
         own = self.features.kernel.prior_variance if prior is None else prior
         return kron_identity(own - explained, self.w.shape[1])
 
     @cached_property
     def mean_factor(self) -> Array:
-        """The lower Cholesky factor L of P = information + lambda I, of the normal equations."""
+        """The lower Cholesky factor L of P = information + lambda I."""
         return _factorised(self.information, self.hyperparameters.lambda_mean)
 
     @cached_property
@@ -222,15 +221,15 @@ def _factorised(information: Array, penalty: float) -> Array:
 
 
 def _add_information(total: Array, z: Array, precision: Array) -> None:
-    """Adds sum_n z_n^T z_n (x) Sigma_n^-1 (r, D, r, D), of z (n, C, r), precisions (n, O, O)."""
+    """Add sum_n z_n^T z_n (x) Sigma_n^-1 (r, D, r, D), of z (n, C, r) and precisions (n, O, O)."""
     n, c, r = z.shape
     d = total.shape[1]
     blocks = precision.reshape(n, c, d, c, d)
 
     def along(*outputs: int) -> Array:
-        # A A^T is twice as fast as A B, so off the diagonal: 2 a b = (a + b)^2 - a^2 - b^2.
+        # BLAS computes A^T A twice as fast as A^T B: 2 a b = (a + b)^2 - a^2 - b^2.
         square = np.asarray(sum(blocks[:, 0, i, 0, j] for i in outputs for j in outputs))
-        part = z[:, 0] * np.sqrt(np.maximum(square, 0.0))[:, None]  # below 0 by rounding alone
+        part = z[:, 0] * np.sqrt(np.maximum(square, 0.0))[:, None]  # negative by rounding only
         return np.asarray(part.T @ part)
 
     diagonal = [along(i) for i in range(d)] if c == 1 else []
@@ -238,7 +237,7 @@ def _add_information(total: Array, z: Array, precision: Array) -> None:
         for j in range(i + 1):
             if c == 1:
                 share = diagonal[i] if i == j else (along(i, j) - diagonal[i] - diagonal[j]) / 2
-            else:  # the block of two outputs between the channels is not symmetric
+            else:  # between two channels, the block of two outputs is not symmetric
                 share = z.reshape(-1, r).T @ (blocks[:, :, i, :, j] @ z).reshape(-1, r)
             total[:, i, :, j] += share
             if i != j:

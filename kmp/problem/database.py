@@ -1,4 +1,8 @@
-"""The reference database, and how via-points change it (the paper, Algorithm 1)."""
+"""The reference database (s_n, mu_n, Sigma_n) and its changes by via-points.
+
+The paper, Algorithm 1: a via-point replaces the nearest reference point within a tolerance, or is
+inserted.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +21,15 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, variances
 
-DISTANCES = 10_000_000  # from via-points to reference points, at once
-_PAIR = 2  # points, at least, have a distance
-_MISSED = 3.0  # of a via-point's deviations: more is a miss
-_NAMED = 5  # via-points in a message
-_WORTH_SAYING = 1e-3  # [unit of the outputs] 1 mm, where that is the metre
+DISTANCES = 10_000_000  # distances computed at once, which bounds the memory to 80 MB
+_PAIR = 2  # a distance needs two points
+_MISSED_DEVIATIONS = 3.0  # a via-point is missed beyond this multiple of its deviation
+_MISSED_DISTANCE = 1e-3  # [unit of the outputs] smaller errors are not reported: 1 mm in metres
+_NAMED = 5  # a message names at most this many via-points
 
 
 class Changes(NamedTuple):
-    """How an adapted database differs from its base: R points less, V via-points more."""
+    """Difference of an adapted database from its base: R points removed, V via-points added."""
 
     replaced: NDArray[np.intp]  # (R,) indices of the base's points, ascending
     functionals: Functionals  # V
@@ -39,10 +43,7 @@ class Changes(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Database(Immutable):
-    """N reference points: where they are, and the normal distribution of the output there.
-
-    Where a point is a derivative along a direction, of that derivative.
-    """
+    """N reference points: functionals of the output, and a normal distribution of each."""
 
     _not_pickled = frozenset({"_known_shares"})
 
@@ -72,7 +73,7 @@ class Database(Immutable):
         return known[1]
 
     def since(self, first: int) -> Database:
-        """The points from that one on."""
+        """The points from index `first` on."""
         chosen = slice(first, None)
         return Database(self.functionals.take(chosen), self.reference.take(chosen))
 
@@ -82,7 +83,7 @@ class Database(Immutable):
         return Database(functionals, Gaussians.concatenated([self.reference, other.reference]))
 
     def unchanged(self) -> Changes:
-        """No changes at all."""
+        """The empty set of changes."""
         nothing = frozen(np.empty(0, dtype=np.intp))
         return Changes(nothing, Functionals(self.inputs[:0]), self.reference.take(slice(0, 0)))
 
@@ -98,7 +99,7 @@ class Database(Immutable):
         )
 
     def spacing(self, period: float | None) -> float:
-        """Median distance from a value to the nearest other one; 0 where there is none."""
+        """Median distance [unit of inputs] of a value to its nearest neighbour; 0 without any."""
         values = np.unique(self.inputs[self.functionals.values], axis=0)
         if len(values) < _PAIR:
             return 0.0
@@ -110,9 +111,10 @@ class Database(Immutable):
         return float(np.median(distances))
 
     def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
-        """The indices, ascending, of the values nearest to those of via, if near enough.
+        """Indices, ascending, of the values that are nearest to a via-point within the tolerance.
 
-        A derivative neither replaces a point nor is replaced.
+        `tolerance` and `period` [unit of the inputs]. Derivatives neither replace a point nor are
+        replaced.
         """
         if tolerance == 0:
             return np.empty(0, dtype=np.intp)
@@ -129,7 +131,7 @@ class Database(Immutable):
 
 
 def _distances(a: Array, b: Array, period: float | None) -> Array:
-    """From a (A, I) to b (B, I): (A, B); round the circle where there is a period."""
+    """Distances |a - b| (A, B) of a (A, I) and b (B, I), modulo the period if there is one."""
     if period is None:
         return cdist(a, b)
     r = np.abs(a - b.T) % period
@@ -137,18 +139,21 @@ def _distances(a: Array, b: Array, period: float | None) -> Array:
 
 
 def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
-    """Warns of the desired points that the mean (V, O) misses, and tells by how much."""
+    """Warn of the desired points that the mean (V, O) misses.
+
+    The error r of a channel is a miss if |r| > 0.001 and sqrt(r^T Sigma^-1 r) > 3.
+    """
     count, d = len(mean), desired.outputs // channels
     residual = (desired.mean - mean).reshape(count, channels, d)
     distance = np.sqrt((residual * residual).sum(axis=2))  # (V, C)
-    if not (distance > _WORTH_SAYING).any():
+    if not (distance > _MISSED_DISTANCE).any():
         return
     missed = []
     for c in range(channels):
         block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
         pull = np.linalg.solve(block, residual[:, c, :, None])[:, :, 0]
         deviations = np.sqrt(np.vecdot(residual[:, c], pull))
-        for n in np.flatnonzero((distance[:, c] > _WORTH_SAYING) & (deviations > _MISSED)):
+        for n in np.flatnonzero((distance[:, c] > _MISSED_DISTANCE) & (deviations > _MISSED_DEVIATIONS)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
         more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""

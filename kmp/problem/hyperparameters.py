@@ -1,4 +1,7 @@
-"""What is chosen when a primitive is fitted: the kernel, the penalties, the prior mean."""
+"""Hyper-parameters of a primitive: kernel, lambda, lambda_c, prior mean.
+
+The prior mean m(s) = A s + b is subtracted before fitting and added to predictions.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ from kmp.kernel import Kernel
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AffineMean(Immutable):
-    """matrix @ s + offset at an input s (I,): linear regression, or a straight way over time.
+    """The prior mean A s + b at an input s (I,): a linear regression, or a line over time.
 
-    matrix (O, I) [unit of the outputs / unit of the inputs], offset (O,) [unit of the outputs].
-    Read-only. Far from the data it extrapolates, where a constant would stay. Raises ValueError if
+    matrix A (O, I) [unit of the outputs / unit of the inputs], offset b (O,) [unit of the outputs].
+    Read-only. Far from the data the primitive's mean extrapolates along it. Raises ValueError if
     shapes do not agree or a number is not finite.
     """
 
@@ -34,13 +37,12 @@ class AffineMean(Immutable):
                 f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} given, "
                 f"(O, I) and (O,) needed."
             )
-        object.__setattr__(self, "matrix", matrix)
-        object.__setattr__(self, "offset", offset)
+        self.__dict__.update(matrix=matrix, offset=offset)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Hyperparameters(Immutable):
-    """The parameters of the costs: equation (4) for the mean, IJRR 2019 for the covariance."""
+    """Parameters of the costs: equation (4) for the mean, IJRR 2019 for the covariance."""
 
     kernel: Kernel
     lambda_mean: float
@@ -59,7 +61,7 @@ class Hyperparameters(Immutable):
         inputs: int,
         outputs: int,
     ) -> Hyperparameters:
-        """The parameters, or their defaults. Raises ValueError if they do not go with I and O."""
+        """The parameters with defaults filled in. Raises ValueError if they do not fit I and O."""
         checked_kernel(kernel).check(inputs, outputs)
         penalty = positive("lambda_mean", lambda_mean)
         other = penalty if lambda_covariance is None else positive("lambda_covariance", lambda_covariance)
@@ -82,17 +84,20 @@ class Hyperparameters(Immutable):
 
     @property
     def prior_mean(self) -> Array | AffineMean:
-        """(O,) [unit of the outputs], or what goes with the input."""
+        """(O,) [unit of the outputs], or an `AffineMean` that depends on the input."""
         return self.prior_offset if self.prior_matrix is None else AffineMean(self.prior_matrix, self.prior_offset)
 
     @cached_property
     def prior_columns(self) -> Array:
-        """The offset (O, 1), and beside it the matrix if there is one: (O, 1 + I)."""
+        """The offset (O, 1), or the offset and the matrix side by side (O, 1 + I)."""
         offset = self.prior_offset[:, None]
         return frozen(np.array(offset) if self.prior_matrix is None else np.hstack([offset, self.prior_matrix]))
 
     def prior_at(self, points: Functionals) -> Array:
-        """The prior mean of N functionals, (N, O) or (O,) for all, derived where they are."""
+        """The prior mean of N functionals: (N, O), or (O,) if it is the same for all.
+
+        A derivative along v has A v.
+        """
         offset = self.prior_offset if points.directions is None else points.values[:, None] * self.prior_offset
         if self.prior_matrix is None:
             return offset
@@ -113,7 +118,7 @@ class Hyperparameters(Immutable):
 
 
 def checked_kernel(kernel: Kernel) -> Kernel:
-    """The kernel. Raises ValueError unless it is one."""
+    """The kernel. Raises ValueError unless it is a `Kernel`."""
     if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
         raise ValueError(f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
     return kernel

@@ -1,21 +1,10 @@
-"""References that one mixture cannot give.
+"""References other than the regression of one mixture.
 
-In task frames, superposed by priority, by Gaussian processes, with correlations from a reward.
-
-A reference is N inputs and a normal distribution of the output at each: what a primitive imitates.
+A reference is a normal distribution of the output at each of N inputs. A primitive imitates it.
+`frames`: in coordinates that move with the task; `superposition`: several by priorities;
+`gaussian_process`: for inputs of many dimensions; `correlation`: its covariances, from a reward.
 """
 
-from kmp.references.correlation import Correlation, Improvement, improve
 from kmp.references.frames import CoordinateFrame, LocalKMP
-from kmp.references.gaussian_process import gaussian_process_reference
-from kmp.references.superposition import superposed
 
-__all__ = [
-    "CoordinateFrame",
-    "Correlation",
-    "Improvement",
-    "LocalKMP",
-    "gaussian_process_reference",
-    "improve",
-    "superposed",
-]
+__all__ = ["CoordinateFrame", "LocalKMP"]

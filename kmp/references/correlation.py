@@ -1,15 +1,15 @@
-"""Correlation-adaptive imitation: how the outputs are tied together, learned from a reward.
+"""Correlation-adaptive imitation: covariances between outputs, learned from a reward.
 
 The paper, section II-D: the reference's covariances become Lambda(s)^T Sigma Lambda(s), equation
-(11), and the diagonal Lambda(s) is found from rollouts alone, as in section III-B; the reward is
-the caller's. A diagonal Lambda that stays above 0 leaves every correlation coefficient as it was,
-and only loosens or tightens; where one of its factors is below 0 that output's change their signs.
+(11). The diagonal Lambda(s) is found from rollouts, as in section III-B; the caller gives the
+reward. Positive factors keep the correlation coefficients and change the variances; a negative
+factor changes the signs of its output's correlations.
 
 The search is PI^BB (Stulp and Sigaud 2012, "Policy improvement methods: between black-box
-optimization and episodic reinforcement learning"): that which remains of policy improvement with
-path integrals (PI^2, Theodorou, Buchli, Schaal 2010) when the noise is constant over a rollout and
-its total reward alone counts. PI^2 weighs each time step by what follows it; that means nothing
-here, where each Lambda(s_n) moves the whole trajectory.
+optimization and episodic reinforcement learning"): policy improvement with path integrals (PI^2,
+Theodorou, Buchli, Schaal 2010) with noise that is constant over a rollout, and its total reward.
+PI^2 weighs each time step by the reward that follows; here each Lambda(s_n) moves the whole
+trajectory, so that there is no such order.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from kmp.gaussians import Gaussians
 from kmp.primitive import KMP, checked_primitive
 
 Reward = Callable[[Array], float]
-"""How good a predicted trajectory (M, O) is; higher is better."""
+"""The reward of a predicted trajectory (M, O); higher is better."""
 
-_SHARPNESS = 10.0  # h of the exponential weights, usual in path integral methods
-_SMALLEST = 0.05  # of |Lambda|: below it a deviation shrinks no further
+_SHARPNESS = 10.0  # h in the weights exp(h (R - max R) / (max R - min R)), as usual for PI^2
+_LEAST_FACTOR = 0.05  # a deviation is scaled by at least this factor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,20 +47,19 @@ class Correlation(Immutable):
     theta: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centres", numbers("centres", self.centres, "B", "I"))
-        object.__setattr__(self, "width", positive("width", self.width))
-        object.__setattr__(self, "theta", numbers("theta", self.theta, len(self.centres), "O"))
+        centres, width = numbers("centres", self.centres, "B", "I"), positive("width", self.width)
+        self.__dict__.update(centres=centres, width=width, theta=numbers("theta", self.theta, len(centres), "O"))
 
     @classmethod
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
-        """Lambda = 1 everywhere, for so many outputs. Raises ValueError as the constructor does."""
+        """Lambda = 1 everywhere, for O = `outputs`. Raises ValueError as the constructor does."""
         places = numbers("centres", centres, "B", "I")
         return cls(places, width, np.ones((len(places), whole("outputs", outputs))))
 
     def __call__(self, inputs: ArrayLike) -> Array:
         """The diagonals of Lambda at inputs (N, I): (N, O).
 
-        Raises ValueError if the shape is another or a number is not finite.
+        Raises ValueError if the shape differs or a number is not finite.
         """
         s = numbers("inputs", inputs, "N", self.centres.shape[1])
         exponent = -0.5 * cdist(s, self.centres, "sqeuclidean") / self.width**2
@@ -71,32 +70,32 @@ class Correlation(Immutable):
     def applied(self, primitive: KMP) -> KMP:
         """The primitive of the cost (11): the base's covariances changed, the via-points kept.
 
-        Lambda^T Sigma Lambda is singular where a factor is 0. So no factor makes a deviation
-        smaller than 0.05 times what it was: what lacks there is added to its variance alone, and
-        its correlations fade to 0 as the factor does, before their signs change.
+        Lambda^T Sigma Lambda is singular if a factor is 0. So each deviation is at least 0.05 times
+        the original: the difference is added to the variance only, and the correlations fall to 0
+        with the factor, before their signs change.
 
-        Raises ValueError if it has another number of inputs or outputs.
+        Raises ValueError if the numbers of inputs or outputs differ.
         """
         base = checked_primitive(primitive).base
         if (given := self.theta.shape[1]) != base.outputs:
             raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
         scale, sigma = self(base.inputs), base.reference.covariance
         variances = np.diagonal(sigma, axis1=1, axis2=2)
-        lacking = np.maximum(_SMALLEST**2 - scale**2, 0.0) * variances
+        lacking = np.maximum(_LEAST_FACTOR**2 - scale**2, 0.0) * variances
         covariance = scale[:, :, None] * sigma * scale[:, None, :] + lacking[:, :, None] * np.eye(base.outputs)
         return primitive.refitted(Gaussians(base.reference.mean, covariance))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Improvement(Immutable):
-    """What `improve` found."""
+    """The result of `improve`."""
 
     correlation: Correlation
-    """The best Lambda of all that were tried."""
+    """The Lambda of the highest reward, of all that were evaluated."""
     primitive: KMP
     """The primitive with it."""
     rewards: Array
-    """(U + 1,) the reward of the policy itself before the first update and after each."""
+    """(U + 1,) the reward without exploration, before the first update and after each."""
 
 
 def improve(
@@ -110,7 +109,7 @@ def improve(
     rollouts: int,
     seed: int,
 ) -> Improvement:
-    """The Lambda(s) that makes the trajectory at `queries` (M, I) more rewarding: equation (11).
+    """The Lambda(s) of equation (11) that raises the reward of the trajectory at `queries` (M, I).
 
     PI^BB: each update draws `rollouts` theta + epsilon, epsilon of standard deviation
     `exploration`, the same in each update (constant exploration); fits and adapts the primitive

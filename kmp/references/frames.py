@@ -1,6 +1,7 @@
-"""References from others: several in one by priority, and frames that move with the task.
+"""Skills in coordinate frames that move with the task: local KMP of IJRR 2019.
 
-Both as in IJRR 2019.
+xi = A xi' + b. In F frames the predictions N(mu_f, Sigma_f) combine to the normal distribution of
+Sigma = (sum_f (A_f Sigma_f A_f^T)^-1)^-1, mu = Sigma sum_f (A_f Sigma_f A_f^T)^-1 (A_f mu_f + b_f).
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from kmp.problem.hyperparameters import checked_kernel
 class CoordinateFrame(Immutable):
     """Task parameters (A, b): xi = A xi' + b for coordinates xi' in the frame. Read-only.
 
-    matrix (O, O), offset (O,) [unit of the outputs]. Rotations and translations keep the unit; any
-    matrix that can be inverted will do. Raises ValueError if shapes do not agree, a number is not
-    finite, or the matrix has no inverse.
+    matrix A (O, O), offset b (O,) [unit of the outputs]. Any matrix with an inverse is allowed;
+    rotations keep the unit. Raises ValueError if shapes do not agree, a number is not finite, or
+    the matrix has no inverse.
     """
 
     matrix: Array
@@ -39,14 +40,13 @@ class CoordinateFrame(Immutable):
         matrix = numbers("matrix", self.matrix, len(offset), len(offset))
         if np.linalg.cond(matrix) > 1e12:
             raise ValueError(f"matrix: {brief(matrix)} given, and it must have an inverse.")
-        object.__setattr__(self, "offset", offset)
-        object.__setattr__(self, "matrix", matrix)
+        self.__dict__.update(matrix=matrix, offset=offset)
 
     @classmethod
     def at(cls, origin: ArrayLike) -> CoordinateFrame:
-        """The frame at an origin (O,), not turned: a start, or a goal.
+        """The frame at an origin (O,), without rotation: a start, or a goal.
 
-        Raises ValueError if the shape is another or a number is not finite.
+        Raises ValueError if the shape differs or a number is not finite.
         """
         offset = numbers("origin", origin, "O")
         check_some("origin", offset)
@@ -56,7 +56,7 @@ class CoordinateFrame(Immutable):
     def start_and_goal(cls, path: ArrayLike) -> tuple[CoordinateFrame, CoordinateFrame]:
         """The frames at the first and the last point of a path (T, O).
 
-        Raises ValueError if the shape is another, a number is not finite, or there is no point.
+        Raises ValueError if the shape differs, a number is not finite, or there is no point.
         """
         points = numbers("path", path, "T", "O")
         if points.size == 0:
@@ -64,42 +64,42 @@ class CoordinateFrame(Immutable):
         return cls.at(points[0]), cls.at(points[-1])
 
     def with_velocity(self) -> CoordinateFrame:
-        """The frame of values and their rates, 2 O outputs: a rate is turned and not moved."""
+        """The frame of values and their rates, 2 O outputs: rates rotate and do not move."""
         matrix = np.asarray(np.kron(np.eye(2), self.matrix), dtype=np.float64)
         return CoordinateFrame(matrix, np.concatenate([self.offset, np.zeros(len(self.offset))]))
 
     def local(self, points: ArrayLike) -> Array:
-        """The coordinates (T, O) in this frame of points (T, O).
+        """The coordinates (T, O) of points (T, O) in this frame: A^-1 (xi - b).
 
-        Raises ValueError if the shape is another or a number is not finite.
+        Raises ValueError if the shape differs or a number is not finite.
         """
         moved = numbers("points", points, "T", len(self.offset)) - self.offset
         return np.asarray(np.linalg.solve(self.matrix, moved.T).T)
 
     def localised(self, normals: Gaussians) -> Gaussians:
-        """The same normals in this frame's coordinates. Raises ValueError if O is another."""
+        """The normals in this frame's coordinates. Raises ValueError if O differs."""
         check_gaussians("normals", normals, len(self.offset))
         inverse = np.linalg.inv(self.matrix)
         return normals.affine(inverse, -inverse @ self.offset)
 
     def placed(self, normals: Gaussians) -> Gaussians:
-        """Normals of this frame's coordinates in the world's. Raises ValueError if O is another."""
+        """Normals of this frame in the world's coordinates. Raises ValueError if O differs."""
         check_gaussians("normals", normals, len(self.offset))
         return normals.affine(self.matrix, self.offset)
 
 
 def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
-    """How many there are. Raises ValueError unless they are frames."""
+    """The number of frames. Raises ValueError unless all are frames."""
     return len(parts_of(name, frames, CoordinateFrame, "CoordinateFrame(matrix, offset)"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LocalKMP(Immutable, Plotted):
-    """A skill in F coordinate frames at once: a primitive in each, and where the frames are now.
+    """A skill in F coordinate frames: a primitive in each, and the frames' present positions.
 
-    From `learn`, for the frames of the last demonstration; `placed` moves it. Each frame's
-    prediction is mapped back, (A mu + b, A Sigma A^T), and the product of the normals is the
-    prediction: the frame that is surer prevails. IJRR 2019.
+    `learn` returns it with the frames of the last demonstration; `placed` moves it. Each frame's
+    prediction is mapped to the world, (A mu + b, A Sigma A^T); the prediction is the product of
+    these normals, in which the smallest covariance weighs most. IJRR 2019.
     """
 
     primitives: tuple[KMP, ...]
@@ -129,10 +129,11 @@ class LocalKMP(Immutable, Plotted):
     ) -> LocalKMP:
         """The skill of demonstrations, each inputs (T, I), outputs (T, O), and F frames for each.
 
-        In each frame a mixture of `components` gives the reference at `inputs` (N, I), and that the
-        primitive. The other parameters are those of `GaussianMixture.fit` and `KMP.fit`.
+        In each frame, the regression of a mixture of `components` at `inputs` (N, I) is the
+        primitive's reference. The other parameters are those of `GaussianMixture.fit` and
+        `KMP.fit`.
 
-        Raises ValueError if not each demonstration has F frames, and as these two do.
+        Raises ValueError if a demonstration does not have F frames, and as these two do.
         """
         kernel = checked_kernel(kernel)
         parts_of("demonstrations", demonstrations)
@@ -169,7 +170,7 @@ class LocalKMP(Immutable, Plotted):
         return cls(tuple(primitives), tuple(frames[-1]))
 
     def placed(self, frames: Sequence[CoordinateFrame]) -> LocalKMP:
-        """The skill with its F frames elsewhere. Raises ValueError if F or O is another."""
+        """The skill with its F frames moved. Raises ValueError if F or O differs."""
         if _check_frames("frames", frames) and [len(frame.offset) for frame in frames] != [
             len(frame.offset) for frame in self.frames
         ]:
@@ -178,7 +179,7 @@ class LocalKMP(Immutable, Plotted):
         return LocalKMP(self.primitives, tuple(frames))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
-        """The product of what the frames predict at queries (M, I): M normals.
+        """The product of the frames' predictions at queries (M, I): M normals.
 
         Raises ValueError as `KMP.predict` does.
         """
@@ -205,7 +206,7 @@ class LocalKMP(Immutable, Plotted):
         return LocalKMP(tuple(adapted), self.frames)
 
     def to_plot(self) -> Shown:
-        """The references of all frames and the via-points, where the frames are now."""
+        """The references of all frames and the via-points, in the world's coordinates."""
         each = [one.to_plot() for one in self.primitives]
         placed = [
             Points(known.references.inputs, frame.placed(known.references.normals))

@@ -1,4 +1,9 @@
-"""The reference by Gaussian process regression: where inputs have many dimensions."""
+"""The reference by Gaussian process regression, for inputs of many dimensions.
+
+Each output o is a process of kernel c exp(-sum_i (s_i - s'_i)^2 / (2 l_i^2)) + noise, with
+mu = k (K + noise I)^-1 y (Rasmussen and Williams 2006, algorithm 2.1). With the inverse P of its
+matrix, the error of samples h held out is P_hh^-1 (P y)_h, of covariance P_hh^-1 (section 5.4.2).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,11 @@ from kmp.arrays.checks import Array, check_finite, check_some, checked_demonstra
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
 
-_SIGNAL = 1e-3, 1e3  # variance of the function, over the outputs'
-_LENGTH = 1e-2, 1e3  # along an input, over the inputs' deviation
-_NOISE = 1e-6, 1e1  # variance of the noise, over the outputs'
-_LONGER = 1.0, 1.5, 2.5, 4.0  # than the likeliest lengths, tried on what is left out
-_NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # tried on it as well
+_SIGNAL = 1e-3, 1e3  # bounds of the function's variance over the variance of the output
+_LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
+_NOISE = 1e-6, 1e1  # bounds of the noise's variance over the variance of the output
+_LONGER = 1.0, 1.5, 2.5, 4.0  # factors on the likeliest lengths, evaluated on held-out demonstrations
+_NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # noises, evaluated on the same
 
 
 def gaussian_process_reference(
@@ -30,15 +35,15 @@ def gaussian_process_reference(
     """The reference at inputs (N, I) of demonstrations, each inputs (T, I), outputs (T, O).
 
     For inputs of many dimensions, where a mixture would need more components than the samples can
-    tell. Choose `inputs` among the demonstrations' own. Each output is a Gaussian process of its
-    own, with a squared exponential kernel of one length an input, and noise, of the greatest
-    likelihood on `count` samples at most, evenly taken.
+    determine. Choose `inputs` among those of the demonstrations. Each output is a Gaussian process
+    of its own, with a squared exponential kernel of one length per input, and noise. They have the
+    greatest likelihood on at most `count` samples, evenly spaced.
 
-    Samples of one demonstration are off together, and not each by itself as that likelihood has it.
-    So longer lengths and other noises are tried: those count under which each demonstration is
-    likeliest given the others. The mean square of these errors, in their deviations, scales the
-    covariance, and tells how outputs go together. One demonstration alone tells neither.
-    `regularization` [unit^2] is added to the covariance's diagonal.
+    That likelihood assumes independent errors, but the samples of one demonstration err together.
+    So longer lengths and other noises are evaluated too, and those are taken under which each
+    demonstration is likeliest given the others. The mean square of these errors, in their
+    deviations, scales the covariance and gives the correlations between outputs; one demonstration
+    alone gives neither. `regularization` [unit^2] is added to the covariance's diagonal.
 
     Raises ValueError if shapes do not agree, a number is not finite, there is no sample, or a
     parameter is out of its range.
@@ -52,28 +57,29 @@ def gaussian_process_reference(
     of = np.repeat(np.arange(len(data)), [len(one) for one in chosen])
     s, y = (np.concatenate([one[i][some] for one, some in zip(data, chosen, strict=True)]) for i in (0, 1))
     scale, size, centre = _deviations(s), _deviations(y), y.mean(axis=0)
-    s, asked = s / scale, where / scale
-    check_finite("inputs", asked, "over the demonstrations' deviation:")
-    found = [_process(s, one, of, asked) for one in ((y - centre) / size).T]
+    s, queries = s / scale, where / scale
+    check_finite("inputs", queries, "over the demonstrations' deviation:")
+    found = [_process(s, one, of, queries) for one in ((y - centre) / size).T]
     mean, deviation, errors = (np.stack(parts, axis=1) for parts in zip(*found, strict=True))
-    apart = deviation * size
-    together = errors.T @ errors / len(errors) if len(data) > 1 else np.eye(len(centre))
-    covariance = apart[:, :, None] * together * apart[:, None, :] + added * np.eye(len(centre))
+    scaled = deviation * size
+    correlation = errors.T @ errors / len(errors) if len(data) > 1 else np.eye(len(centre))
+    covariance = scaled[:, :, None] * correlation * scaled[:, None, :] + added * np.eye(len(centre))
     return Gaussians(
         mean * size + centre, covariances("regularization: covariance", symmetric(covariance), *mean.shape)
     )
 
 
 def _deviations(values: Array) -> Array:
-    """Of each column; 1 of one that never changes."""
+    """The deviation of each column; 1 for a constant one."""
     found = values.std(axis=0)
     check_finite("demonstrations", found, "too large for their deviation:")
     return np.where(found > 0, found, 1.0)
 
 
-def _process(s: Array, y: Array, of: NDArray[np.intp], asked: Array) -> tuple[Array, Array, Array]:
-    """The mean and the deviation (N,) at inputs (N, I), from samples (M, I), (M,) of these
-    demonstrations (M,); and the errors (M,) of each as the others predict it, in their deviations.
+def _process(s: Array, y: Array, of: NDArray[np.intp], queries: Array) -> tuple[Array, Array, Array]:
+    """Mean and deviation (N,) at inputs `queries` (N, I); left-out errors (M,) in their deviations.
+
+    From samples s (M, I) and y (M,) of the demonstrations with the numbers `of` (M,).
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -83,7 +89,7 @@ def _process(s: Array, y: Array, of: NDArray[np.intp], asked: Array) -> tuple[Ar
     count = s.shape[1]
     kernel = ConstantKernel(1.0, _SIGNAL) * RBF(np.full(count, np.sqrt(count)), _LENGTH) + WhiteKernel(0.01, _NOISE)
     with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore", ConvergenceWarning)  # an input that does not matter has no length
+        warnings.simplefilter("ignore", ConvergenceWarning)  # an input without effect has no finite length
         likeliest = GaussianProcessRegressor(kernel).fit(s, y).kernel_
         tried = [likeliest]
         if of[-1] > 0:
@@ -91,12 +97,12 @@ def _process(s: Array, y: Array, of: NDArray[np.intp], asked: Array) -> tuple[Ar
         each = [_left_out(one(s), y, of) for one in tried]
         best = min(range(len(tried)), key=lambda i: np.sum(np.log(each[i][1]) + 0.5 * (each[i][0]) ** 2))
         fitted = GaussianProcessRegressor(tried[best], optimizer=None).fit(s, y)
-        mean, deviation = fitted.predict(asked, return_std=True)
+        mean, deviation = fitted.predict(queries, return_std=True)
     return mean, deviation, each[best][0]
 
 
 def _with(kernel: Any, longer: float, noise: float) -> Any:
-    """The same kernel, its lengths so many times longer, with another noise."""
+    """The kernel with lengths multiplied by `longer`, and another noise."""
     theta = kernel.theta.copy()
     theta[1:-1] += np.log(longer)
     theta[-1] = np.log(noise)
@@ -104,10 +110,10 @@ def _with(kernel: Any, longer: float, noise: float) -> Any:
 
 
 def _left_out(gram: Array, y: Array, of: NDArray[np.intp]) -> tuple[Array, Array]:
-    """The errors (M,) of each demonstration as the others predict it, and the deviations (M,)."""
+    """Errors (M,), in deviations, of each demonstration given the others; deviations (M,)."""
     precision = np.linalg.inv(gram)
     pull, errors, deviations = precision @ y, np.empty_like(y), np.empty_like(y)
-    for h in np.unique(of):  # of a normal, given all else: covariance P_hh^-1, error P_hh^-1 (P y)_h
+    for h in np.unique(of):  # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
         own = of == h
         covariance = np.linalg.inv(precision[np.ix_(own, own)])
         deviations[own] = np.sqrt(np.diag(covariance))

@@ -13,10 +13,10 @@ from kmp.gaussians import Gaussians, check_gaussians, fused_mean
 
 
 def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussians:
-    """The reference that L references over the same N inputs agree on, by their priorities.
+    """L references over the same N inputs, combined into one by their priorities g.
 
     Priorities (L,) or (L, N) have the sum 1: Sigma = (sum_l (Sigma_l / g_l)^-1)^-1,
-    mu = Sigma sum_l (Sigma_l / g_l)^-1 mu_l. A reference of priority 0 has no say; priorities that
+    mu = Sigma sum_l (Sigma_l / g_l)^-1 mu_l. Priority 0 excludes a reference; priorities that
     change along the inputs blend from one reference to the next. IJRR 2019, superposition.
 
     Raises ValueError if there is no reference, shapes do not agree, or a priority is below 0 or

@@ -132,7 +132,7 @@ def test_outputs_that_nothing_tells_apart_are_solved_as_one_with_the_same_result
     other[0, 0, 0] *= 1 + 1e-13
     options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 2.0, "representation": "dense"}
     one, apart = (KMP.fit(inputs, Gaussians(mean, c), **options) for c in (covariance, other))
-    assert (one.inner.solution.apart, apart.inner.solution.apart) == (1, 2)
+    assert (one.inner.solution.distinct, apart.inner.solution.distinct) == (1, 2)
     assert 2 * len(one.inner.solution.mean_factor) == len(apart.inner.solution.mean_factor)
     queries = inputs[:7] + 0.1
     adapted = [x.adapt(queries, via(7, o), tolerance=0) for x in (one, apart)]
@@ -160,7 +160,7 @@ def test_adapting_changes_whether_outputs_are_solved_as_one(first):
     points = Gaussians(np.ones((3, 2)), apart if first == "alike" else alike)
     where = S[:3] + 0.01 if first == "alike" else S[37:]  # in the place of those that tell them apart
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
-    assert (base.inner.solution.apart, adapted.inner.solution.apart) == ((1, 2) if first == "alike" else (2, 1))
+    assert (base.inner.solution.distinct, adapted.inner.solution.distinct) == ((1, 2) if first == "alike" else (2, 1))
     anew = KMP.fit(adapted.inputs, adapted.reference, **options)
     assert adapted.inner.solution.same > 0
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
