@@ -300,7 +300,8 @@ def sessions() -> dict[str, Session]:
         return {name: float(np.mean(values)) for name, values in out.items()}
 
     def middle() -> Array:
-        return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER).hands.mean(axis=0)
+        skill = decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
+        return np.asarray(skill.hands.mean(axis=0))
 
     def person(seed: int) -> list[Moving]:
         hands = moving_hands.modelled(middle(), numbers=[streams["people"].numbers[seed]], seconds=MOTION_S)
