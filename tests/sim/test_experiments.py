@@ -211,6 +211,7 @@ def test_every_experiment_has_a_test() -> None:
         "letters",
         "promp",
         "separation",
+        "sensitivity",  # in test_sensitivity.py
         "correlation",
         "runs",
         "table",
