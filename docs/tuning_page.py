@@ -27,8 +27,9 @@ The range and the effects of more and less are what we expect. The last column i
 `python -m sim.experiments sensitivity` halves and doubles each number, a count as well, and
 compares short sessions with those at the tuned value. The column names the figure that changes most
 in relation to its noise, which is the standard deviation of the figure over other seeds. A change
-below the noise says little. {measured} numbers have been measured, and no session reads {unread} of
-these. {stale}
+below the noise says little.
+
+{state}
 
 The sessions are short, so that all numbers can be measured in some hours. A number that does not
 matter there may still matter in a rare situation: look for tests of it before you remove it.
@@ -67,8 +68,10 @@ def page() -> str:
     measured = {key: rows[key] for key in known if key in rows}
     unread = sum(not any(found["figures"] for found in row["changed"].values()) for row in measured.values())
     why = staleness("sensitivity", result, tree()) if measured else ""
-    stale = f"*Measured with an earlier version: {why}.*" if why else ""
-    head = HEAD.format(count=len(known), measured=len(measured), unread=unread, stale=stale).replace(" \n", "\n")
+    state = f"{len(measured)} of {len(known)} numbers have been measured; no session reads {unread} of these."
+    if why:
+        state += f" *Measured with an earlier version: {why}.*"
+    head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
     return head + "".join(
         part
         for stage in STAGES

@@ -32,7 +32,7 @@ ENTRY_POINTS = [
 STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
     *("MODES", "STATES", "KEPT", "WAY", "HULL_SPANS", "ORDER", "TURNS", "TURN_INPUTS", "MOST_STAGES", "OUTPUTS"),
     *("NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_STAGE", "NO_GRIPPER"),
-    "MAX_SKILL_DISTANCE_M",  # of a file's contents
+    *("MAX_SKILL_DISTANCE_M", "FARTHEST_REPORTED_M", "TABLE_DEPTH_M"),  # of files, of reports, of a shape
     *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
 }
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken

@@ -1,5 +1,5 @@
-"""Arithmetic on vectors (3,), compiled. Each sum begins with 0 and adds the axes in order: a
-function gives the same bits as the loop in its place.
+"""Compiled arithmetic on vectors (3,). Each sum starts from 0 and adds the axes in order, which
+fixes its last bit.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ class WayOut:
                 if met is None:
                     break
                 if np.array_equal(met, new):
-                    one, two = _back(grown, before), _back(other, other_before)[::-1]
+                    one, two = _to_root(grown, before), _to_root(other, other_before)[::-1]
                     path = one[::-1] + two[::-1][1:] if number % 2 == 0 else two + one[1:]
                     return path if np.array_equal(path[0], start) else path[::-1]
         return []
@@ -208,7 +208,7 @@ def _length(path: list[Vector]) -> float:
     return sum(float(np.abs(b - a).max()) for a, b in itertools.pairwise(path))
 
 
-def _back(nodes: list[Vector], before: list[int]) -> list[Vector]:
+def _to_root(nodes: list[Vector], before: list[int]) -> list[Vector]:
     """Postures from the newest node of a tree back to its root."""
     path, at = [], len(nodes) - 1
     while at >= 0:

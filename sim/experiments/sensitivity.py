@@ -301,7 +301,8 @@ def sessions() -> dict[str, Session]:
         return {name: float(np.mean(values)) for name, values in out.items()}
 
     def middle() -> Array:
-        return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER).hands.mean(axis=0)
+        skill = decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
+        return np.asarray(skill.hands.mean(axis=0))
 
     def person(seed: int) -> list[Moving]:
         hands = moving_hands.modelled(middle(), numbers=[streams["people"].numbers[seed]], seconds=MOTION_S)
@@ -486,14 +487,13 @@ def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
     for key in keys:
         one, began = known[key], time.monotonic()
         values = {f"{factor:g}": one.changed(factor) for factor in FACTORS}
-        found: dict[str, Any] = {}
-        for factor, value in values.items():
-            found[factor] = in_fork(functools.partial(at_other_value, one, value, here, all_sessions))
-            if workers == 1:
-                found[factor] = functools.partial(lambda done: done, found[factor]())
-        changed = {
-            factor: {"to": np.asarray(values[factor]).tolist(), "figures": done()} for factor, done in found.items()
-        }
+        work = {f: functools.partial(at_other_value, one, value, here, all_sessions) for f, value in values.items()}
+        if workers == 1:
+            figures = {factor: in_fork(measure)() for factor, measure in work.items()}
+        else:
+            started = {factor: in_fork(measure) for factor, measure in work.items()}
+            figures = {factor: result() for factor, result in started.items()}
+        changed = {f: {"to": np.asarray(value).tolist(), "figures": figures[f]} for f, value in values.items()}
         row = {"value": np.asarray(one.value).tolist(), "changed": changed}
         yield {"number": key, "row": row | {"seconds": round(time.monotonic() - began, 1)}}
 
@@ -505,14 +505,21 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     known = numbers()
     before = result_of(results.folder, results.name) or {}
     same = before.get("depends_on") == results.origin["depends_on"]
-    rows: dict[str, Any] = {key: row for key, row in before.get("numbers", {}).items() if same and key in known}
-    rows = {key: row for key, row in rows.items() if row["value"] == np.asarray(known[key].value).tolist()}
+    rows: dict[str, Any] = {
+        key: row
+        for key, row in before.get("numbers", {}).items()
+        if same and key in known and np.allclose(row["value"], known[key].value, rtol=1e-4)  # the file has five digits
+    }
     wanted = [key for key in known if key not in rows and options.numbers in ("", key, *key.split("."))]
     out: dict[str, Any] = {"tuned": before.get("tuned", {}) if same else {}, "numbers": rows, "unmeasured": []}
+    if not wanted:
+        return out
     command = [sys.executable, "-m", "sim.experiments.sensitivity", f"--workers={options.workers}", *wanted]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as server:
         assert server.stdout is not None
         for line in server.stdout:
+            if not line.startswith("{"):
+                continue  # the simulation's greeting
             found = json.loads(line)
             if "tuned" in found:
                 out["tuned"] = found["tuned"]
@@ -537,10 +544,9 @@ def effects(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[tuple[
             continue
         for session, figures in found["figures"].items():
             for name, value in figures.items():
-                if "nan" in (value, tuned["figures"][session][name]):
-                    continue
-                change, noise = value - tuned["figures"][session][name], tuned["noise"][session][name]
-                if noise > 0.0:
+                change = float(value) - float(tuned["figures"][session][name])
+                noise = float(tuned["noise"][session][name])
+                if noise > 0.0 and math.isfinite(change):
                     yield abs(change) / noise, factor, f"{session} {name}", change
 
 

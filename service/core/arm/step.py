@@ -23,6 +23,7 @@ from service.core.arm.tuning import (
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
 from service.core.numerics import MAX_ERROR_M, ROUNDING
+from service.core.vectors import dot, norm, square
 
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
@@ -41,7 +42,7 @@ def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) 
     With 5 tasks, the last row of R^T Jw is left out.
     """
     arm, here = arms[0], heres[0]
-    joints, square, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
+    joints, gram, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
     here.jacobian[:], here.rotation[:] = jacobian, rotation
     for joint in range(joints):
         for i in range(3):
@@ -56,11 +57,11 @@ def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) 
             total = 0.0
             for joint in range(joints):
                 total += jacobian[i, joint] * jacobian[j, joint]
-            square[i, j] = total
+            gram[i, j] = total
     determinant = (
-        square[0, 0] * (square[1, 1] * square[2, 2] - square[1, 2] ** 2)
-        - square[0, 1] * (square[0, 1] * square[2, 2] - square[0, 2] * square[1, 2])
-        + square[0, 2] * (square[0, 1] * square[1, 2] - square[0, 2] * square[1, 1])
+        gram[0, 0] * (gram[1, 1] * gram[2, 2] - gram[1, 2] ** 2)
+        - gram[0, 1] * (gram[0, 1] * gram[2, 2] - gram[0, 2] * gram[1, 2])
+        + gram[0, 2] * (gram[0, 1] * gram[1, 2] - gram[0, 2] * gram[1, 1])
     )
     shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / arm.singular_volume, 0.0)
     here.damping = arm.damping + arm.singular_damping * shortage * shortage
@@ -74,11 +75,7 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 
     If `forward` alone exceeds `most`, it is first scaled down to it.
     """
-    ff = fc = cc = 0.0
-    for i in range(3):
-        ff += forward[i] * forward[i]
-        fc += forward[i] * closing[i]
-        cc += closing[i] * closing[i]
+    ff, fc, cc = square(forward), dot(forward, closing), square(closing)
     if ff > most * most:
         shrink = most / math.sqrt(ff)
         for i in range(3):
@@ -143,12 +140,10 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     tasks, scale, damping = here.tasks, arm.scale, here.damping
     count_of_tasks, joints = tasks.shape
     wanted, error, linear, turn = np.empty(count_of_tasks), np.empty(3), np.empty(3), np.empty(3)
-    distance = 0.0
     for i in range(3):
         linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
         error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M) - arm.period_s * linear[i]
-        distance += error[i] * error[i]
-    distance = math.sqrt(distance)
+    distance = norm(error)
     # rate is constant for small errors; large errors are closed at constant deceleration
     near = arm.closing_braking / arm.position_gain**2
     rate = arm.position_gain
@@ -289,12 +284,11 @@ def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector,
         turn_between(here, orientation, out)
     else:
         swing(rotation[:, 2].copy(), orientation, out)
-    square = 0.0
     for i in range(3):
         out[i] = arms[0].turn_gain * out[i] + turning[i]
-        square += out[i] * out[i]
-    if not square < math.inf:
+    turn = square(out)
+    if not turn < math.inf:
         out[:] = 0.0
-    elif square > max_speed * max_speed:
+    elif turn > max_speed * max_speed:
         for i in range(3):
-            out[i] *= max_speed / math.sqrt(square)
+            out[i] *= max_speed / math.sqrt(turn)

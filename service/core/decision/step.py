@@ -49,6 +49,7 @@ from service.core.decision.tuning import (
     WAY_TIMEOUT_S,
 )
 from service.core.frame import Records, Vector
+from service.core.vectors import distance
 
 
 @compiled
@@ -179,11 +180,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     ANOTHER_TARGET_M.
     """
     state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
-    gap = moved = 0.0
-    for i in range(3):
-        gap += (frame.target[i] - tool[i]) ** 2
-        moved += (frame.target[i] - state.stuck_target[i]) ** 2
-    gap, moved = math.sqrt(gap), math.sqrt(moved)
+    gap, moved = distance(frame.target, tool), distance(frame.target, state.stuck_target)
     passed_s = (state.tick - state.stuck_tick) * config.period_s
     if state.way_next < state.way_count and passed_s < WAY_TIMEOUT_S:
         return HELD

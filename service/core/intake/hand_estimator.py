@@ -39,6 +39,7 @@ from service.core.intake.tuning import (
     STILLNESS_LOWPASS_S,
 )
 from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
+from service.core.vectors import squared_distance
 from service.settings.config import HandSettings
 
 STILL = np.ones(2)  # stillness of two hands that rest
@@ -202,11 +203,10 @@ def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> 
 
     p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
     """
-    state, square = states[0], 0.0
-    for axis in range(3):
-        square += (position[axis] - state.hands[side, 0, axis]) ** 2
+    state = states[0]
+    apart = squared_distance(position, state.hands[side, 0])
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(is_fresh(states, side, unseen_ticks) and square < REAPPEARED_VARIANCE_SHARE * variance)
+    return bool(is_fresh(states, side, unseen_ticks) and apart < REAPPEARED_VARIANCE_SHARE * variance)
 
 
 @compiled

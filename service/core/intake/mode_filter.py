@@ -43,6 +43,7 @@ from service.core.intake.tuning import (
     TREMOR_STDS_M,
 )
 from service.core.numerics import PROBABILITY_ROUND_TO
+from service.core.vectors import square
 
 
 @compiled
@@ -157,11 +158,9 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
         for j in range(MODES):
             shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
         if i != REST:
-            square = 0.0
-            for axis in range(3):
-                square += means[i, 1, axis] ** 2
+            speed = square(means[i, 1])
             slow = math.exp(
-                -0.5 * min(square / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS), MAX_INNOVATION)
+                -0.5 * min(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS), MAX_INNOVATION)
             )
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
@@ -218,9 +217,8 @@ def _beyond_rest(mean: Vector) -> float:
     with v_max = REST_MAX_SPEED_MPS, σ_v = REST_SPEED_STD_MPS, y_max = MAX_TREMOR_M and the tremor's
     σ.
     """
-    speed = tremor = 0.0
+    speed, tremor = square(mean[1]), 0.0
     for axis in range(3):
-        speed += mean[1, axis] ** 2
         tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE_PER_S) ** 2
     trembles = max(tremor - MAX_TREMOR_M**2, 0.0) / float(TREMOR_STDS_M[REST]) ** 2
     return max(speed - REST_MAX_SPEED_MPS**2, 0.0) / REST_SPEED_STD_MPS**2 + trembles
@@ -251,17 +249,17 @@ def update(
             for column in range(row):
                 p[row, column] = p[column, row]
             seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
-        variance, square = seen[0] + seen[3] + noise, 0.0
+        variance, error = seen[0] + seen[3] + noise, 0.0
         for axis in range(3):
             innovation = position[axis] - mean[0, axis] - mean[3, axis]
-            square += innovation * innovation
+            error += innovation * innovation
             for row in range(STATES):
                 mean[row, axis] += seen[row] / variance * innovation
         for row in range(STATES):
             for column in range(row, STATES):
                 p[row, column] -= seen[row] * seen[column] / variance
                 p[column, row] = p[row, column]
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(square / variance, MAX_INNOVATION)
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(error / variance, MAX_INNOVATION)
         if i == REST:
             likelihood[i] -= 0.5 * _beyond_rest(mean)
         best = max(best, likelihood[i])

@@ -22,8 +22,6 @@ source that contradicts the first. The rules are the same for both hands and for
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kmp.compiled import compiled
@@ -43,6 +41,7 @@ from service.core.intake.tuning import (
     SWAPPED_M,
     SWAPPED_MPS,
 )
+from service.core.vectors import distance, squared_distance
 
 
 @compiled
@@ -56,9 +55,7 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
     """
     state, config, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
-    far = (
-        _distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * config.period_s
-    )
+    far = distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * config.period_s
     in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
     returns = passed < config.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
     state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
@@ -119,7 +116,7 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
     near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * config.period_s, config.swapped_s)
-    return bool(seen >= 0 and _distance(position, there) < min(near, 0.5 * _distance(here, there)))
+    return bool(seen >= 0 and distance(position, there) < min(near, 0.5 * distance(here, there)))
 
 
 @compiled
@@ -129,17 +126,8 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
     """
     state, config = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = _distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * config.period_s
+    near = distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * config.period_s
     return bool(passed < config.stale_ticks and near)
-
-
-@compiled
-def _distance(a: Vector, b: Vector) -> float:
-    """Distance [m] between two points (3,)."""
-    square = 0.0
-    for axis in range(3):
-        square += (a[axis] - b[axis]) ** 2
-    return math.sqrt(square)
 
 
 @compiled
@@ -155,7 +143,7 @@ def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
         for k in range(3):
             around[k] = state.kept_positions[side, slot(states, side, before - 1 + k)]
         off = around[1] - 0.5 * (around[0] + around[2])
-        if _distance(off, offset) <= SOURCE_SPREAD_SHARE * _distance(offset, np.zeros(3)):
+        if distance(off, offset) <= SOURCE_SPREAD_SHARE * distance(offset, np.zeros(3)):
             return True
     return False
 
@@ -176,13 +164,11 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
         within, apart = 0.0, np.inf
         for i in range(4):
             for j in range(i):
-                square = 0.0
-                for axis in range(3):
-                    square += (samples[i, axis] - samples[j, axis]) ** 2
+                between = squared_distance(samples[i], samples[j])
                 if (sources >> i) & 1 == (sources >> j) & 1:
-                    within = max(within, square)
+                    within = max(within, between)
                 else:
-                    apart = min(apart, square)
+                    apart = min(apart, between)
         if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
             # index of the second source's only sample; 0 if it has two
             odd = 1 if sources == SECOND_NEWEST else 2 if sources == THIRD_NEWEST else 0

@@ -34,6 +34,7 @@ from service.core.intake.tuning import (
     TO_AND_FRO_MPS2,
     TO_AND_FRO_S,
 )
+from service.core.vectors import squared_distance
 
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
@@ -110,10 +111,7 @@ def has_jumped(
     """
     state, config = states[0], parameters[0]
     gate = max(config.jump + config.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
-    off = 0.0
-    for axis in range(3):
-        off += (position[axis] - expected[axis]) ** 2
-    return bool(off > gate * gate)
+    return bool(squared_distance(position, expected) > gate * gate)
 
 
 @compiled

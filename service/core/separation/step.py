@@ -25,6 +25,7 @@ from service.core.separation.tuning import (
     UNKNOWN_VELOCITY_STD_MPS,
     UNSEEN_ACCELERATION_MPS2,
 )
+from service.core.vectors import norm
 
 
 @compiled
@@ -235,8 +236,7 @@ def _swiftness(velocity: Vector, tremor_speed: float) -> float:
 
     |velocity| / tremor_speed - 1, limited to 0 ... 1
     """
-    speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-    return min(max(speed / tremor_speed - 1.0, 0.0), 1.0)
+    return min(max(norm(velocity) / tremor_speed - 1.0, 0.0), 1.0)
 
 
 @compiled

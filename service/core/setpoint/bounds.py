@@ -43,6 +43,7 @@ from service.core.setpoint.tuning import (
     STOP_SECANTS,
 )
 from service.core.stops import fastest_stop
+from service.core.vectors import distance, norm, square, squared_distance
 
 Pair: TypeAlias = tuple[float, float]
 
@@ -119,16 +120,11 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
     max_speed = config.max_speed
     if not np.isfinite(setpoint).all():
         return FINITE_BOUND
-    speed = now = earlier = change = 0.0
-    for i in range(3):
-        speed += setpoint[1, i] ** 2
-        now, earlier = now + setpoint[2, i] ** 2, earlier + before[2, i] ** 2
-        change += (setpoint[2, i] - before[2, i]) ** 2
-    if math.sqrt(speed) > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9:
+    if norm(setpoint[1]) > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9:
         return SPEED_BOUND
-    if math.sqrt(now) > max(config.max_acceleration, math.sqrt(earlier)) + 1e-9:
+    if norm(setpoint[2]) > max(config.max_acceleration, norm(before[2])) + 1e-9:
         return ACCELERATION_BOUND
-    if math.sqrt(change) > (config.max_jerk + 1e-6) * config.period_s:
+    if distance(setpoint[2], before[2]) > (config.max_jerk + 1e-6) * config.period_s:
         return JERK_BOUND
     low, high = np.empty(3), np.empty(3)
     bounds(hull, box, config.lowest, low, high)
@@ -182,12 +178,8 @@ def take_safe(
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
                 is_mixed = True
     if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
-        acceleration = change = 0.0
-        for i in range(3):
-            acceleration += ahead[2, i] ** 2
-            change += (ahead[2, i] - setpoint[2, i]) ** 2
-        is_kept = is_kept and acceleration <= config.max_acceleration**2
-        is_kept = is_kept and change <= (config.max_jerk * config.period_s) ** 2
+        is_kept = is_kept and square(ahead[2]) <= config.max_acceleration**2
+        is_kept = is_kept and squared_distance(ahead[2], setpoint[2]) <= (config.max_jerk * config.period_s) ** 2
     if is_kept and speed_to_come(ahead[1], ahead[2], max_jerk, return_speed) <= max_speed:
         setpoint[:] = ahead
         return True
@@ -271,14 +263,14 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
     if acceleration >= 0.0:
         t = acceleration / change
         speed_then = speed + 0.5 * acceleration * t
-        distance = t * (speed + acceleration * t / 3.0)
+        length = t * (speed + acceleration * t / 3.0)
     else:  # the braking is treated as begun at acceleration 0
         t = min(-acceleration, brake) / change
         speed_then = speed + 0.5 * change * t * t
-        distance = -(speed_then * t - change * t * t * t / 6.0)
+        length = -(speed_then * t - change * t * t * t / 6.0)
     if speed_then >= brake * brake / change:
-        return distance + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
-    return distance + speed_then * math.sqrt(speed_then / change)
+        return length + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+    return length + speed_then * math.sqrt(speed_then / change)
 
 
 @compiled
@@ -306,21 +298,21 @@ def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, li
 
 @compiled
 def stopping(
-    distance: float, growth: float, v: float, a: float, brakes: Pair, jerks: Pair, retained: float, dt: float
+    length: float, growth: float, v: float, a: float, brakes: Pair, jerks: Pair, retained: float, dt: float
 ) -> float:
     """Largest jerk [m/s³] in [lowest, wanted] at which a discrete barrier keeps a distance h.
 
     With d the `stop_distance` by `brakes` (m/s², m/s³) before and d' after one period at this jerk:
 
-        h  = distance - d                      left at the end of a stop [m]
-        h' = distance + growth - v dt - d'     the same, one period later
+        h  = length - d                        left at the end of a stop [m]
+        h' = length + growth - v dt - d'       the same, one period later
         h' >= retained h
 
-    `growth` [m] is how much the distance grows by itself in a period. A secant method finds the
+    `growth` [m] is how much the length grows by itself in a period. A secant method finds the
     jerk, to STOP_SECANT_TOLERANCE_M of h'.
     """
     (brake, change), (wanted, chosen) = brakes, jerks
-    limit = distance + growth - retained * (distance - stop_distance(v, a, brake, change))
+    limit = length + growth - retained * (length - stop_distance(v, a, brake, change))
     most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
     for _ in range(STOP_SECANTS):
         chosen = between(wanted, chosen, most, passed, limit)

@@ -9,7 +9,9 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, parameters
 from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
+from service.core.numerics import ROUNDING
 from service.core.setpoint.tuning import ORIENTATION_BRAKE_SHARE, ORIENTATION_GAIN_PER_S, ORIENTATION_SPEED_SHARE
+from service.core.vectors import dot, norm
 from service.settings.config import Settings
 
 
@@ -64,24 +66,19 @@ def turn_orientation(
         turn_between(quaternion, target, error)
     else:
         swing(axis, target, error)
-        for i in range(3):
-            along += target_turning[i] * axis[i]
-    angle = math.sqrt(error[0] * error[0] + error[1] * error[1] + error[2] * error[2])
+        along = dot(target_turning, axis)
+    angle = norm(error)
     # rate is constant for small errors; for large ones the turn ends at constant deceleration
     brake, rate = ORIENTATION_BRAKE_SHARE * config.max_acceleration, ORIENTATION_GAIN_PER_S
     near = brake / ORIENTATION_GAIN_PER_S**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
-    speed = 0.0
     for i in range(3):
         wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
-        speed += wanted[i] * wanted[i]
-    slower = min(1.0, config.max_speed / max(math.sqrt(speed), 1e-12))
-    change = 0.0
+    slower = min(1.0, config.max_speed / max(norm(wanted), ROUNDING))
     for i in range(3):
         wanted[i] = slower * wanted[i] - turning[i]
-        change += wanted[i] * wanted[i]
-    share = min(1.0, config.max_acceleration * dt / max(math.sqrt(change), 1e-12))
+    share = min(1.0, config.max_acceleration * dt / max(norm(wanted), ROUNDING))
     for i in range(3):
         turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
         wanted[i] = dt * turning[i]

@@ -32,6 +32,7 @@ from service.core.setpoint.tuning import (
     STOP_OVERSHOOT_M,
     STOP_REACTION_S,
 )
+from service.core.vectors import norm
 
 
 @compiled
@@ -50,7 +51,7 @@ def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) ->
         gap += ahead * ahead
     slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE_M) / GAP_SLOW_M)
     if share < 1.0:
-        slow = min(slow, share * _norm(setpoint[1]) / max_speed)
+        slow = min(slow, share * norm(setpoint[1]) / max_speed)
     return slow
 
 
@@ -144,7 +145,7 @@ def _track(
     config = parameters[0]
     gains, dt = config.gains, config.period_s
     max_speed = config.max_speed
-    speed, target_speed = _norm(setpoint[1]), _norm(target[1])
+    speed, target_speed = norm(setpoint[1]), norm(target[1])
     feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
     for i in range(3):
         jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
@@ -253,20 +254,14 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
     config, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
-    excess = max(_norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
+    excess = max(norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
     if excess > 1.0:
         for i in range(3):
             jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
-    excess = max(_norm(jerk) / config.max_jerk, _largest(costs[2], jerk))
+    excess = max(norm(jerk) / config.max_jerk, _largest(costs[2], jerk))
     if excess > 1.0:
         for i in range(3):
             jerk[i] /= excess
-
-
-@compiled
-def _norm(vector: Vector) -> float:
-    """Euclidean norm of a vector (3,)."""
-    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
 @compiled

@@ -48,6 +48,7 @@ from service.core.skill.tuning import (
     STAGE_FORWARD_PER_S,
     WITH_HAND_POWER,
 )
+from service.core.vectors import dot, norm, squared_distance
 
 MOST_STAGES = 64  # stages for which the state has room
 STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
@@ -162,11 +163,11 @@ def _likely(moving: Vector, stage: Record) -> float:
         here = slice(3 * side, 3 * side + 3)
         _, off = on_way(moving[0, here], stage, side)
         out -= 0.5 * min((off / stage["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
-        square, speed, along = stage["square"][side], 0.0, 0.0
-        for i in range(3):
-            speed += moving[1, 3 * side + i] ** 2
-            along += moving[1, 3 * side + i] * stage["way"][side, i]
-        goes = along / math.sqrt(square) if square > STAYS else -RESTLESS_WEIGHT * math.sqrt(speed)
+        length, velocity = stage["square"][side], moving[1, here]
+        if length > STAYS:
+            goes = dot(velocity, stage["way"][side]) / math.sqrt(length)
+        else:
+            goes = -RESTLESS_WEIGHT * norm(velocity)
         out += DIRECTION_WEIGHT * math.tanh(goes / DIRECTION_SPEED_MPS)
     return out
 
@@ -341,12 +342,10 @@ def _ambiguity(belief: Vector, tools: Vector) -> float:
             most = k
     out = 0.0
     for k in range(len(tools)):
-        if belief[k] >= LEAST_STAGE_PROBABILITY and k != most:
-            square = 0.0
-            for i in range(3):
-                square += (tools[k, i] - tools[most, i]) ** 2
-            if square > AMBIGUOUS_M**2:
-                out += belief[k]
+        if belief[k] < LEAST_STAGE_PROBABILITY or k == most:
+            continue
+        if squared_distance(tools[k], tools[most]) > AMBIGUOUS_M**2:
+            out += belief[k]
     return out
 
 
