@@ -36,7 +36,7 @@ GROUPS = {
         "access",
         "coming-from",
     ),
-    "Reference": ("settings", "wire", "incidents", "library", "glossary"),
+    "Reference": ("settings", "wire", "status", "incidents", "library", "glossary"),
     "Background": ("how-it-works", "learning", "faults", "bounds", "timing", "experiments", "evidence"),
 }
 

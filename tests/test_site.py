@@ -44,6 +44,11 @@ def test_the_page_on_settings_is_that_of_the_settings() -> None:
     assert written == written_by("settings_page"), "run `python docs/settings_page.py`"
 
 
+def test_the_page_on_incidents_is_that_of_their_table() -> None:
+    written = (DOCS / "incidents.md").read_text(encoding="utf-8")
+    assert written == written_by("incidents_page"), "run `python docs/incidents_page.py`"
+
+
 def test_the_page_on_the_library_is_that_of_its_docstrings_and_tells_all_that_it_offers() -> None:
     written = (DOCS / "library.md").read_text(encoding="utf-8")
     assert written == written_by("library_page"), "run `python docs/library_page.py`"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from service.contract.incidents import remedy, word
+from service.contract.incidents import what_to_do, word
 from service.contract.printable import printable
 from service.contract.records import Mode
 from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
@@ -114,7 +114,7 @@ def _tables(report: Report) -> Iterator[Table]:
         "rejections",
         "Rejected samples",
         ("cause", "count [samples]", "first at [s]", "what to do"),
-        tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
+        tuple((one.cause, str(one.samples), _s(one.first_s), what_to_do(one.cause)) for one in report.rejections),
         numbers=0,
     )
 

@@ -20,7 +20,7 @@ from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.settings import palette
 from service.settings.config import Settings
-from service.viewer.banner import banner, line
+from service.viewer.banner import banner, log_line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import ArmModels
 
@@ -52,7 +52,7 @@ class DynamicScene:
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
-        self._live = live
+        self._live, self._settings = live, settings
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
@@ -230,7 +230,9 @@ class DynamicScene:
             yield columns("/scene/banner", [i], texture)
         for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
-            yield columns("/log", [i], rr.TextLog.columns(text=[line(modes[i], reasons[i])], level=[level]))
+            yield columns(
+                "/log", [i], rr.TextLog.columns(text=[log_line(modes[i], reasons[i], self._settings)], level=[level])
+            )
 
     def _scene(
         self,

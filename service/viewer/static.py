@@ -19,6 +19,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.contract.incidents import title, word
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
@@ -269,11 +270,12 @@ def _log_names(fix: Any, settings: Settings) -> None:
         policy = rr.components.AggregationPolicy.Max if is_largest else None
         widths = [1.5] * len(names)
         fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
-    for path, names, colours_packed in (
-        ("/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
-        ("/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
+    for path, members, colours_packed in (
+        ("/mode", Mode, [palette.packed(palette.MODES[mode]) for mode in Mode]),
+        ("/reason", Reason, [palette.packed(palette.GREY)] * len(Reason)),
     ):
-        labels = [name.replace("_", " ") for name in names]
+        names = [word(member) for member in members]
+        labels = [title(name) for name in names]
         fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))
     fix("/scene/banner", _board())
 
