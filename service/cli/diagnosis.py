@@ -47,13 +47,13 @@ class Finding(msgspec.Struct, frozen=True):
     wanted: str = ""
     remedy: str = ""
 
-    def line(self) -> str:
-        """The finding as one line."""
+    def text(self) -> str:
+        """The finding as text, with what is required and what to do on lines of their own."""
         parts = [f"{self.level:<5}  {self.what:<18} {self.found}"]
         if self.level != "ok":
             parts += [f"required: {self.wanted}"] if self.wanted else []
             parts += [f"what to do: {self.remedy}"] if self.remedy else []
-        return " | ".join(parts)
+        return f"\n{'':<26}".join(parts)
 
 
 wrong = functools.partial(Finding, "wrong")
@@ -154,7 +154,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     wanted = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
         f"joints {', '.join(now.joints)}"
         if name == "arm"
-        else f"frame {' or '.join(repr(frame) for frame in now.frames if frame)} or none"
+        else f"frame {', '.join(repr(frame) for frame in now.frames if frame)} or none"
     )
     if not source.rate_hz and name in SIDES and name not in now.needed:
         yield Finding("ok", what, "nothing arrives; the skill does not need it")
@@ -176,7 +176,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     advice = "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
     rejected = list(_rejected(before, now, name))
     yield from rejected
-    if source.age_ms is None and any(one.level == "wrong" for one in rejected):
+    if not source.fresh and any(one.level == "wrong" for one in rejected):
         return  # all of its samples are rejected; the reason is found above
     yield judged(is_fine, what, found, wanted, advice or what_to_do(Condition.RATE_LOW))
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
@@ -203,7 +203,7 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE, SCATTER_MM)
         found = explained(Reason.TWO_SOURCES, seen)
         wanted = f"one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
-        yield wrong(what, found.why, wanted, found.what_to_do)
+        yield wrong(what, found.why.removeprefix(f"{what}, "), wanted, found.what_to_do)
 
 
 def _unit_advice(source: Source) -> str:
@@ -268,7 +268,7 @@ def _is_y_up(seen: Sequence[Status]) -> bool:
 def _machine(before: Status, now: Status) -> Iterator[Finding]:
     missed, ticks, late_us = now.missed - before.missed, max(now.tick - before.tick, 1), now.lateness_us.p99
     if now.busy:
-        wanted = "time for everything that runs in real time; without it, arm, network and clocks seem to fail"
+        wanted = "a machine that keeps time; on any other, arm, network and clocks seem to fail"
         yield Finding("note", MACHINE, f"too busy: {now.busy}", wanted, what_to_do(Condition.MACHINE_BUSY))
     found = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period

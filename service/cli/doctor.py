@@ -35,12 +35,12 @@ def doctor(args: argparse.Namespace) -> int:
     for finding in _examined(args):
         found.append(finding)
         if not args.json:
-            print(printable_lines(finding.line()), flush=True)
+            print(printable_lines(finding.text()), flush=True)
     count = sum(finding.level == "wrong" for finding in found)
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
     else:
-        many = f"{count} things are wrong, the first may be the cause of the rest"
+        many = f"{count} things are wrong; the first may cause the others"
         print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
     return 1 if count else 0
 
@@ -72,7 +72,7 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
             }
             remedy = what_to_do(Condition.NO_ANSWER if args.cell in cells else Condition.NO_DAEMON)
             if cells and args.cell not in cells:
-                remedy = f"{what_to_do(Condition.OTHER_CELL)}: {', '.join(sorted(cells))} can be reached here"
+                remedy = f"{what_to_do(Condition.OTHER_CELL)}: here, {', '.join(sorted(cells))} can be reached"
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
         except RefusedError as error:

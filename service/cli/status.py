@@ -173,16 +173,16 @@ def _at(point: tuple[float, float, float] | None) -> str:
 
 def _where(now: Status, side: str) -> str:
     source = now.sources.get(side, Source())
-    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _arrival(source)
+    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _arrival(source, "not seen")
 
 
-def _arrival(source: Source) -> str:
-    """Age and rate of a source's samples, or the time since the last one."""
+def _arrival(source: Source, missing: str) -> str:
+    """Age and rate of a source's samples, or since when they are missing."""
     is_rejected = source.rate_hz > 0 and source.cause
     rejected = f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
     if source.fresh:
         return f"{source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
-    return ("not seen yet" if source.age_ms is None else f"not seen for {source.age_ms / 1000:.1f} s") + rejected
+    return f"{missing} {'yet' if source.age_ms is None else f'for {source.age_ms / 1000:.1f} s'}{rejected}"
 
 
 def _nearest(now: Status) -> str:
@@ -197,7 +197,8 @@ def _nearest(now: Status) -> str:
 def _arm(now: Status) -> str:
     if "arm" not in now.sources:
         return "assumed, not measured"
-    return f"{_arrival(now.sources['arm'])}; {'somebody' if now.command_heard else 'nobody'} listens to commands"
+    listener = "somebody" if now.command_heard else "nobody"
+    return f"{_arrival(now.sources['arm'], 'no joint states')}; {listener} listens to commands"
 
 
 def _off(now: Status) -> str:

@@ -129,8 +129,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
     "The arm has stopped, and waits for a reset": (
         Incident(Reason.ARM_ERROR, Mode.FAULT, "arm not where commanded",
             "a joint was measured more than {arm.fault_error_rad rad} from its command",
-            "find what blocked or pushed the arm; if it has not moved since commands began: are the drives on?; then "
-            "`thirdhand reset`"),
+            "find what blocked or pushed the arm, and whether its drives are on; then `thirdhand reset`"),
         Incident(Reason.ARM_SILENT, Mode.FAULT, "arm silent",
             "no joint states arrived for {arm.silent_ms ms} while the arm followed or moved",
             "check the arm's driver and the network; then `thirdhand reset`"),
@@ -237,7 +236,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "publish as often as required, and without pauses"),
         Incident(Condition.MACHINE_BUSY, None, "machine too busy",
             "the machine is too busy for real-time work",
-            "see what else runs on this machine, `thirdhand bench` measures it; or lower `rate_hz`"),
+            "see what else runs on this machine (`thirdhand bench` measures it), or lower `rate_hz`"),
         Incident(Condition.NO_REAL_TIME, None, "no real time",
             "the daemon does not run at real-time priority",
             "raise its rtprio limit, as docs/hardware.md says"),
@@ -274,7 +273,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "ask again; if it still does not answer, read the log of `thirdhand serve`"),
         Incident(Condition.OTHER_CELL, None, "another cell",
             "only daemons of other cells are running",
-            "give the cell's name by `--cell`"),
+            "give the name of the cell by `--cell`"),
         Incident(Condition.NO_ENDPOINT, None, "no endpoint",
             "`--connect` is not an endpoint",
             "give one like tcp/127.0.0.1:7447"),

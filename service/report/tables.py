@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from service.contract.incidents import what_to_do, word
+from service.contract.incidents import what_happened, what_to_do, word
 from service.contract.printable import printable
 from service.contract.records import Mode
 from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
@@ -99,8 +99,12 @@ def _tables(report: Report) -> Iterator[Table]:
     yield Table(
         "limits",
         "Limits that were touched",
-        ("limit", "for [s]", "times", "first at [s]"),
-        tuple((limit.name, _s(limit.lasts_s), str(limit.times), _s(limit.first_s)) for limit in report.limits),
+        ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
+        tuple(
+            (one.name, _s(one.lasts_s), str(one.times), _s(one.first_s), what_happened(one.name))
+            for one in report.limits
+        ),
+        numbers=0,
     )
     yield Table(
         "joints",

@@ -193,7 +193,7 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
         token.undeclare()  # type: ignore[no-untyped-call]
     said = capsys.readouterr().out
     assert "nobody answers on lab/status" in said
-    assert "give --cell: lab/bench2 can be reached here" in said
+    assert "give the name of the cell by --cell: here, lab/bench2 can be reached" in said
 
 
 def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: pytest.CaptureFixture[str]) -> None:
