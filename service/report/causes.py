@@ -68,7 +68,7 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
     if len(timing):
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
         if missed or late_us >= LATE_US:
-            yield f"in the second before: missed deadlines: {missed}, largest lateness of a tick: {late_us / 1e3:.1f} ms"
+            yield f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} ms late"
     for one in columns.orders:
         ago_s = (tick - one.tick) * columns.period_s
         if one.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:

@@ -130,7 +130,7 @@ def test_the_initial_approach_of_the_tool_is_no_error_of_following(
     found = Report(columns)
     stops = [span for span in found.spans if span.mode is not Mode.FOLLOW]
     found.spans = tuple(span for span in found.spans if span not in stops)  # else a stop is the worst
-    prompt = next(one for one in tables(found) if one.title == "Promptness")
+    prompt = next(one for one in tables(found) if one.title == "Timing and accuracy")
     if far_ticks == 0:
         assert found.initial_mm is None
         assert found.lag_mm == before.lag_mm
@@ -370,7 +370,7 @@ def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Repo
     told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
     best_m = session.best_m("glass")
     assert best_m is not None
-    assert told.startswith("with the hands where 'glass' was taught, the tool came only within")
+    assert told.startswith("with the hands where 'glass' was taught, the tool came no nearer than")
     assert told.endswith(f" {1000 * best_m:.0f} mm of it")
     assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
 
