@@ -52,6 +52,7 @@ GROUPS = {
         "settings",
         "tuning",
         "wire",
+        "status",
         "client",
         "library",
         "incidents",

@@ -1,4 +1,4 @@
-"""The pages agree with the code: incidents, faults with their figures, tests behind promises, the
+"""The pages agree with the code: the status, faults with their figures, tests behind promises, the
 wire, ROS 2 topics, commands, options, settings and files. Words that the glossary retires stay out.
 """
 
@@ -18,7 +18,7 @@ import sim.__main__
 from service.cli import main
 from service.contract import incidents, requests, ros2
 from service.contract.channels import CHANNELS, Channel, topic
-from service.contract.records import Cause, Flag, Mode, Reason
+from service.contract.messages import BASE
 from service.contract.roles import ROLES
 from service.core.arm.stage import Arm
 from service.core.frame import FRAME, TIMING_FIELDS
@@ -29,34 +29,16 @@ from support.paths import ROOT
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]
-MANUAL = (ROOT / "docs" / "incidents.md").read_text(encoding="utf-8")
+STATUS = (ROOT / "docs" / "status.md").read_text(encoding="utf-8")
 
 
 def table(head: str) -> list[list[str]]:
-    """The cells of each row of the manual's table with this head."""
-    lines = MANUAL[MANUAL.index(f"\n| {head} |") :].lstrip().split("\n\n")[0].splitlines()
+    """The cells of each row of the table with this head on the page on the status."""
+    lines = STATUS[STATUS.index(f"\n| {head} |") :].lstrip().split("\n\n")[0].splitlines()
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_the_page_on_incidents_has_the_words_of_the_service() -> None:
-    """Add a member, explain it, and put the row that this test misses into the manual."""
-
-    def rows(*members: incidents.Member) -> list[list[str]]:
-        explained = [(incidents.word(member), *incidents.explained(member)[:2]) for member in members]
-        return sorted([f"`{word}`", about, remedy] for word, about, remedy in explained if word)
-
-    reasons = [(row[0], row[2], row[3]) for row in table("reason")]
-    assert sorted(table("mode")) == rows(*Mode)
-    assert sorted(map(list, reasons)) == rows(*Reason)
-    assert sorted(table("flag")) == rows(*Flag)
-    counters = [[row[0].replace(" KEY", ""), *row[1:]] for row in table("counter")]
-    assert sorted(counters) == rows(*Cause, incidents.MALFORMED)
-    modes = {row[0].strip("`"): row[1] for row in table("reason")}
-    assert {reason for reason, mode in modes.items() if mode == "fault"} == set(map(incidents.word, incidents.FAULTS))
-    assert set(modes.values()) == {"hold", "fault"}
-
-
-def test_every_field_of_the_status_is_explained_and_no_other() -> None:
+def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
     def named(cells: Iterable[str]) -> list[str]:
         return sorted(word for cell in cells for word in re.findall(r"`(\w+)`", cell))
 
@@ -64,11 +46,16 @@ def test_every_field_of_the_status_is_explained_and_no_other() -> None:
     assert named(row[0] for row in table("of a source")) == sorted(requests.Source.__struct_fields__)
     scribe = next(row[1] for row in table("field") if row[0] == "`scribe`")
     assert named([scribe]) == sorted(Scribe(Settings()).status())
-    fields = {*requests.Status.__struct_fields__, *requests.Source.__struct_fields__, *named([scribe])}
-    mentioned = re.findall(r"`(\w+)`(?:, (?:under|in) `(\w+)`| in the status|, under `rejected`)", MANUAL)
-    words = "".join(entry.about + entry.remedy for entry in incidents.BY_WORD.values())
-    mentioned += [(word, "") for word in re.findall(r"`(\w+)` (?:in the status|counts)", words)]
-    assert {word for pair in mentioned for word in pair if word} <= fields
+
+
+def test_what_to_do_names_fields_settings_and_causes_that_exist() -> None:
+    settings = msgspec.to_builtins(Settings())
+    known = {*requests.Status.__struct_fields__, *incidents.BY_WORD, *settings, BASE}
+    known |= {name for section in settings.values() if isinstance(section, dict) for name in section}
+    named = {
+        name for row in incidents.BY_WORD.values() for name in re.findall(r"`([a-z]+(?:_[a-z]+)*)`", row.what_to_do)
+    }
+    assert {"hand_age_ms", "rejected", "older", "keep_mb"} <= named <= known
 
 
 def test_each_view_that_a_page_names_by_its_title_exists() -> None:

@@ -49,7 +49,7 @@ def written_by(name: str) -> str:
     return str(program(name).page())
 
 
-@pytest.mark.parametrize("name", ["settings", "command-line", "tuning"])
+@pytest.mark.parametrize("name", ["settings", "command-line", "incidents", "tuning"])
 def test_a_generated_page_is_up_to_date(name: str) -> None:
     writer = f"{name.replace('-', '_')}_page"
     assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), f"run `python docs/{writer}.py`"

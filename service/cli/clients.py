@@ -12,7 +12,7 @@ import msgspec
 from service.cli.here import still
 from service.cli.usage import UsageError, added_in, reached
 from service.client import Client
-from service.contract.incidents import in_brief, remedy
+from service.contract.incidents import in_brief, what_to_do
 from service.contract.records import SIDES
 
 
@@ -76,8 +76,8 @@ def hold(args: argparse.Namespace) -> int:
     reply = ask(args, args.command)
     mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
     print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
-    if (mode == "fault" or (args.command == "resume" and mode == "hold")) and remedy(reason):
-        print(f"What to do: {remedy(reason)}")
+    if (mode == "fault" or (args.command == "resume" and mode == "hold")) and what_to_do(reason):
+        print(f"What to do: {what_to_do(reason)}")
     return 0
 
 

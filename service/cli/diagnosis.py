@@ -1,4 +1,4 @@
-"""What two statuses of a cell say of it: what was found, what is wanted, what to do."""
+"""The diagnosis of a cell from its statuses: what was found, what is required, what to do."""
 
 from __future__ import annotations
 
@@ -11,31 +11,35 @@ import msgspec
 
 from service.cli.status import AHEAD_MS
 from service.contract.channels import BY_KEY, key
-from service.contract.incidents import FREE_THE_MACHINE, SOURCE_NAMES, Evidence, explained, in_brief, remedy
+from service.contract.evidence import Evidence, explained
+from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
 from service.contract.requests import Source, Status
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
-LATE_MS = 100.0  # a stamp that is older at its arrival tells of clocks, or of a slow way
-SLACK = 0.9  # of the least rate
-OFTEN = 0.05  # share of what comes that is rejected, above which it is no accident
-NOISY_MM = 8.0  # of a hand's samples, each axis: no tracker that sees it well
-MOST_OTHERS = 4  # keys that are named
-ROOM_MB, LASTS_H = 2000.0, 1.0  # of free space, and how long that is to last at least
-MISSED, LATE_US = 0.01, 1000.0  # share of deadlines, and 99th percentile of lateness
-OUTSIDE_M = 0.15  # a hand this far from where it was demonstrated is somewhere else
-TOLD_RAD, STUCK = 0.03, 0.1  # what a joint is told to travel before it can be stuck, and the share that it did
-OFF_M, LONG_S = 0.05, 1.5  # a tool farther off its target, and for longer, does not only lag
-LEVEL_M, RAISED_M = 0.03, 0.10  # of hands: the span of z, and of y, by which y looks to be the height
+LATE_MS = 100.0  # a stamp older than this at its arrival shows that clocks differ, or a slow network
+LEAST_RATE_SHARE = 0.9  # smallest accepted rate / least rate of the key
+REJECTED_SHARE = 0.05  # a larger share of rejected samples is no accident
+SCATTER_MM = 8.0  # a tracker that sees a hand well scatters less, on each axis
+MOST_OTHER_KEYS = 4  # keys that are named
+FREE_MB = 2000.0  # least free space
+DISK_LASTS_H = 1.0  # least time until the disk is full
+MISSED_SHARE = 0.01  # largest share of missed deadlines
+LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
+OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
+COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
+MOVED_SHARE = 0.1  # a joint that moved less than this share of it has not moved
+OFF_TARGET_M, OFF_TARGET_S = 0.05, 1.5  # a tool that is farther away for longer does not only lag
+LEVEL_M, RAISED_M = 0.03, 0.10  # if z spans less than the first and y more than the second, y is the height
 Y_UP = (0.0, 0.0, 0.0, 0.7071, 0.0, 0.0, 0.7071)  # base_from_tracker of a tracker whose y points up
 MACHINE = "machine"
 LEVELS = ("wrong", "note", "ok")
-OWN_CLOCK_S = 0.5  # a status is up to 0.1 s old
+OWN_CLOCK_S = 0.5  # accepted difference; a status is up to 0.1 s old
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One thing that was looked at; `level` is ok, note or wrong."""
+    """The finding on one thing; `level` is ok, note or wrong."""
 
     level: str
     what: str
@@ -43,21 +47,21 @@ class Finding(msgspec.Struct, frozen=True):
     wanted: str = ""
     remedy: str = ""
 
-    def line(self) -> str:
-        """All of it in one line."""
-        said = [f"{self.level:<5}  {self.what:<18} {self.found}"]
+    def text(self) -> str:
+        """The finding as text, with what is required and what to do on lines of their own."""
+        parts = [f"{self.level:<5}  {self.what:<18} {self.found}"]
         if self.level != "ok":
-            said += [f"wanted: {self.wanted}"] if self.wanted else []
-            said += [f"what to do: {self.remedy}"] if self.remedy else []
-        return " | ".join(said)
+            parts += [f"required: {self.wanted}"] if self.wanted else []
+            parts += [f"what to do: {self.remedy}"] if self.remedy else []
+        return f"\n{'':<26}".join(parts)
 
 
-wrong = functools.partial(Finding, "wrong")  # what needs to be mended
+wrong = functools.partial(Finding, "wrong")
 
 
-def judged(fine: bool, what: str, found: str, wanted: str, remedy: str) -> Finding:
-    """What is right, or needs to be mended."""
-    return Finding("ok" if fine else "wrong", what, found, wanted, remedy)
+def judged(is_fine: bool, what: str, found: str, wanted: str, remedy: str) -> Finding:
+    """A finding that is ok or wrong."""
+    return Finding("ok" if is_fine else "wrong", what, found, wanted, remedy)
 
 
 def findings(
@@ -67,15 +71,14 @@ def findings(
     published: Sequence[str] = (),
     travels: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Finding]:
-    """What is to be said of a cell by its statuses: what is wrong first, causes before what follows
-    from them.
+    """The findings on a cell, from its statuses: wrong ones first, causes before their effects.
 
-    `own_ns` and `own_version` are time and version here, `published` the keys on which hands and
-    joints were heard, in whatever cell, and `travels` how far each joint was told to go, and went,
-    since the first status [rad].
+    `own_ns` and `own_version` are time and version of this machine, `published` the keys of any
+    cell on which hands and joints were received, and `travels` the commanded and the measured
+    travel of each joint since the first status [rad].
     """
     found = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}))
-    if any(finding.level == "wrong" for finding in found):  # it may be the machine that makes it look so
+    if any(finding.level == "wrong" for finding in found):  # a busy machine may be the cause
         found = [wrong(*msgspec.structs.astuple(one)[1:]) if one.what == MACHINE else one for one in found]
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
 
@@ -90,9 +93,9 @@ def _in_order_of_cause(
     before, now = seen[0], seen[-1]
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
-    yield judged(now.version == own_version, "daemon", found, wanted, "update the older one")
+    yield judged(now.version == own_version, "daemon", found, wanted, what_to_do(Condition.VERSIONS_DIFFER))
     if now.tick < 0:
-        yield wrong("loop", "no tick yet", "ticks", "wait: it begins once the recorder listens")
+        yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
         return
     yield from _machine(before, now)
     for name in now.sources:
@@ -105,43 +108,44 @@ def _in_order_of_cause(
     yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
-        told = f"{abs(apart_s):.3g} s {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
-        yield Finding("note", "clock here", told, f"within {OWN_CLOCK_S:g} s", "synchronise the clocks (chrony, PTP)")
+        found = f"{abs(apart_s):.3g} s {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
+        advice = what_to_do(Condition.CLOCKS_DIFFER)
+        yield Finding("note", "clock here", found, f"within {OWN_CLOCK_S:g} s", advice)
 
 
 def _mode(now: Status) -> Finding:
-    told = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
-    told += f": {now.because}" if now.because else ""
-    advice = now.remedy
-    if now.reason == "arm_error":
-        advice += "; if it has not moved since commands began: are the drives on?"
+    found = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
+    found += f": {now.because}" if now.because else ""
     level = "ok" if now.mode == "follow" else "note" if now.reason == "operator" else "wrong"
-    return Finding(level, "mode", told, "follow", advice)
+    return Finding(level, "mode", found, "follow", now.remedy)
 
 
 def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
-    """The joint that was told to go farthest of those that did not."""
-    stuck = {name: told for name, (told, went) in travels.items() if told > TOLD_RAD and went < STUCK * told}
-    if stuck:
-        name = max(stuck, key=lambda joint: stuck[joint])
-        found = f"{name} was told to go {stuck[name]:.2f} rad and it has not moved since commands began"
-        advice = "are the drives on? Look at their power, brakes and emergency stop; then `thirdhand reset`"
-        yield wrong("arm's drives", found, "joints that go where they are told", advice)
+    """Of the joints that did not move, the one with the largest commanded travel."""
+    still = {
+        name: commanded
+        for name, (commanded, moved) in travels.items()
+        if commanded > COMMANDED_RAD and moved < MOVED_SHARE * commanded
+    }
+    if still:
+        name = max(still, key=lambda joint: still[joint])
+        found = f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since commands began"
+        yield wrong("arm's drives", found, "joints that follow their commands", what_to_do(Condition.DRIVES_OFF))
 
 
 def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
-    """Whether the tool is off its target for long."""
-    offs = [
+    """A tool that has been off its target for long."""
+    distances_m = [
         math.dist(one.tool_measured_m or one.tool_m, one.target_m)
         for one in seen
         if one.mode == "follow" and one.tool_m is not None and one.target_m is not None
     ]
     lasts_s, flags = (seen[-1].time_ns - seen[0].time_ns) / 1e9, seen[-1].flags
-    if len(offs) == len(seen) and lasts_s > LONG_S and min(offs) > OFF_M:
-        found = f"off its target by {100 * min(offs):.0f} cm or more for {lasts_s:.1f} s"
-        advice = "; ".join(map(remedy, flags)) or "see that the arm's driver follows commands, and as fast"
+    if len(distances_m) == len(seen) and lasts_s > OFF_TARGET_S and min(distances_m) > OFF_TARGET_M:
+        found = f"{100 * min(distances_m):.0f} cm or more from its target for {lasts_s:.1f} s"
+        advice = "; ".join(map(what_to_do, flags)) or what_to_do(Condition.OFF_TARGET)
         level = "note" if flags else "wrong"
-        yield Finding(level, "tool", found, f"within {100 * OFF_M:.0f} cm once the hands rest", advice)
+        yield Finding(level, "tool", found, f"within {100 * OFF_TARGET_M:.0f} cm once the hands rest", advice)
 
 
 def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
@@ -150,109 +154,106 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     wanted = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
         f"joints {', '.join(now.joints)}"
         if name == "arm"
-        else f"frame {' or '.join(repr(frame) for frame in now.frames if frame)} or none"
+        else f"frame {', '.join(repr(frame) for frame in now.frames if frame)} or none"
     )
     if not source.rate_hz and name in SIDES and name not in now.needed:
-        yield Finding("ok", what, "nothing comes, and the skill does without it")
+        yield Finding("ok", what, "nothing arrives; the skill does not need it")
         return
     if not source.rate_hz:
-        told = "nothing comes" if source.age_ms is None else f"nothing came for {source.age_ms / 1000:.1f} s"
+        found = "nothing arrives" if source.age_ms is None else f"nothing arrived for {source.age_ms / 1000:.1f} s"
         group = KEYS[name].rpartition("/")[0]
         ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
-        others = [one for one in published if f"/{group}/" in one and one not in ours][:MOST_OTHERS]
-        told += f", but on {', '.join(others)}" if others else ""
-        start = f"start {'the driver' if name == 'arm' else 'the tracker'}, connected to "
-        rename = f"let it publish {key(now.cell, KEYS[name])}; or " if others else ""
-        yield wrong(what, told, wanted, rename + start + (", ".join(now.endpoints) or "where the daemon connects"))
+        others = [one for one in published if f"/{group}/" in one and one not in ours][:MOST_OTHER_KEYS]
+        found += f", but on {', '.join(others)}" if others else ""
+        advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)
+        advice += f" ({', '.join(now.endpoints)})" if now.endpoints else ""
+        rename = f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}; or " if others else ""
+        yield wrong(what, found, wanted, rename + advice)
         return
-    told = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
-    told += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
-    fine = source.fresh and source.rate_hz >= SLACK * least
-    advice = "" if source.fresh else _of_unit(source) or source.advice or remedy(source.cause)
+    found = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
+    found += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
+    is_fine = source.fresh and source.rate_hz >= LEAST_RATE_SHARE * least
+    advice = "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
     rejected = list(_rejected(before, now, name))
     yield from rejected
-    if source.age_ms is None and any(one.level == "wrong" for one in rejected):
-        return  # nothing is accepted of it, and why is said
-    yield judged(fine, what, told, wanted, advice or "let it publish as often, and without pauses")
+    if not source.fresh and any(one.level == "wrong" for one in rejected):
+        return  # all of its samples are rejected; the reason is found above
+    yield judged(is_fine, what, found, wanted, advice or what_to_do(Condition.RATE_LOW))
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
-        way = "before it comes" if source.clock_ms > 0 else "after it comes: its clock is ahead"
-        told = f"a sample is stamped {abs(source.clock_ms) / 1000:.3g} s {way}"
-        advice = "synchronise its clock (chrony, PTP), or stamp as it is sent; no latency can be told until then"
-        level = "note" if name == "arm" else "wrong"  # of the arm's nothing is told
-        yield Finding(level, f"{what}'s clock", told, f"less than {LATE_MS / 1000:g} s", advice)
+        order = "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
+        found = f"a sample is stamped {abs(source.clock_ms) / 1000:.3g} s {order}; no latency can be measured"
+        level = "note" if name == "arm" else "wrong"  # no latency is computed from the arm's stamps
+        advice = what_to_do(Condition.CLOCKS_DIFFER)
+        yield Finding(level, f"{what}'s clock", found, f"less than {LATE_MS / 1000:g} s", advice)
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
     source, what, seconds = now.sources[name], SOURCE_NAMES[name], max((now.time_ns - before.time_ns) / 1e9, 0.1)
-    earlier, came = before.sources.get(name, Source()).rejected, max(source.rate_hz, 1.0)
+    earlier, arriving_hz = before.sources.get(name, Source()).rejected, max(source.rate_hz, 1.0)
     rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
-    share = max(source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / came)
+    share = max(source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz)
     for cause, rate in rates.items():
-        if rate and not (share > OFTEN and cause in ("older", "jumped")):  # said below
+        if rate and not (share > REJECTED_SHARE and cause in ("older", "jumped")):  # these are found below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
-            level = "wrong" if rate > OFTEN * came else "note"
-            advice = (_of_unit(source) or source.advice if cause == source.cause else "") or remedy(cause)
+            level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
+            advice = (_unit_advice(source) or source.advice if cause == source.cause else "") or what_to_do(cause)
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
-    noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > NOISY_MM
-    if share > OFTEN or noisy:
-        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, OFTEN, NOISY_MM)
+    is_noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM
+    if share > REJECTED_SHARE or is_noisy:
+        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE, SCATTER_MM)
         found = explained(Reason.TWO_SOURCES, seen)
         wanted = f"one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
-        yield wrong(what, found.why, wanted, found.what_to_do)
+        yield wrong(what, found.why.removeprefix(f"{what}, "), wanted, found.what_to_do)
 
 
-def _of_unit(source: Source) -> str:
-    """What to write or publish where what was refused looks to be in another unit."""
+def _unit_advice(source: Source) -> str:
+    """What to do if the rejected samples seem to be in another unit; empty otherwise."""
     looks = re.search(r"looks like (\w+)", source.refused)
     if looks is None or source.cause != "out_of_range":
         return ""
     if looks[1] == "degrees":
-        return "publish joints in radians"
-    return f'write unit = "{looks[1]}" under [hands] in the cell\'s settings, and start the daemon anew'
+        return what_to_do(Condition.DEGREES)
+    return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{looks[1]}"'
 
 
 def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
-        return Finding("note", "arm", "assumed, not measured", "", "with an arm start the daemon with --joints state")
+        return Finding("note", "arm", "assumed, not measured", "", what_to_do(Condition.NO_ARM))
     commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
-    told = f"{'somebody' if heard else 'nobody'} listens to {commands}"
-    return judged(heard, "arm's driver", told, "a driver", f"let the arm's driver subscribe to {commands}")
+    found = f"{'somebody' if heard else 'nobody'} listens to {commands}"
+    return judged(heard, "arm's driver", found, "a driver", what_to_do(Condition.NO_DRIVER))
 
 
 def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     now, boxes = seen[-1], seen[-1].demonstrated_m
-    there = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
-    off = {side: _outside(at, boxes[side]) for side, at in there.items()}
+    positions = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
+    off = {side: _outside(at, boxes[side]) for side, at in positions.items()}
     crossed = [
-        _outside(at, boxes[other]) for side, at in there.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
+        _outside(at, boxes[other]) for side, at in positions.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
     ]
-    swapped = len(off) == len(SIDES) and max(crossed) < OUTSIDE_M < min(off.values())
-    advice = (
-        "left and right look swapped: publish each under the other's key"
-        if swapped
-        else "bring it there, or demonstrate this too; see that [hands] unit and base_from_tracker are right"
-    )
+    is_exchanged = len(off) == len(SIDES) and max(crossed) < OUTSIDE_M < min(off.values())
+    advice = what_to_do(Condition.HANDS_EXCHANGED if is_exchanged else Condition.HAND_ELSEWHERE)
     if off and max(off.values()) > OUTSIDE_M and _is_y_up(seen):
         written = "[{}]".format(", ".join(f"{v:g}" for v in Y_UP))
         yield wrong(
             "tracker's axes",
-            "z of the hands stays as it is while y moves like a height",
+            "z of the hands is constant while y changes like a height",
             "z up, as in frame base",
-            f"if y is up, write base_from_tracker = {written} under [hands]; its first three are where the tracker's "
-            "origin is in base [m]",
+            f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = {written}, with the position of the tracker's "
+            "origin in base [m] as its first three numbers",
         )
-    for side, at in there.items():
-        told = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
+    for side, at in positions.items():
+        found = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
         wanted = " to ".join(map(_point, boxes[side])) + " m"
-        yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", told, wanted, advice)
+        yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", found, wanted, advice)
     if now.deviation_m is not None:
-        told = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
+        found = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
         wanted = f"up to {100 * now.threshold_m:.1f} cm"
-        yield judged(now.deviation_m <= now.threshold_m, "skill", told, wanted, remedy("far_from_demonstrations"))
+        yield judged(now.deviation_m <= now.threshold_m, "skill", found, wanted, what_to_do("far_from_demonstrations"))
 
 
 def _is_y_up(seen: Sequence[Status]) -> bool:
-    """Whether y looks to be the hands' height: alike for both, and changing while z does not."""
+    """True if y seems to be the hands' height: it changes while z does not."""
     at = [one.hands_m for one in seen if all(side in one.hands_m for side in SIDES)]
     heights = [[hands[side][1] for hands in at] for side in SIDES]
     levels = [[hands[side][2] for hands in at] for side in SIDES]
@@ -267,46 +268,44 @@ def _is_y_up(seen: Sequence[Status]) -> bool:
 def _machine(before: Status, now: Status) -> Iterator[Finding]:
     missed, ticks, late_us = now.missed - before.missed, max(now.tick - before.tick, 1), now.lateness_us.p99
     if now.busy:
-        advice = FREE_THE_MACHINE.replace("`", "")
-        wanted = "time for all that runs in real time; else arm, network and clocks seem to fail"
-        yield Finding("note", MACHINE, f"too busy: {now.busy}", wanted, advice)
-    told = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
+        wanted = "a machine that keeps time; on any other, arm, network and clocks seem to fail"
+        yield Finding("note", MACHINE, f"too busy: {now.busy}", wanted, what_to_do(Condition.MACHINE_BUSY))
+    found = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period
-    wanted = f"less than {MISSED:.0%} missed, and {most_us:.0f} µs"
-    advice = "see what else runs there; `thirdhand bench` measures it"
-    yield judged(missed <= MISSED * ticks and late_us <= most_us, "loop", told, wanted, advice)
+    wanted = f"less than {MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
+    is_fine = missed <= MISSED_SHARE * ticks and late_us <= most_us
+    yield judged(is_fine, "loop", found, wanted, what_to_do(Condition.MACHINE_BUSY))
 
 
 def _privileges_and_recording(now: Status) -> Iterator[Finding]:
-    told, wanted = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
-    yield judged(now.realtime, "real time", told, wanted, "raise its rtprio limit, as docs/hardware.md says")
-    told, wanted = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
-    yield judged(now.memory_locked, "memory", told, wanted, "raise its memlock limit, as docs/hardware.md says")
+    found, wanted = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
+    yield judged(now.realtime, "real time", found, wanted, what_to_do(Condition.NO_REAL_TIME))
+    found, wanted = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
+    yield judged(now.memory_locked, "memory", found, wanted, what_to_do(Condition.NOT_LOCKED))
     scribe = now.scribe
     state, lost, free_mb = scribe.get("state", "off"), scribe.get("lost", 0), scribe.get("free_mb")
     if state == "off":
-        yield Finding("note", "recording", "none is asked for", "", "`thirdhand serve --record DIR`")
+        yield Finding("note", "recording", "off", "", what_to_do(Condition.NOT_RECORDED))
         return
-    told = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
-    advice = "see that the folder is there and has room; `thirdhand replay` says what is missing"
-    yield judged(state != "interrupted" and not lost, "recording", told, "recording, none lost", advice)
+    found = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
+    is_fine = state != "interrupted" and not lost
+    yield judged(is_fine, "recording", found, "recording, none lost", what_to_do(Condition.TICKS_LOST))
     if free_mb is not None:
         yield _disk(free_mb, scribe.get("mb_per_hour"), scribe.get("keep_mb_left"))
 
 
 def _disk(free_mb: float, mb_per_hour: float | None, keep_mb_left: float | None) -> Finding:
-    """Free space where the cell records, and how long it lasts."""
-    told, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
+    """Free space for recordings, and the time until it is full."""
+    found, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
     if mb_per_hour:
-        told += f", {mb_per_hour / 1000:.2g} GB an hour written"
+        found += f", {mb_per_hour / 1000:.2g} GB an hour written"
         if keep_mb_left is not None and keep_mb_left < free_mb:
-            told += f": in {_hours(keep_mb_left / mb_per_hour)} the oldest recordings begin to be removed"
+            found += f": in {_hours(keep_mb_left / mb_per_hour)} the oldest recordings begin to be removed"
         else:
-            told += f": full in {_hours(free_mb / mb_per_hour)}"
-            lasts = free_mb / mb_per_hour > LASTS_H
-    wanted = f"more than {ROOM_MB / 1000:g} GB, and {LASTS_H:g} h"
-    advice = "make room, or lower [files] keep_mb, or rerun_mb_per_hour"
-    return judged(free_mb > ROOM_MB and lasts, "disk", told, wanted, advice)
+            found += f": full in {_hours(free_mb / mb_per_hour)}"
+            lasts = free_mb / mb_per_hour > DISK_LASTS_H
+    wanted = f"more than {FREE_MB / 1000:g} GB, and {DISK_LASTS_H:g} h"
+    return judged(free_mb > FREE_MB and lasts, "disk", found, wanted, what_to_do(Condition.DISK_SHORT))
 
 
 def _hours(hours: float) -> str:
@@ -314,7 +313,7 @@ def _hours(hours: float) -> str:
 
 
 def _outside(at: Vector3, box: tuple[Vector3, Vector3]) -> float:
-    """How far a point is outside of a box [m]."""
+    """Distance of a point from a box [m]; 0 inside."""
     gaps = (max(low - v, 0.0, v - high) for v, low, high in zip(at, *box, strict=True))
     return float(sum(gap * gap for gap in gaps) ** 0.5)
 

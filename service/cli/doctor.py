@@ -1,6 +1,4 @@
-"""`thirdhand doctor`: looks at a running cell, and says of each thing what was found, what is
-wanted and what to do.
-"""
+"""`thirdhand doctor`: examines a running cell; prints what was found and what to do about it."""
 
 from __future__ import annotations
 
@@ -17,36 +15,37 @@ import msgspec
 import zenoh
 
 from service.cli.diagnosis import Finding, findings, wrong
-from service.cli.status import heard
+from service.cli.status import statuses
 from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
 from service.client import Overheard, RefusedError, StartingError, UnreachableError
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
 from service.contract.explain import in_words
+from service.contract.incidents import Condition, what_to_do
 from service.contract.messages import WireError
 from service.contract.printable import printable_lines
 
 PROBE_S = 1.0
-PUBLISHED = ("**/hands/*", "**/joints/state")  # of whatever cell: a name may be wrong
+PUBLISHED = ("**/hands/*", "**/joints/state")  # in any cell, because a name may be wrong
 
 
 def doctor(args: argparse.Namespace) -> int:
-    """Exit code 1 when something is wrong."""
+    """Exit code 1 if something is wrong."""
     found = []
-    for finding in _looked_at(args):
+    for finding in _examined(args):
         found.append(finding)
         if not args.json:
-            print(printable_lines(finding.line()), flush=True)
+            print(printable_lines(finding.text()), flush=True)
     count = sum(finding.level == "wrong" for finding in found)
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
     else:
-        many = f"{count} things are wrong, the first may be the cause of the rest"
+        many = f"{count} things are wrong; the first may cause the others"
         print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
     return 1 if count else 0
 
 
-def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
+def _examined(args: argparse.Namespace) -> Iterator[Finding]:
     try:
         session = reached(args)
     except UnreachableError as error:
@@ -54,16 +53,16 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
         return
     with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
         try:
-            with contextlib.closing(heard(session, args.cell)) as told:
-                seen = [next(told)]
+            with contextlib.closing(statuses(session, args.cell)) as arriving:
+                seen = [next(arriving)]
                 travel = Travel()
-                if seen[0].command_heard:  # else who is looked for would be ourselves
+                if seen[0].command_heard:  # otherwise the daemon would take this subscriber for a driver
                     closing.enter_context(travel.watching(session, args.cell))
                 end = time.monotonic() + args.seconds
                 while time.monotonic() < end:
-                    seen.append(next(told))
+                    seen.append(next(arriving))
         except StartingError as error:
-            yield wrong("daemon", str(error), "a daemon that is ready", "wait: it tells how far it is")
+            yield wrong("daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING))
             return
         except UnreachableError as error:
             cells = {
@@ -71,15 +70,13 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
                 for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
                 if reply.ok is not None
             }
-            remedy = "start `thirdhand serve`; with certificates use an operator's or an observer's"
-            if args.cell in cells:
-                remedy = "ask again; see the log of `thirdhand serve` where it stays so"
-            elif cells:
-                remedy = f"give --cell: {', '.join(sorted(cells))} can be reached here"
+            remedy = what_to_do(Condition.NO_ANSWER if args.cell in cells else Condition.NO_DAEMON)
+            if cells and args.cell not in cells:
+                remedy = f"{what_to_do(Condition.OTHER_CELL)}: here, {', '.join(sorted(cells))} can be reached"
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
         except RefusedError as error:
-            yield wrong("daemon", str(error), f"one of version {version('thirdhand')}", "update the older one")
+            yield wrong("daemon", str(error), f"version {version('thirdhand')}", what_to_do(Condition.VERSIONS_DIFFER))
             return
     yield from findings(
         *seen,
@@ -91,17 +88,17 @@ def _looked_at(args: argparse.Namespace) -> Iterator[Finding]:
 
 
 class Travel:
-    """How far the joints of an arm are told to go, and go, while it watches."""
+    """Commanded and measured travel of an arm's joints while they are watched."""
 
     def __init__(self) -> None:
-        self._told: dict[str, tuple[float, float]] = {}  # lowest and highest of each joint [rad]
-        self._went: dict[str, tuple[float, float]] = {}
+        self._commanded: dict[str, tuple[float, float]] = {}  # lowest and highest position of each joint [rad]
+        self._measured: dict[str, tuple[float, float]] = {}
 
     @contextlib.contextmanager
     def watching(self, session: zenoh.Session, cell: str) -> Iterator[None]:
-        """Watches a cell's arm as long as the context lasts."""
-        commands = functools.partial(self._take, self._told)
-        states = functools.partial(self._take, self._went)
+        """Watch a cell's arm while the context lasts."""
+        commands = functools.partial(self._take, self._commanded)
+        states = functools.partial(self._take, self._measured)
         with (
             session.declare_subscriber(key(cell, "joints/command"), commands),
             session.declare_subscriber(key(cell, "joints/state"), states),
@@ -109,11 +106,11 @@ class Travel:
             yield
 
     def of_joints(self) -> dict[str, tuple[float, float]]:
-        """How far each joint was told to go, and went [rad]."""
+        """Commanded and measured travel of each joint [rad]."""
         return {
-            name: (told[1] - told[0], went[1] - went[0])
-            for name, told in self._told.copy().items()
-            if (went := self._went.get(name)) is not None
+            name: (commanded[1] - commanded[0], measured[1] - measured[0])
+            for name, commanded in self._commanded.copy().items()
+            if (measured := self._measured.get(name)) is not None
         }
 
     @staticmethod
@@ -125,21 +122,19 @@ class Travel:
                 spans[name] = min(low, at), max(high, at)
 
 
-def unreachable(endpoint: str, said: str) -> Finding:
-    """Why no session comes about with an endpoint."""
-    match = re.fullmatch(r"(tcp|tls)/\[?(.+?)\]?:(\d+)", endpoint)
+def unreachable(endpoint: str, error_text: str) -> Finding:
+    """The reason why no session with an endpoint can be opened."""
+    match = re.fullmatch(r"(?:tcp|tls)/\[?(.+?)\]?:(\d+)", endpoint)
     if match is None:
-        return wrong("port", said, "an endpoint like tcp/127.0.0.1:7447", "give another --connect")
-    protocol, host, port = match.groups()
+        return wrong("port", error_text, "an endpoint", what_to_do(Condition.NO_ENDPOINT))
+    host, port = match.groups()
     wanted = f"a daemon that listens on {endpoint}"
     try:
         socket.create_connection((host, int(port)), timeout=PROBE_S).close()
     except ConnectionRefusedError:
-        remedy = "start `thirdhand serve`; its first line says where it listens: give that as --connect"
-        return wrong("port", f"nothing listens on {host} port {port}", wanted, remedy)
+        return wrong("port", f"nothing listens on {host} port {port}", wanted, what_to_do(Condition.PORT_CLOSED))
     except (OSError, OverflowError) as error:
-        remedy = "look at the address, the network and its firewall"
-        return wrong("port", f"{host} port {port} cannot be reached: {in_words(error)}", wanted, remedy)
-    secured = "the --certificate of your role" if protocol == "tls" else "tls/... and a --certificate"
-    remedy = f"a daemon may need {secured}, or be overrun; from another program take the port by another --listen"
-    return wrong("port", f"something listens on {host} port {port}, but opens no Zenoh session", wanted, remedy)
+        found = f"{host} port {port} cannot be reached: {in_words(error)}"
+        return wrong("port", found, wanted, what_to_do(Condition.NO_WAY))
+    found = f"something listens on {host} port {port}, but opens no Zenoh session"
+    return wrong("port", found, wanted, what_to_do(Condition.PORT_FOREIGN))

@@ -34,10 +34,9 @@ from yarl import URL
 from service.client import Client, RefusedError, decoded
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_words
-from service.contract.incidents import in_brief
+from service.contract.incidents import ORDERS, in_brief, title
 from service.contract.requests import Status
 
-ORDERS = ("hold", "resume", "reset")
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
 PIECE = 64 * 1024  # bytes of a file that are passed on at once
 MOST_BODY = 4096  # bytes of a request
@@ -83,30 +82,30 @@ class Latest:
 
     @property
     def stream(self) -> Address:
-        """The server of the live view: another one once the scribe was started again."""
+        """The server of the live view; it changes when the scribe is started again."""
         parts = urlsplit(str(self._status.scribe.get("live") or "").removeprefix("rerun+"))
         return Address(parts.hostname or "127.0.0.1", parts.port or 0)
 
     def summary(self) -> dict[str, Any]:
-        """Mode, reason, cause, remedy by the page's buttons, places [m], age [s], the daemon's time
-        [ms], which live view it serves, and further facts in one line.
+        """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
+        [s], the daemon's time [ms], the live view that it serves, and further facts in one line.
         """
         now, age_s = self._status, time.monotonic() - self._at
         hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
         near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
         facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
-        told = {name: getattr(now, name) for name in ("mode", "reason", "because", "hands_m")}
-        told |= {name: getattr(now, name) for name in ("tool_m", "target_m", "std_m")}
+        names = ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m")
+        shown = {name: getattr(now, name) for name in names} | {"title": title(now.reason)}
         remedy = _COMMAND.sub(
             lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
             now.remedy,
         )
         now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
-        return told | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
+        return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
 class Room:
-    """What a viewer has room for: samples are sent little ahead of its picture, or left out."""
+    """A viewer's room for messages: samples are sent little ahead of its picture, or left out."""
 
     def __init__(self) -> None:
         self._left, self._sent_ms, self._due = 0, 0.0, time.monotonic() + HISTORY_S
@@ -115,12 +114,12 @@ class Room:
         self._left, self._due = A_PICTURE, time.monotonic() + PATIENCE_S
 
     def shown(self, at_ms: float) -> None:
-        """Makes room, as the picture of this time is shown [ms]; not where that is far behind."""
+        """Make room when the picture of this time [ms] is shown, unless that is far behind."""
         if not self._sent_ms - at_ms > BEHIND_MS:
             self._fill()
 
     def take(self) -> bool:
-        """Whether there is room for one more message."""
+        """Take room for one more message; False if there is none."""
         if time.monotonic() > self._due:
             self._fill()
         self._left -= 1
@@ -135,8 +134,8 @@ class LivePage:
     def __init__(self, *, client: Client, latest: Latest, cell: str, viewer: Address) -> None:
         self._client, self._latest, self._cell, self._viewer = client, latest, cell, viewer
         self._token, self._page = secrets.token_urlsafe(24), secrets.token_hex(4)
-        self._rooms: dict[str, Room] = {}  # by the viewer's address, each with a number of its own
-        self._unheard: set[web.RequestHandler] = set()  # connections on which no request came yet
+        self._rooms: dict[str, Room] = {}  # by the viewer's address, which has a number
+        self._idle: set[web.RequestHandler] = set()  # connections on which no request has arrived yet
         self._application = web.Application(client_max_size=MOST_BODY, middlewares=[self._guarded])
         self._application.add_routes(
             [
@@ -151,8 +150,8 @@ class LivePage:
         )
 
     async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
-        """Serve until SIGTERM or SIGHUP; `listening` is called with the address that was taken.
-        Raises OSError where that cannot be had.
+        """Serve until SIGTERM or SIGHUP; call `listening` with the address taken. Raises OSError if
+        the address is not available.
         """
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -179,21 +178,21 @@ class LivePage:
                 await runner.cleanup()
 
     def _connection(self, runner: web.AppRunner) -> web.RequestHandler:
-        """A new connection, closed where no request comes in time."""
+        """A new connection; it is closed if no request arrives in time."""
         assert runner.server is not None
         connection = runner.server()
-        self._unheard.add(connection)
-        asyncio.get_running_loop().call_later(FROZEN_S, self._close_unheard, connection)
+        self._idle.add(connection)
+        asyncio.get_running_loop().call_later(FROZEN_S, self._close_idle, connection)
         return connection
 
-    def _close_unheard(self, connection: web.RequestHandler) -> None:
-        if connection in self._unheard:
-            self._unheard.remove(connection)
+    def _close_idle(self, connection: web.RequestHandler) -> None:
+        if connection in self._idle:
+            self._idle.remove(connection)
             connection.force_close()
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
-        self._unheard.discard(request.protocol)
+        self._idle.discard(request.protocol)
         if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
             return _answer(403, FOREIGN)
         try:
@@ -237,8 +236,8 @@ class LivePage:
         return _answer(200, text, kind=HTML, policy=policy)
 
     async def _status(self, _: web.Request) -> web.Response:
-        told = self._latest.summary() | {"page": self._page}
-        return _answer(200, json.dumps(told), kind="application/json")
+        shown = self._latest.summary() | {"page": self._page}
+        return _answer(200, json.dumps(shown), kind="application/json")
 
     async def _viewer_page(self, request: web.Request) -> web.Response:
         sources = f"connect-src 'self'; worker-src 'self' blob:; {INLINE} 'self' 'wasm-unsafe-eval'"
@@ -254,13 +253,13 @@ class LivePage:
         return await self._pass_on(request, self._latest.stream, STREAM, lambda answer: self._drawn(answer, page))
 
     async def _shown(self, request: web.Request) -> web.Response:
-        """Note up to when [ms] a viewer has drawn."""
+        """Note the time [ms] of the newest picture that a viewer has drawn."""
         with contextlib.suppress(KeyError, ValueError):
             self._rooms[request.headers.get("Referer", "")].shown(float(await request.read()))
         return _answer(200, "")
 
     async def _order(self, request: web.Request) -> web.Response:
-        """Hold, resume or reset; one that was sent is carried out also where the browser leaves."""
+        """Carry out hold, resume or reset, even if the browser disconnects meanwhile."""
         given = request.headers.get("X-Thirdhand-Token", "")
         if not hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode()):
             return _answer(403, "The token of the page is needed: reload it.")
@@ -280,7 +279,7 @@ class LivePage:
         path: str,
         pieces: Callable[[aiohttp.ClientResponse], AsyncIterator[bytes]],
     ) -> web.StreamResponse:
-        """The answer of another server of this machine, passed on piece by piece."""
+        """Pass on the answer of another server of this machine, piece by piece."""
         headers = {name: value for name, value in request.headers.items() if name.lower() not in _DROPPED_OF_REQUEST}
         body = await request.read()
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=TIMEOUT_S, sock_read=None if body else TIMEOUT_S)
@@ -310,7 +309,7 @@ class LivePage:
         return begun
 
     async def _drawn(self, answer: aiohttp.ClientResponse, page: str) -> AsyncIterator[bytes]:
-        """The messages of a stream, without samples that the page's viewer has no room for."""
+        """The messages of a stream, without the samples that the page's viewer has no room for."""
         room = self._rooms[page] = Room()
         try:
             while True:
@@ -343,7 +342,7 @@ def _text(name: str) -> str:
 
 
 def _other_name(host: str) -> str:
-    """The host with this machine's other name, `localhost` or 127.0.0.1."""
+    """The host under this machine's other name, `localhost` or 127.0.0.1."""
     name, _, port = host.rpartition(":")
     other = {"127.0.0.1": "localhost", "localhost": "127.0.0.1"}.get(name)
     return f"{other}:{port}" if other else host
@@ -351,8 +350,8 @@ def _other_name(host: str) -> str:
 
 @contextlib.contextmanager
 def web_viewer(program: Path, stream: str, port: int) -> Iterator[Address]:
-    """The address of Rerun's web viewer, served by its own program on a port of this machine while
-    the context lasts. Raises OSError where it does not start.
+    """The address of Rerun's web viewer, which its own program serves on a port of this machine
+    while the context lasts. Raises OSError if it does not start.
     """
     command = [str(program), "--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), stream]
     quiet = subprocess.DEVNULL

@@ -1,4 +1,4 @@
-"""`thirdhand status`: what a running daemon does, once or live."""
+"""`thirdhand status`: the status of a running daemon, once or live."""
 
 from __future__ import annotations
 
@@ -16,69 +16,75 @@ from service.cli.clients import ask
 from service.cli.usage import reached
 from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
-from service.contract.incidents import SOURCE_NAMES, in_brief
-from service.contract.records import SIDES
+from service.contract.incidents import SOURCE_NAMES, in_brief, what_happened, what_to_do, word
+from service.contract.records import SIDES, Flag
 from service.contract.requests import Source, Status
 from service.process import interrupt
 
-LOOK_S, LINE_S, SILENT_S = 0.02, 0.5, 2.0
-LATE_MS, AHEAD_MS = 1000.0, -5.0  # beyond these a sample's stamp tells of clocks
+POLL_S = 0.02
+LINE_S = 0.5  # interval of the lines of --watch
+SILENT_S = 2.0  # a daemon without a status for this time does not answer
+LATE_MS, AHEAD_MS = 1000.0, -5.0  # a sample's stamp beyond these shows that clocks differ
+NOTHING_DECIDED = "starting: nothing has been decided yet"
+STUCK = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers; with --watch 1 once it does no more."""
+    """Exit code 0 if a daemon answers; with --watch, 1 when it ends."""
     if args.watch:
         return _watch(args)
     now = msgspec.convert(ask(args, "status"), Status)
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(now)).decode())
         return 0
-    for name, text in rows(now).items():
-        print(f"{name:<11} {text}")
+    found = rows(now)
+    width = max(map(len, found))
+    for name, text in found.items():
+        print(f"{name:<{width}}  {text}")
     return 0
 
 
 def _watch(args: argparse.Namespace) -> int:
     with reached(args) as session:
-        told = heard(session, args.cell)
+        arriving = statuses(session, args.cell)
         if args.json:
-            for now in told:
+            for now in arriving:
                 print(msgspec.json.encode(now).decode(), flush=True)
         elif sys.stdout.isatty():
-            _draw(told)
+            _draw(arriving)
         else:
-            last, said = 0.0, ("", "")
-            for now in told:
-                if time.monotonic() - last >= LINE_S or (now.mode, now.reason) != said:
-                    last, said = time.monotonic(), (now.mode, now.reason)
+            last_s, outcome = 0.0, ("", "")
+            for now in arriving:
+                if time.monotonic() - last_s >= LINE_S or (now.mode, now.reason) != outcome:
+                    last_s, outcome = time.monotonic(), (now.mode, now.reason)
                     print(line(now), flush=True)
     return 1
 
 
-def heard(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
-    """The status now, and each as it comes. Raises UnreachableError once none does."""
+def statuses(session: zenoh.Session, cell: str) -> Generator[Status, None, None]:
+    """The status now, and each one that arrives. Raises UnreachableError when no more arrive."""
     key = channels.key(cell, "status")
     yield Client(session, cell).status()
     with session.declare_subscriber(key, RingChannel(1)) as subscriber:
-        heard = time.monotonic()
-        while time.monotonic() - heard < SILENT_S:
+        arrived_s = time.monotonic()
+        while time.monotonic() - arrived_s < SILENT_S:
             if (sample := subscriber.try_recv()) is None:
-                time.sleep(LOOK_S)
+                time.sleep(POLL_S)
                 continue
-            heard = time.monotonic()
+            arrived_s = time.monotonic()
             yield decoded(sample.payload.to_bytes(), Status)
-    raise UnreachableError(f"nothing comes on {key}: {why_silent(session, cell)}")
+    raise UnreachableError(f"nothing arrives on {key}: {why_silent(session, cell)}")
 
 
-def _draw(told: Iterator[Status]) -> None:
-    """Draws each status over the one before."""
-    from rich.live import Live  # most calls draw nothing
+def _draw(arriving: Iterator[Status]) -> None:
+    """Draw each status over the previous one."""
+    from rich.live import Live  # imported here because most calls draw nothing
     from rich.table import Table
     from rich.text import Text
 
     colours = {"follow": "green", "hold": "yellow", "fault": "bold red"}
-    with interrupt.clean_up_first(), Live(refresh_per_second=10) as live:  # which hides the cursor
-        for now in told:
+    with interrupt.clean_up_first(), Live(refresh_per_second=10) as live:  # it hides the cursor
+        for now in arriving:
             table = Table.grid(padding=(0, 2))
             for name, text in rows(now).items():
                 table.add_row(Text(name, style="dim"), Text(text, style=colours[now.mode] if name == "mode" else ""))
@@ -89,7 +95,7 @@ def line(now: Status) -> str:
     """A status in one line."""
     parts = [f"tick {now.tick}", in_brief(now.mode, now.reason) + "".join(f" +{flag}" for flag in now.flags)]
     if now.tick < 0:
-        return "starting: nothing has been decided yet"
+        return NOTHING_DECIDED
     parts += [f"{side} {_where(now, side)}" for side in SIDES]
     parts.append(f"tool {_at(now.tool_m)}")
     if now.target_m is not None:
@@ -102,9 +108,9 @@ def rows(now: Status) -> dict[str, str]:
     """A status as names and texts."""
     if now.tick < 0:
         return {
-            "mode": "starting: nothing has been decided yet",
+            "mode": NOTHING_DECIDED,
             "skill": now.skill,
-            "listening": ", ".join(now.endpoints) or "nowhere, it connects",
+            "listening": ", ".join(now.endpoints) or "no endpoint; it connects to others",
         }
     scribe = now.scribe
     granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
@@ -115,6 +121,7 @@ def rows(now: Status) -> dict[str, str]:
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
         "what to do": now.remedy,
+        **{flag: f"{what_happened(flag)}. What to do: {what_to_do(flag)}" for flag in now.flags if flag != STUCK},
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
         "scheduling": granted,
@@ -125,10 +132,10 @@ def rows(now: Status) -> dict[str, str]:
         "tool": _at(now.tool_m),
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
         if now.target_m is not None
-        else f"none: it needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
+        else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
         "turned": _turned(now),
-        "gripper": now.gripper + (f", {now.closure:.0%} closed is predicted" if now.closure is not None else ""),
+        "gripper": now.gripper + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
         or "none",
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
@@ -150,14 +157,14 @@ def rows(now: Status) -> dict[str, str]:
 
 
 def differing_clocks(now: Status) -> str:
-    """Whose clocks differ so much that no latency can be told, and by how much."""
-    told = []
+    """The sources whose clocks differ too much for a latency, and the differences; empty: none."""
+    found = []
     for side in SIDES:
         apart_ms = getattr(now.sources.get(side), "clock_ms", None)
         if apart_ms is not None and not AHEAD_MS <= apart_ms <= LATE_MS:
-            way = "ahead of" if apart_ms < 0 else "behind"
-            told.append(f"the {SOURCE_NAMES[side]}'s stamps are {abs(apart_ms) / 1000:.3g} s {way} this daemon's clock")
-    return ", ".join(told)
+            difference = f"{abs(apart_ms) / 1000:.3g} s {'ahead of' if apart_ms < 0 else 'behind'}"
+            found.append(f"the {SOURCE_NAMES[side]}'s stamps are {difference} the daemon's clock")
+    return ", ".join(found)
 
 
 def _at(point: tuple[float, float, float] | None) -> str:
@@ -166,33 +173,32 @@ def _at(point: tuple[float, float, float] | None) -> str:
 
 def _where(now: Status, side: str) -> str:
     source = now.sources.get(side, Source())
-    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _coming(source)
+    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _arrival(source, "not seen")
 
 
-def _coming(source: Source) -> str:
-    """How often something comes of a source and how old it is, or since when nothing does."""
+def _arrival(source: Source, missing: str) -> str:
+    """Age and rate of a source's samples, or since when they are missing."""
     is_rejected = source.rate_hz > 0 and source.cause
-    refused = f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
+    rejected = f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
     if source.fresh:
         return f"{source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
-    return ("not seen yet" if source.age_ms is None else f"not seen for {source.age_ms / 1000:.1f} s") + refused
+    return f"{missing} {'yet' if source.age_ms is None else f'for {source.age_ms / 1000:.1f} s'}{rejected}"
 
 
 def _nearest(now: Status) -> str:
     fresh = [side for side in SIDES if now.sources.get(side, Source()).fresh]
     if not fresh:
         return "no hand is seen"
-    near = f"{100 * now.hand_distance_m:.1f} cm to a hand, toward which {now.hand_limit_m_s:.2f} m/s are allowed"
+    near = f"{100 * now.hand_distance_m:.1f} cm to a hand, at most {now.hand_limit_m_s:.2f} m/s toward it"
     gone = [side for side in now.hand_age_ms if side not in fresh]
-    return near + (f"; the {gone[0]} one counts where it was last seen" if gone else "")
+    return near + (f"; the {gone[0]} hand is assumed where it was last seen" if gone else "")
 
 
 def _arm(now: Status) -> str:
     if "arm" not in now.sources:
         return "assumed, not measured"
-    return (
-        f"{_coming(now.sources['arm'])}; {'commands are heard' if now.command_heard else 'nobody listens to commands'}"
-    )
+    listener = "somebody" if now.command_heard else "nobody"
+    return f"{_arrival(now.sources['arm'], 'no joint states')}; {listener} listens to commands"
 
 
 def _off(now: Status) -> str:
@@ -204,8 +210,8 @@ def _off(now: Status) -> str:
 def _turned(now: Status) -> str:
     if now.turn_off_rad is None:
         return ""
-    sure = f" ± {math.degrees(now.turn_std_rad):.1f}°" if now.turn_std_rad is not None else ""
-    return f"{math.degrees(now.turn_off_rad):.1f}° from the target{sure}"
+    std = f" ± {math.degrees(now.turn_std_rad):.1f}°" if now.turn_std_rad is not None else ""
+    return f"{math.degrees(now.turn_off_rad):.1f}° from the target{std}"
 
 
 def _rejected(name: str, source: Source) -> str:

@@ -1,4 +1,4 @@
-"""Validation errors in words: where in the input, what was given, what would be accepted."""
+"""Validation errors in words: the place in the input, the given value, the accepted ones."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-LONGEST = 300  # characters of what others say is wrong
-MOST_PROBLEMS = 50  # told at once
-WANTED = {  # by the operating system's number of an error
+MAX_MESSAGE = 300  # characters of a message of another library
+MAX_PROBLEMS = 50  # problems that are listed at once
+NEEDED = {  # by the operating system's number of an error
     errno.EEXIST: "a folder needed, and that is something else",
     errno.ENOTDIR: "a folder needed, and that is something else",
     errno.EISDIR: "a file needed, and that is a folder",
@@ -29,31 +29,33 @@ T = TypeVar("T")
 
 
 class ExplainedError(Exception):
-    """Tells people what failed, was given and is accepted: commands print it and exit 1."""
+    """An error whose message says what failed, what was given and what is accepted. Commands print
+    the message and exit with 1.
+    """
 
 
 def in_words(error: BaseException, *, named: bool = True) -> str:
-    """An error in words, without numbers of the operating system and names of codecs: which file
-    (if `named`), what failed, and what is needed.
+    """An error in words: the file (if `named`), what failed, and what is needed; without numbers of
+    the operating system and names of codecs.
     """
     if isinstance(error, UnicodeDecodeError):
         return f"the byte 0x{error.object[error.start]:02x} is not valid; a text in UTF-8 needed"
     if not isinstance(error, OSError) or isinstance(error, ExplainedError) or error.strerror is None:
         return str(error) or type(error).__name__
-    wanted = WANTED.get(error.errno or 0, "")
+    needed = NEEDED.get(error.errno or 0, "")
     file = f"{error.filename}: " * (named and error.filename is not None)
-    return file + error.strerror + f"; {wanted}" * bool(wanted)
+    return file + error.strerror + f"; {needed}" * bool(needed)
 
 
 _PATH = re.compile(
-    r"""(?mx) (?<!\w)(?: '(?:[^'\\\n]|\\.)*' | "(?:[^"\\\n]|\\.)*" )  # a quotation stays as it is
+    r"""(?mx) (?<!\w)(?: '(?:[^'\\\n]|\\.)*' | "(?:[^"\\\n]|\\.)*" )  # quotations are left as they are
     | ^\$:[ ] | \$((?:\.\w+ | \[(?:\d+|\.\.\.)\])+)"""
 )
 
 
 def in_file(text: str) -> str:
-    """The text with each JSON path as an author of a file names the value: `$.arm.urdf` becomes
-    `[arm] urdf`, `$.points[0].left` becomes `points, entry 1, left`; the root needs no name.
+    """A text with JSON paths replaced by the names in a file: `$.arm.urdf` becomes `[arm] urdf`,
+    `$.points[0].left` becomes `points, entry 1, left`; the root has no name.
     """
     return _PATH.sub(lambda found: _named(found[1]) if found[1] else found[0].replace("$: ", ""), text)
 
@@ -69,30 +71,30 @@ def _named(path: str) -> str:
 
 
 class InvalidError(ExplainedError, ValueError):
-    """What does not pass validation: all that is wrong with it, a line each."""
+    """An invalid value; the message has one line for each problem."""
 
 
 def validated(given: Any, kind: type[T]) -> T:
-    """A struct of structs from what a file holds. Raises InvalidError with all that is wrong, in
+    """A struct of structs from the contents of a file. Raises InvalidError with all problems, in
     the words of `in_file`.
 
-    What is wrong is left out and the rest looked at again. The checks of several values come last;
-    what they say of a section in which something was left out is not told.
+    An invalid value is removed and the rest validated again. Checks of several values together come
+    last; their problems are dropped for sections from which a value was removed.
     """
-    rest, problems, doubted = copy.deepcopy(given), list[str](), set[str]()
-    while len(problems) < MOST_PROBLEMS:
+    rest, problems, incomplete = copy.deepcopy(given), list[str](), set[str]()
+    while len(problems) < MAX_PROBLEMS:
         try:
             value = msgspec.convert(rest, kind)
         except msgspec.ValidationError as error:
             lines = explained(error, rest, kind).splitlines()
             if str(error).startswith("$.") and " - at `" not in str(error):
-                problems += [line for line in lines if not any(f"$.{name}" in line for name in doubted)]
+                problems += [line for line in lines if not any(f"$.{name}" in line for name in incomplete)]
                 break
             problems += lines
-            left_out = _leave_out(rest, lines[0])
-            if not left_out:
+            section = _remove(rest, lines[0])
+            if not section:
                 break
-            doubted.add(left_out)
+            incomplete.add(section)
         else:
             if not problems:
                 return value
@@ -100,9 +102,9 @@ def validated(given: Any, kind: type[T]) -> T:
     raise InvalidError(in_file("\n".join(problems)))
 
 
-def _leave_out(given: Any, said: str) -> str:
-    """Takes away the value that an error tells of; in which section it stood, or nothing."""
-    found = re.match(r"\$(?:\.(\w+))?(?:\.(\w+))?[^:]*: (?:unknown field '(.*)'; known)?", said)
+def _remove(given: Any, problem: str) -> str:
+    """Remove the value that a problem names; return its section, or an empty text if not found."""
+    found = re.match(r"\$(?:\.(\w+))?(?:\.(\w+))?[^:]*: (?:unknown field '(.*)'; known)?", problem)
     section, name, unknown = found.groups() if found else (None, None, None)
     inner = given.get(section) if isinstance(given, dict) and section else given
     if isinstance(inner, dict) and (key := unknown or name) in inner:
@@ -122,17 +124,17 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
     message, found, path = str(error).rpartition(" - at `")
     message, path = (message, path.rstrip("`")) if found else (str(error), "$")
     if message.startswith("$"):
-        return message  # said by a check of our own, which knows better
+        return message  # from a check of our own, which names the path itself
     try:
         value, node, accepted = _at(path, given, inspect.type_info(kind))
-    except (LookupError, TypeError, AttributeError):  # a name in what was given looks like a path
+    except (LookupError, TypeError, AttributeError):  # a name in the given value looks like a path
         return f"$: {error}"
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
         known = _known(node)
         near = difflib.get_close_matches(unknown[1], known, n=1)
-        told = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(known) or 'none'}"
-        return told + (f"; did you mean {near[0]}?" if near else "")
+        problem = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(known) or 'none'}"
+        return problem + (f"; did you mean {near[0]}?" if near else "")
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
     if (
@@ -144,7 +146,7 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
             counted = "numbers" if isinstance(node, inspect.TupleType) else "given"
             return f"{path}: {len(value) or 'none'} {counted}, {needed}"
         return f"{path}: {_short(value)} given; {needed}"
-    return f"{path}: {message[:LONGEST]}"
+    return f"{path}: {message[:MAX_MESSAGE]}"
 
 
 def _known(node: inspect.StructType) -> list[str]:
@@ -152,7 +154,9 @@ def _known(node: inspect.StructType) -> list[str]:
 
 
 def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
-    """What stands at a path, the type needed there, and what the type's author says is accepted."""
+    """The value at a path, the type needed there, and the values that the type describes as
+    accepted.
+    """
     accepted = ""
     for field, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
         node = _chosen(node, value)
@@ -177,7 +181,7 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
 
 
 def _chosen(node: Any, value: Any) -> Any:
-    """The one of several tagged structs that a value says it is."""
+    """Of several tagged structs, the one that the value's tag names."""
     if isinstance(node, inspect.UnionType) and isinstance(value, dict):
         tagged = (one for one in node.types if isinstance(one, inspect.StructType) and one.tag_field)
         return next((one for one in tagged if value.get(one.tag_field) == one.tag), node)
@@ -185,7 +189,7 @@ def _chosen(node: Any, value: Any) -> Any:
 
 
 def _needed(node: Any, value: Any, accepted: str) -> str:
-    """What a type accepts, in words."""
+    """The values that a type accepts, in words."""
     if accepted:
         return f"{accepted} accepted"
     match node:
@@ -216,7 +220,7 @@ def _short(value: Any) -> str:
     try:
         text = repr(value)
     except RecursionError:
-        return "what is nested too deep"
+        return "a value that is nested too deep"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

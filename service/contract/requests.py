@@ -1,7 +1,4 @@
-"""Requests and replies as JSON: their types, checked whole, with errors that say where.
-
-And the status.
-"""
+"""Types of requests, replies and the status, as JSON; validation errors name the place."""
 
 from __future__ import annotations
 
@@ -15,9 +12,9 @@ from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
-STARTING = "starting: "  # how every answer of a daemon begins that is not ready yet
-NORM = 1e-3  # by which that of a quaternion may differ from 1
-TOLERANCE_M = 0.05  # a reference point nearer to a via-point gives way, unless said otherwise
+STARTING = "starting: "  # begins every answer of a daemon that is not ready yet
+NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
+TOLERANCE_M = 0.05  # by default, a via-point replaces reference points nearer than this
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
 Point = tuple[Metre, Metre, Metre]
 Turned = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001, extra={"accepted": "-1 to 1"})]
@@ -27,12 +24,12 @@ Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w 
 
 
 class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """With the hands there, the tool goes there. Metres, frame `base`.
+    """Positions of both hands and the tool position that belongs to them [m], frame `base`.
 
-    With a `radius` it is a flat neighbourhood: the point and its twelve neighbours, one hand
-    coordinate `radius` away each, whose tool position is the same, or moves with the hand named in
-    `follow`. With an `orientation`, a quaternion x y z w of norm 1, the tool is turned so there;
-    with a `gripper` that opens or closes there. Both hold for the neighbourhood too.
+    With a `radius`, the via-point has a flat neighbourhood: twelve neighbours, each with one hand
+    coordinate `radius` away. Their tool position is the same, or moves with the hand named in
+    `follow`. `orientation` is the tool's, a quaternion x y z w of norm 1; `gripper` opens or closes
+    the gripper there. Both apply to the neighbourhood too.
     """
 
     name: Name
@@ -46,7 +43,7 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gripper: Literal["open", "closed"] | None = None
 
     def __post_init__(self) -> None:
-        if self.orientation is not None and abs(math.hypot(*self.orientation) - 1.0) > NORM:
+        if self.orientation is not None and abs(math.hypot(*self.orientation) - 1.0) > NORM_TOLERANCE:
             norm = math.hypot(*self.orientation)
             raise ValueError(f"orientation: {list(self.orientation)} has norm {norm:.4g}; 1 needed (x y z w)")
 
@@ -56,9 +53,8 @@ class _Operation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_fi
 
 
 class Add(_Operation, frozen=True, tag="add"):
-    """Teach via-points; all or nothing; a name given again replaces.
-
-    A reference point nearer than `tolerance` [m] gives way.
+    """Teach via-points, all or none. Each replaces a via-point of the same name, and reference
+    points nearer than `tolerance` [m].
     """
 
     points: Annotated[tuple[ViaPoint, ...], msgspec.Meta(min_length=1, max_length=100)]
@@ -72,17 +68,17 @@ class Add(_Operation, frozen=True, tag="add"):
 
 
 class Remove(_Operation, frozen=True, tag="remove"):
-    """Forget via-points by name; all or nothing."""
+    """Remove via-points by name, all or none."""
 
     names: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=100)]
 
 
 class Clear(_Operation, frozen=True, tag="clear"):
-    """Forget all via-points."""
+    """Remove all via-points."""
 
 
 class List(_Operation, frozen=True, tag="list"):
-    """Tell the via-points in force."""
+    """List the via-points in force."""
 
 
 ViaPointsRequest: TypeAlias = Add | Remove | Clear | List
@@ -95,7 +91,7 @@ class SkillRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class StageRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The task has come to the via-point of this name."""
+    """State that the task has reached the via-point of this name."""
 
     name: Name
 
@@ -128,11 +124,11 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class RequestError(ExplainedError, ValueError):
-    """A request that is not understood; the message says where in it."""
+    """An invalid request; the message names the place in it."""
 
 
 def decode_request(data: bytes, kind: Any) -> Any:
-    """The request in JSON bytes, checked whole against its type.
+    """The request in JSON bytes, validated against its type.
 
     Raises RequestError like "$.points[0].left: 2 numbers, 3 needed".
     """
@@ -151,7 +147,7 @@ encode_json = msgspec.json.encode
 
 
 class Percentiles(msgspec.Struct, frozen=True):
-    """p50, p99 and maximum over the last seconds; NaN-free: 0 before the first value."""
+    """p50, p99 and maximum over the last seconds; 0 before the first value."""
 
     p50: float = 0.0
     p99: float = 0.0
@@ -159,25 +155,25 @@ class Percentiles(msgspec.Struct, frozen=True):
 
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
-    """What comes in of one hand, or of the arm."""
+    """The input of one hand, or of the arm."""
 
-    rate_hz: float = 0.0  # messages in the last second, accepted or not; of the arm, states of all its joints
-    age_ms: float | None = None  # of the newest accepted sample; None: none yet
-    fresh: bool = False  # whether that is young enough to go by
-    clock_ms: float | None = None  # stamp to arrival, median of the last second; below 0: a clock that is ahead
-    late_ms: float | None = None  # of a hand's newest 49 samples behind the quickest, mean; None: no steady clock
-    late_95_ms: float | None = None  # of 95 in 100 of them at most
-    frame: str = ""  # that the newest message names
-    rejected: dict[str, int] = {}  # samples by cause, `malformed` among them
-    cause: str = ""  # of the newest one rejected in the last second
-    refused: str = ""  # that one in words: what came, and what is accepted
-    advice: str = ""  # what to do about that one
+    rate_hz: float = 0.0  # messages in the last second, accepted or rejected; for the arm, states of all its joints
+    age_ms: float | None = None  # age of the newest accepted sample; None: none yet
+    fresh: bool = False  # True if that sample is recent enough
+    clock_ms: float | None = None  # time from stamp to arrival, median of the last second; negative: the clock is ahead
+    late_ms: float | None = None  # mean delay of a hand's newest 49 samples beyond the minimum; None: no steady clock
+    late_95_ms: float | None = None  # 95th percentile of these delays
+    frame: str = ""  # frame in the newest message
+    rejected: dict[str, int] = {}  # rejected samples by cause, `malformed` included
+    cause: str = ""  # cause of the newest rejection in the last second
+    refused: str = ""  # that rejection in words: what arrived, and what is accepted
+    advice: str = ""  # what to do about that rejection
     contested: float = 0.0  # share of the last second's samples that contradict the rest
     scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """What `<cell>/status` carries."""
+    """The status of a cell, as on `<cell>/status`."""
 
     cell: str
     mode: str
@@ -189,45 +185,45 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     realtime: bool
     memory_locked: bool
     skill: str
-    hands: Hands = "both"  # by which the skill goes
+    hands: Hands = "both"  # hands that the skill follows
     places: tuple[str, ...]
     rejected: dict[str, int]
-    received: dict[str, int] = {}  # messages that the loop took, by channel; of many in one tick the newest
+    received: dict[str, int] = {}  # messages that the loop took, by channel; at most one in a tick, the newest
     hand_age_ms: dict[str, float]
-    hand_distance_m: float  # of the nearest hand from the arm; 3 at most, and where none is seen
-    hand_limit_m_s: float  # least speed toward a hand that is allowed at some part of the arm
+    hand_distance_m: float  # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
+    hand_limit_m_s: float  # smallest speed allowed toward a hand, over all parts of the arm
     lateness_us: Percentiles
     work_us: Percentiles
-    latency_ms: Percentiles  # hand stamp to command published; tells of clocks too, where they are not one
+    latency_ms: Percentiles  # from a hand's stamp to the published command; contains the difference of clocks
     scribe: dict[str, Any]
     endpoints: tuple[str, ...]
     version: str
     because: str = ""  # the reason in words, with its figures
     remedy: str = ""  # what to do about it
-    time_ns: int = 0  # when it was made, by the daemon's clock
-    sources: dict[str, Source] = {}  # by `left`, `right` and, where it is measured, `arm`
-    frames: tuple[str, ...] = ()  # in which a hand's pose may be; empty: as the tracker's
+    time_ns: int = 0  # time of the status by the daemon's clock
+    sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
+    frames: tuple[str, ...] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
     joints: tuple[str, ...] = ()  # their names, in order
-    hands_m: dict[str, Vector3] = {}  # as estimated at this tick, frame `base`; those that are seen
-    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of where each is known
-    tool_m: Vector3 | None = None  # as commanded; None before the first tick
-    tool_measured_m: Vector3 | None = None  # by the joints that the arm told last; None: none lately
-    target_m: Vector3 | None = None  # None where a hand is not seen
+    hands_m: dict[str, Vector3] = {}  # estimated positions of the hands that were seen, frame `base`
+    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of the demonstrated box
+    tool_m: Vector3 | None = None  # commanded position; None before the first tick
+    tool_measured_m: Vector3 | None = None  # by the newest joint state; None: not recent
+    target_m: Vector3 | None = None  # None if a needed hand is not seen
     setpoint_m: Vector3 | None = None
-    std_m: float | None = None  # of the target, root mean square over the axes
-    turn_off_rad: float | None = None  # of the tool as commanded from how the target is turned, or where that points
-    turn_std_rad: float | None = None  # of how the target is turned; None: the skill did not learn it
-    gripper: str = ""  # `open` or `closed`, as commanded; empty: the skill knows of none
-    closure: float | None = None  # of the gripper as predicted, 0 to 1
-    stage: tuple[str, ...] = ()  # of the task: the via-points it comes from and goes to; empty: not known
-    stage_belief: float = 0.0  # how probable that is
-    deviation_m: float | None = None  # of the hands from what the skill knows
-    threshold_m: float = 0.0  # a greater deviation is far from the demonstrations
-    command_heard: bool = True  # whether anybody listens to `joints/command`
-    busy: str = ""  # how the daemon's machine is too busy, or was when the arm stopped; empty: it is not
+    std_m: float | None = None  # standard deviation of the target, root mean square over the axes
+    turn_off_rad: float | None = None  # angle between commanded tool and target, or between their directions
+    turn_std_rad: float | None = None  # standard deviation of the target's orientation; None: not learned
+    gripper: str = ""  # commanded, `open` or `closed`; empty: the skill has no gripper
+    closure: float | None = None  # predicted closure of the gripper, 0 to 1
+    stage: tuple[str, ...] = ()  # the via-points at which the stage begins and ends; empty: unknown
+    stage_belief: float = 0.0  # probability of that stage
+    deviation_m: float | None = None  # deviation of the hands from what the skill knows
+    threshold_m: float = 0.0  # limit of that deviation
+    command_heard: bool = True  # True if somebody subscribes to `joints/command`
+    busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """The hands that must be seen: those by which the skill goes, and any that was lately."""
-        lately = {side for side, age_ms in self.hand_age_ms.items() if age_ms < 1000 * GONE_S}
-        return tuple(side for side in SIDES if self.hands in ("both", side) or side in lately)
+        """The hands that must be seen: those that the skill follows, and any seen recently."""
+        recent = {side for side, age_ms in self.hand_age_ms.items() if age_ms < 1000 * GONE_S}
+        return tuple(side for side in SIDES if self.hands in ("both", side) or side in recent)

@@ -1,6 +1,6 @@
-"""What comes in of each hand and of the arm: rates, clocks, and what was rejected and why.
+"""The input of each hand and of the arm: rates, clocks, and rejected samples with their causes.
 
-The loop only counts; all else is found out beside it, ten times a second.
+The loop only counts samples. Everything else is computed beside it, ten times a second.
 """
 
 from __future__ import annotations
@@ -10,17 +10,8 @@ from collections import deque
 from collections.abc import Iterator
 from statistics import median
 
-from service.contract.incidents import (
-    LONGEST_NAME,
-    MALFORMED,
-    SOURCE_NAMES,
-    Evidence,
-    Incident,
-    Jump,
-    Outside,
-    explained,
-    word,
-)
+from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
+from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, word
 from service.contract.joint_states import measured
 from service.contract.messages import BASE, PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
@@ -34,25 +25,25 @@ from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
 from service.daemon.cell_streams import Arrivals
 from service.settings.config import JointSettings, Settings
 
-WINDOW_S = 1.0  # over which rates and clocks are taken
-TELL_EVERY_S = 10.0  # counts of what goes on being rejected
+WINDOW_S = 1.0  # rates and clocks are taken over this time
+COUNTS_EVERY_S = 10.0  # interval of the log lines that count further rejections
 KEYS = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
 
 
 class _History:
-    """The last second of one source, and what was logged of it."""
+    """The last second of one source, and the rejections that were logged."""
 
     def __init__(self) -> None:
         self.counts: deque[tuple[float, int]] = deque()
         self.clocks: deque[tuple[float, float]] = deque()
         self.seen: dict[str, int] = {}
         self.logged: dict[str, int] = {}
-        self.found: dict[str, Incident] = {}  # of the newest rejected, by cause
+        self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
         self.cause, self.refused_s = "", -math.inf
 
 
 class InputMonitor:
-    """Rates, clocks and rejections of the sources of one cell; for one thread."""
+    """Rates, clocks and rejections of the sources of one cell. Only one thread may use it."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -62,7 +53,7 @@ class InputMonitor:
         self._counted_s = 0.0
 
     def update(self, controller: Controller, state: Record, now_s: float) -> dict[str, Source]:
-        """Each source at this moment, by the state of this controller."""
+        """Each source at this moment, from the state of this controller."""
         return {source: self._source(source, controller, state, now_s) for source in self._histories}
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
@@ -79,7 +70,7 @@ class InputMonitor:
         rejected |= {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
             if cause == MALFORMED:
-                history.found[cause] = explained(MALFORMED, Evidence(mistake=arrivals.why))
+                history.found[cause] = explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
             else:
                 refused = intake.refused[source, Cause[cause.upper()]]
                 seen_of = evidence(refused, self._settings, arrivals)
@@ -111,13 +102,13 @@ class InputMonitor:
         )
 
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:
-        """Lines for the log: the first rejection of each kind at once, then counts."""
-        counts = now_s - self._counted_s >= TELL_EVERY_S
+        """Lines for the log: the first rejection of each cause at once, then counts."""
+        counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
             logged, found, name = self._histories[source].logged, self._histories[source].found, SOURCE_NAMES[source]
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
-                yield f"{name}: rejected as {cause}: {found[cause].why}. What to do: {found[cause].what_to_do}"
+                yield f"{name}: rejected as {cause}{in_full(*found[cause])}"
             more = {cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]}
             if counts and more:
                 logged |= now.rejected
@@ -128,7 +119,7 @@ class InputMonitor:
 
 
 def frames(settings: Settings) -> tuple[str, ...]:
-    """The frames in which a hand's pose may be; empty: none named, as the tracker's."""
+    """The names of frames that a hand's pose may have; the empty name stands for the tracker's."""
     own = settings.hands.frame
     return (BASE, "") if own in ("", BASE) else (BASE, own, "")
 
@@ -137,7 +128,7 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
-    seen = Evidence(sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
+    seen = Evidence(settings=settings, sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
     if isinstance(sample, PoseStamped):
         mistake = too_far(sample.position, settings.hands.unit) if cause is Cause.OUT_OF_RANGE else ""
         return seen._replace(mistake=mistake)
@@ -160,13 +151,13 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
 
 
 def _turned(leap: Jump, kind: str) -> float:
-    """Distance that a joint moved, for a continuous joint without whole turns."""
+    """Distance between two positions of a joint; a continuous joint's without whole turns."""
     far = leap.after - leap.before
     return math.remainder(far, 2.0 * math.pi) if kind == "continuous" else far
 
 
 def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]) -> Iterator[Outside]:
-    """Measured values that are outside of what is accepted."""
+    """Measured values outside the accepted ranges."""
     of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
     for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
         low, high = lower - MAX_OUTSIDE_RAD * per_rad, upper + MAX_OUTSIDE_RAD * per_rad

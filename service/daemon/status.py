@@ -1,4 +1,4 @@
-"""The status of a cell: what its newest frame decided, and why, in words with their figures."""
+"""The status of a cell: what its newest frame decided, and why, in words with figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.contract.incidents import MALFORMED, Evidence, Inside, Outside, Stuck, explained, word
+from service.contract.evidence import Evidence, Inside, Outside, Stuck, explained
+from service.contract.incidents import MALFORMED, word
 from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES, Flag, Mode, Reason
 from service.contract.requests import Source, Status
@@ -24,13 +25,13 @@ from service.core.skill.pose import CLOSED, OPEN
 from service.daemon.input_monitor import KEYS, frames
 from service.settings.config import Settings
 
-OLDEST_S = 0.2  # of the measured joints
-AT_LIMIT_RAD = 0.02  # so near to its limit a joint is at the end of its way
+OLDEST_S = 0.2  # the tool is measured by joint states up to this age
+AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
 
 
 class CellStatus(NamedTuple):
-    """What a status tells of: the newest frame, the controller that made it and its state, what
-    comes in, and what of the service failed last.
+    """The newest frame, the controller and its state, the sources of input, and the last failure of
+    the service, from which a status is made.
     """
 
     frame: Frame
@@ -39,11 +40,11 @@ class CellStatus(NamedTuple):
     sources: dict[str, Source]
     settings: Settings
     failure: str = ""
-    inside: Inside | None = None  # of an arm that is not ready
-    busy: str = ""  # how this machine was too busy when the arm stopped
+    inside: Inside | None = None  # what an arm that is not ready is inside of
+    busy: str = ""  # signs of a busy machine when the arm stopped
 
     def status(self, **more: Any) -> Status:
-        """The status; `more` are the fields that the core knows nothing of."""
+        """The status; `more` are the fields that the core does not know."""
         frame, sources, settings = self.frame, self.sources, self.settings
         begun, seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
         skill, (mode, reason) = self.controller.skill, outcome(frame)
@@ -88,18 +89,19 @@ class CellStatus(NamedTuple):
         )
 
     def _turned(self) -> float:
-        """By how much the tool is turned from its target, or points elsewhere [rad]."""
+        """Angle between the tool and its target, or between their directions [rad]."""
         tool, target = self.frame["tool_orientation"], self.frame["orientation"]
         return round(float(off_target(tool, target, direction=self.settings.tool.orientation == "direction")), 5)
 
     def evidence(self) -> Evidence:
-        """The figures of what there is to say."""
+        """The figures of the incidents that may be explained."""
         settings, skill, (error_rad, speed) = self.settings, self.controller.skill, self.controller.decision.measured
         errors = np.abs(self.frame["joints"] - self.state["measured"])
         worst = int((errors / np.array(settings.joints.per_rad)).argmax())
         limit = settings.tool.fault_speed
         return Evidence(
-            sources={name: source for name, source in self.sources.items() if not self._spare(name, source)},
+            sources={name: source for name, source in self.sources.items() if not self._is_unneeded(name, source)},
+            settings=settings,
             contested=CONTESTED_OFF_SHARE,
             scatter_mm=1e3 * SCATTER_ON_M,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
@@ -112,27 +114,25 @@ class CellStatus(NamedTuple):
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
-            silent_ms=settings.arm.silent_ms,
-            stale_ms=settings.hands.stale_ms,
             busy=self.busy,
         )
 
-    def _spare(self, name: str, source: Source) -> bool:
-        """Whether that is a hand which the skill does without, and which was not seen lately."""
+    def _is_unneeded(self, name: str, source: Source) -> bool:
+        """True for a hand that the skill does not need, and that has disappeared."""
         side, gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
         return side is not None and name in SIDES and name != SIDES[side] and gone
 
     def _outside(self) -> Outside | None:
-        """The first joint that is moved back into its limits."""
+        """The first joint outside its limits, if the arm moves back into them."""
         joints, measured = self.settings.joints, self.state["measured"].tolist()
         found = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
         returning = int(self.state["arm_ready"]) == RETURNING
         return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
 
     def _stuck(self) -> Stuck:
-        """What keeps the tool from its target, and the way out."""
+        """Joints that keep the tool from its target, and the way out."""
         joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
-        ends = [
+        at_limits = [
             name
             for name, at, low, high, per_rad in zip(
                 joints.names, q, joints.lower, joints.upper, joints.per_rad, strict=True
@@ -141,19 +141,19 @@ class CellStatus(NamedTuple):
         ]
         off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
         count = int(state["way_count"])
-        return Stuck(off_m, tuple(ends), min(int(state["way_next"]) + 1, count), count)
+        return Stuck(off_m, tuple(at_limits), min(int(state["way_next"]) + 1, count), count)
 
 
 class MeasuredArm:
-    """Where the joints measured last put the arm."""
+    """The arm at the joints measured last."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
         self._period_s, self._names = settings.period_s, settings.joints.names
-        # not the loop's, which work at the same time
+        # objects of its own: those of the loop are in use at the same time
         self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
 
     def inside(self, state: Record) -> Inside | None:
-        """What an arm that is not ready stands in."""
+        """What an arm that is not ready is inside of; None: nothing."""
         if state["arm_ready"] == READY or state["arm_tick"] < 0:
             return None
         depth_m, joint, thing = self._separation.intrusion(state["measured"].copy())
@@ -163,7 +163,7 @@ class MeasuredArm:
         return Inside(self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m)
 
     def position(self, state: Record) -> Vector3 | None:
-        """The tool's position [m] in frame `base`; None where no joints were measured lately."""
+        """The tool's position [m] in frame `base`; None if joint states are older than that."""
         if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= OLDEST_S:
             return None
         return _point(self._arm.at(state["measured"].copy()).position)
@@ -175,7 +175,7 @@ def outcome(frame: Frame) -> tuple[Mode, Reason]:
 
 
 def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
-    """What was rejected of all sources, by cause; what was malformed by its key."""
+    """Rejected samples of all sources by cause; malformed ones by their key too."""
     counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():

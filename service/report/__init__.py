@@ -1,1 +1,1 @@
-"""What a recording tells: spans, faults, approaches, visits; as text, tables and a page."""
+"""Reports on recordings: spans, faults, approaches, visits; as text, tables and a page."""

@@ -1,4 +1,4 @@
-"""Why it held or was at fault, as the status of that time said, and what was going on before."""
+"""Why the arm held or was at fault, as the status reported at that time, and what preceded it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from service.contract.incidents import SOURCE_NAMES, Evidence, Incident, explained, word
+from service.contract.evidence import Evidence, Explanation, explained
+from service.contract.incidents import ORDERS, SOURCE_NAMES, word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 from service.report.columns import Columns
 
-BEFORE_S = 1.0  # that is looked at
-LATE_US = 1000.0  # a tick that began later is told of
+BEFORE_S = 1.0  # what happened in this time before a fault is listed
+LATE_US = 1000.0  # a tick that began later than this is listed
 
 
-def why(columns: Columns, begin: int, end: int) -> tuple[str, str]:
-    """Why frames [begin, end) were of their mode and reason, and what was to be done: as the first
-    status among them said; where none was recorded, by what the first frame holds.
+def why(columns: Columns, begin: int, end: int) -> Explanation:
+    """Reason of frames [begin, end) in words, and what to do: from the first status among them, or,
+    if none was recorded, from the first frame.
     """
     frame, last = columns.frames[begin], int(columns.frames["tick"][end - 1])
     named = word(Mode(int(frame["mode"]))), word(Reason(int(frame["reason"])))
@@ -27,21 +28,22 @@ def why(columns: Columns, begin: int, end: int) -> tuple[str, str]:
     first = bisect.bisect_left(columns.statuses, int(frame["tick"]), key=lambda said: said.tick)
     for said in itertools.takewhile(lambda said: said.tick <= last, columns.statuses[first:]):
         if (said.mode, said.reason) == named:
-            return said.because or found.why, said.remedy
-    return found.why, found.what_to_do
+            return Explanation(said.because or found.why, said.remedy)
+    return found
 
 
-def _by_frame(columns: Columns, row: int) -> Incident:
+def _by_frame(columns: Columns, row: int) -> Explanation:
     frame = columns.frames[row]
-    tick, stale_ms = int(frame["tick"]), columns.recording.settings.hands.stale_ms
+    tick, settings = int(frame["tick"]), columns.recording.settings
     ages_ms = [None if age < 0 else age * columns.period_s * 1e3 for age in frame["hand_ages"].tolist()]
     sources = {
-        side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < stale_ms)
+        side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < settings.hands.stale_ms)
         for side, age_ms in zip(SIDES, ages_ms, strict=True)
     }
     skill = next((one.skill for one in reversed(columns.skills) if one.tick <= tick), None)
     seen = Evidence(
         sources=sources,
+        settings=settings,
         gate_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
         measure="" if skill is None else skill.model.measure,
         failure=next((one.text for one in reversed(columns.orders) if one.kind == "fault" and one.tick <= tick), ""),
@@ -50,9 +52,9 @@ def _by_frame(columns: Columns, row: int) -> Incident:
 
 
 def before(columns: Columns, begin: int) -> Iterator[str]:
-    """Sentences on what was going on before frame `begin`."""
+    """Sentences on what preceded frame `begin`."""
     if begin == 0:
-        yield "it was so already when the recording began"
+        yield "the fault is older than the recording"
         return
     yield _was_doing(columns, begin)
     frames, tick = columns.frames, int(columns.frames["tick"][begin])
@@ -66,15 +68,15 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
     if len(timing):
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
         if missed or late_us >= LATE_US:
-            yield f"in the second before {missed} deadlines were missed, and a tick was {late_us / 1e3:.1f} ms late"
+            yield f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} ms late"
     for one in columns.orders:
         ago_s = (tick - one.tick) * columns.period_s
         if one.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
-            yield f"`{one.kind}` was asked for{f' {ago_s:.2f} s before' if ago_s > 0.005 else ''}"
+            yield f"{f'{ago_s:.2f} s before: ' if ago_s > 0.005 else ''}{ORDERS[one.kind]}"
 
 
 def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, str]]:
-    """The source, the cause and the words of what statuses between two ticks called rejected, the
+    """Source, cause and description of the rejected samples in the statuses between two ticks, the
     newest of each source and cause.
     """
     said = [one for one in columns.statuses if first <= one.tick <= last]

@@ -1,6 +1,4 @@
-"""A recording as columns: what its ticks decided, how long they took, and what else happened, for
-looking at the whole of it.
-"""
+"""A recording as columns: decisions and durations of its ticks, requests, skills and statuses."""
 
 from __future__ import annotations
 
@@ -17,6 +15,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from service.contract import cdr
+from service.contract.incidents import ORDERS
 from service.contract.printable import printable, printable_values
 from service.contract.requests import Source
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
@@ -30,12 +29,11 @@ KEPT = (
     *("joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages", "rejected"),
     *("mode", "reason", "flags", "commanded", "stage", "stage_belief"),
 )
-BLOCK = 4096  # ticks that are held whole
-ORDERS = ("hold", "resume", "reset", "fault")
+BLOCK = 4096  # ticks whose whole frames are held in memory
 
 
 class Order(NamedTuple):
-    """Something that was asked for, or that failed, at a tick: its kind and its text."""
+    """A request of the operator, or a failure of the service, at a tick: its kind and its text."""
 
     tick: int
     kind: str
@@ -43,7 +41,7 @@ class Order(NamedTuple):
 
 
 class InForce(NamedTuple):
-    """A skill, and the tick from which it was in force."""
+    """A skill, and the first tick at which it was in force."""
 
     tick: int
     skill: Skill
@@ -76,8 +74,8 @@ class Columns:
     orders: list[Order] = field(default_factory=list)
     skills: list[InForce] = field(default_factory=list)
     statuses: list[Said] = field(default_factory=list)
-    samples: Counter[str] = field(default_factory=Counter)  # that came, by kind
-    remarks: list[str] = field(default_factory=list)  # on what could not be read
+    samples: Counter[str] = field(default_factory=Counter)  # events by kind
+    remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
 
     @property
     def period_s(self) -> float:
@@ -85,7 +83,7 @@ class Columns:
         return self.recording.settings.period_s
 
     def seconds(self, tick: int) -> float:
-        """Time of a tick since the first that is there [s]."""
+        """Time of a tick since the first recorded one [s]."""
         return (tick - int(self.frames["tick"][0])) * self.period_s if len(self.frames) else 0.0
 
     @property
@@ -96,7 +94,7 @@ class Columns:
 
 
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
-    """The columns of a recording. Raises RecordingError on what is not understood."""
+    """The columns of a recording. Raises RecordingError if it cannot be read."""
     found, last, gaps = Columns(recording), None, list[Gap]()
     layout = frame_layout(len(recording.settings.joints.names))
     blocks: list[Records] = []
@@ -135,14 +133,14 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
 
 
 def _take_events(found: Columns, step: Step) -> None:
-    """Counts what came, and keeps requests and skills."""
+    """Count the events of a step; keep its requests and skills."""
     if step.skill:
         _take_skill(found, step.skill, step.tick)
     for kind, payload in step.events:
         found.samples[kind] += 1
         if kind == "skill":
             _take_skill(found, payload, step.tick)
-        elif kind in ORDERS:
+        elif kind in ORDERS or kind == "fault":
             found.orders.append(Order(step.tick, kind, printable(cdr.decode_string(payload))))
 
 
@@ -150,14 +148,14 @@ def _take_skill(found: Columns, file: bytes, tick: int) -> None:
     try:
         skill = decoded(file, origin=found.recording.path.name, recorded=True)
     except SkillError as error:
-        found.remarks.append(f"a skill is not understood, its places are not told: {error}")
+        found.remarks.append(f"a skill cannot be read, so its via-points are not listed: {error}")
         return
     if not found.skills or skill.digest != found.skills[-1].skill.digest:
         found.skills.append(InForce(tick, skill))
 
 
 def runs(values: NDArray[Any]) -> list[tuple[int, int]]:
-    """Begin and end (behind the last) of each run of equal values in a row."""
+    """Begin and end (exclusive) of each run of equal successive values."""
     if not len(values):
         return []
     edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]

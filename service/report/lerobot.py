@@ -26,10 +26,10 @@ Episode = dict[str, NDArray[np.float32 | np.int64]]
 
 
 def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
-    """Each part of a recording without a gap in which commands went out and both hands had been
-    seen: the `FEATURES` by name, a row each 1/fps s, of the newest tick then.
+    """The parts of a recording without gaps in which commands were sent and both hands had been
+    seen: the `FEATURES` by name, a row every 1/fps s, from the newest tick.
 
-    Joints are those that the arm told last; before it told any, the command before.
+    Joints are those of the newest joint state; before the first one, the previous command.
     """
     joint_settings = found.recording.settings.joints
     frames, names = found.frames, joint_settings.names
@@ -53,9 +53,9 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
 
 
 def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:
-    """Writes a data set of one task to a new folder; its numbers of episodes and of rows.
+    """Write a data set of one task to a new folder; return the numbers of episodes and rows.
 
-    Raises ExplainedError where arms differ, and where there is no episode.
+    Raises ExplainedError if arms differ, or if there is no episode.
     """
     parts = [part for one in recordings for part in episodes(one, fps=fps)]
     told = [(one.recording.urdf, one.recording.settings.joints.names) for one in recordings]

@@ -1,4 +1,4 @@
-"""A report as one page with plots in it: nothing is fetched, so it can be kept and sent."""
+"""A report as one page with plots; it fetches nothing, so it can be stored and sent."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, p
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
 LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
-WIDE = 0.011  # of the width of a plot has a letter
-POINTS = 1500  # of a curve at most, the least and the greatest of each stretch
-LEAST_US, LEAST_MM = 10.0, 0.1  # less is not shown
-MOST = 99.5  # per cent of the values that an axis holds; the rest is cut off, and said
-TINT = 0.08  # of what a plot shows where the arm does not follow: palette.PAPER
+LETTER_SHARE = 0.011  # width of a letter / width of a plot
+POINTS = 1500  # most points of a curve
+LEAST_US, LEAST_MM = 10.0, 0.1  # smaller values are not shown
+SHOWN_PERCENT = 99.5  # an axis holds this share of the values; a note tells of the rest
+TINT = 0.08  # opacity of the background where the arm does not follow; gives palette.PAPER
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fff; max-width: 62rem;
        margin: 2rem auto; padding: 0 1rem }
@@ -40,7 +40,7 @@ svg { max-width: 100%; height: auto } p { margin: .3rem 0 }
 """
 
 
-@mpl.rc_context({"text.parse_math": False})  # a name with dollar signs is no formula
+@mpl.rc_context({"text.parse_math": False})  # names with dollar signs are not formulas
 def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda count: None) -> str:
     """The page as HTML."""
     names = names_of(reports)
@@ -76,7 +76,7 @@ def _table(table: Table) -> str:
 
 
 def _svg(figure: Figure, salt: str) -> str:
-    """The figure as an element of the page; `salt` keeps its names apart from another's."""
+    """The figure as an element of the page; `salt` makes its identifiers unique."""
     text = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
@@ -85,7 +85,7 @@ def _svg(figure: Figure, salt: str) -> str:
 
 
 def _over_time(report: Report) -> Figure:
-    """What changes with the time, one above the other: modes, distances, errors, speeds, timing."""
+    """Modes, distances, errors, speeds and timing over time, one above the other."""
     frames, times, timing = report.columns.frames, report.columns.times, report.columns.timing
     rows = 5 if len(timing) else 4
     figure = Figure(figsize=(10.5, 2 * rows), layout="constrained")
@@ -97,7 +97,7 @@ def _over_time(report: Report) -> Figure:
         if span.mode is not Mode.FOLLOW:
             for axes in others:
                 axes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, alpha=TINT, lw=0)
-        if span.lasts_s > WIDE * max(map(len, span.doing.split(": "))) * report.lasts_s:
+        if span.lasts_s > LETTER_SHARE * max(map(len, span.doing.split(": "))) * report.lasts_s:
             modes.text(span.start_s + span.lasts_s / 2, 0.5, span.doing.replace(": ", "\n"), ha="center", va="center",
                        color="white", fontsize=8)  # fmt: skip
     modes.set(yticks=[], ylim=(0, 1), xlim=(0, max(report.lasts_s, 1e-3)))
@@ -178,16 +178,16 @@ def _path(axes: Any, points: Vector, colour: str, label: str) -> None:
 
 
 def _bounded(axes: Any, values: Vector) -> None:
-    """Lets a few outliers not flatten the rest."""
-    usual, largest = np.percentile(values, MOST), values.max(initial=0.0)
+    """Limit the axis, so that a few outliers do not flatten the rest."""
+    usual, largest = np.percentile(values, SHOWN_PERCENT), values.max(initial=0.0)
     if largest > 2 * usual > 0:
         axes.set_ylim(0, 1.2 * usual)
         axes.set_title(f"up to {largest:.1f}, cut off", fontsize=8, loc="right")
 
 
 def thinned(x: Vector, y: Vector, *, points: int = POINTS) -> tuple[Vector, Vector]:
-    """The same curve for the eye, of at most so many points: of each stretch its least and its
-    greatest value, in their order. Stretches without values are gaps.
+    """The curve with at most this number of points: the least and greatest value of each interval,
+    in their order. Intervals without values are gaps.
     """
     if len(x) <= points:
         return x, y

@@ -1,5 +1,5 @@
-"""What a recording tells: how long, what it lacks, what the service did and why, how promptly, how
-near to people, how well places were met, and which limits were touched.
+"""The report on a recording: gaps, modes with their reasons, timing, distance from people, accuracy
+at via-points, and limits that were active.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from service.report.stages import stages
 from service.report.visits import places
 
 SHARES = (50, 99, 100)
-REACHED_MM = 20.0  # the tool has reached its first target once it is this near
+REACHED_MM = 20.0  # a tool this near has reached its first target
 
 
 class Span(NamedTuple):
-    """What the service did for a while, since the first tick [s]; unless it followed, why and what
-    was to be done; of a fault also what was before it, and how it ended.
+    """A time in one mode, since the first tick [s]. For a hold or a fault: why, and what to do; for
+    a fault also what preceded it, and how it ended.
     """
 
     start_s: float
@@ -41,17 +41,17 @@ class Span(NamedTuple):
 
     @property
     def end_s(self) -> float:
-        """When it was over [s]."""
+        """End of the span [s]."""
         return self.start_s + self.lasts_s
 
     @property
     def doing(self) -> str:
-        """In one word or two."""
+        """Mode and reason as one term."""
         return ": ".join(filter(None, (word(self.mode), word(self.reason))))
 
 
 class Percentiles(NamedTuple):
-    """Median, 99th percentile and largest of some values, which there are so many of."""
+    """Median, 99th percentile, largest and number of some values."""
 
     p50: float
     p99: float
@@ -60,7 +60,7 @@ class Percentiles(NamedTuple):
 
     @classmethod
     def of(cls, values: Vector) -> Percentiles | None:
-        """None where there are no values."""
+        """The percentiles of values; None without any."""
         if not len(values):
             return None
         p50, p99, largest = np.percentile(values, SHARES).tolist()
@@ -68,8 +68,8 @@ class Percentiles(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """The least distance between the arm and a hand [m], when [s], what the service did then, and
-    the speed toward the hand that was allowed [m/s].
+    """The least distance between the arm and a hand [m], its time [s], mode and reason then, and
+    the allowed speed toward the hand [m/s].
     """
 
     distance_m: float
@@ -79,7 +79,7 @@ class Approach(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A limit that was touched: for how long and how often, and when first [s]."""
+    """A limit that was active: its duration, number of times, and first time [s]."""
 
     name: str
     lasts_s: float
@@ -100,7 +100,7 @@ class Joint(NamedTuple):
 
 
 class Rejection(NamedTuple):
-    """Samples rejected for one cause, and when first [s]."""
+    """Number of samples rejected for one cause, and the first time [s]."""
 
     cause: str
     samples: int
@@ -108,7 +108,7 @@ class Rejection(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """One number of a report, to be set beside another's."""
+    """A number of a report, for comparison with another report."""
 
     name: str
     value: float | None
@@ -117,7 +117,7 @@ class Figure(NamedTuple):
 
 
 class Report:
-    """What one recording tells. `columns` is what it is made of."""
+    """The report on one recording, made from its `columns`."""
 
     def __init__(self, columns: Columns) -> None:
         recording, frames, timing = columns.recording, columns.frames, columns.timing
@@ -130,7 +130,7 @@ class Report:
         self.begins = begins if len(frames) else "never: it holds no tick"  # by the system clock
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
         self.lasts_s = lasts_s
-        self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, what is not understood
+        self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))
         self.rate_hz = (len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0
         self.missed = int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0
@@ -139,9 +139,9 @@ class Report:
         self.latency_ms = Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0)
         lag_mm = 1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)
         reached = int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
-        self.initial_mm = Percentiles.of(lag_mm[:reached])  # to its target, before it reached the first
+        self.initial_mm = Percentiles.of(lag_mm[:reached])  # tool to target, before it reached the first target
         self.initial_s = reached * columns.period_s
-        self.lag_mm = Percentiles.of(lag_mm[reached:])  # ... and from then on, while it follows
+        self.lag_mm = Percentiles.of(lag_mm[reached:])  # tool to target afterwards, while it follows
         self.approach = _approach(columns, self.spans)
         self.places = tuple(places(columns))
         self.stages = tuple(stages(columns))
@@ -150,7 +150,7 @@ class Report:
         self.rejections = tuple(_rejections(columns))
         stale_ticks = recording.settings.hands.stale_ms / 1000 / columns.period_s
         seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] <= stale_ticks)
-        seen_s = np.maximum(seen.sum(axis=0), 1) * columns.period_s  # of each hand; a rate is of this time
+        seen_s = np.maximum(seen.sum(axis=0), 1) * columns.period_s  # time in which each hand was seen
         self.hands_hz = {side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)}
 
     @property
@@ -159,15 +159,15 @@ class Report:
         return tuple(span for span in self.spans if span.mode is Mode.FAULT)
 
     def seconds(self, mode: Mode, reason: Reason | None = None) -> float:
-        """How long it was in a mode [s], for one reason or for any."""
+        """Time in a mode [s], for one reason or for any."""
         return sum(s.lasts_s for s in self.spans if s.mode is mode and reason in (None, s.reason))
 
     def best_m(self, name: str) -> float | None:
-        """The tool's least distance from a place, however often taught [m]; None: no visit."""
+        """The tool's least distance from a via-point of this name [m]; None without a visit."""
         return min((p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None)
 
     def figures(self) -> Iterator[Figure]:
-        """The numbers by which two recordings are compared."""
+        """The numbers for a comparison of recordings."""
         yield Figure("duration", self.lasts_s, "s", 1)
         yield Figure("missing or damaged", len(self.lacks), "times", 0)
         yield Figure("follow", self.seconds(Mode.FOLLOW), "s", 1)
@@ -199,12 +199,12 @@ class Report:
 
 
 def reported(path: str | Path, *, progress: Callable[[int], None] = lambda ticks: None) -> Report:
-    """What the recording in a file tells. Raises RecordingError."""
+    """The report on the recording in a file. Raises RecordingError."""
     return Report(read(Recording.open(path), progress=progress))
 
 
 def _spans(columns: Columns) -> Iterator[Span]:
-    """What it did, one after the other."""
+    """The times in one mode and reason, in order."""
     frames, times, period_s = columns.frames, columns.times, columns.period_s
     pieces = np.zeros(len(frames), np.int64)
     pieces[columns.breaks] = 1
@@ -222,12 +222,12 @@ def _ended(columns: Columns, fault: Span) -> str:
     if fault.end_s > columns.times[-1]:
         return "not ended in this recording"
     resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
-    by = "a `reset`" if any(abs(at - fault.end_s) < 0.1 for at in resets) else "what is not recorded"
+    by = "a `reset`" if any(abs(at - fault.end_s) < 0.1 for at in resets) else "a cause that is not recorded"
     return f"ended by {by} after {fault.lasts_s:.1f} s"
 
 
 def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
-    """Where a hand was seen, the nearest that it came to the arm."""
+    """The closest approach of a hand that was seen; None without any."""
     frames = columns.frames
     newest = frames["hand_ages"].min(axis=1, where=frames["hand_ages"] >= 0, initial=2**31 - 1)
     known = np.flatnonzero(newest * 1000 * columns.period_s <= columns.recording.settings.hands.stale_ms)
@@ -269,16 +269,14 @@ def _rejections(columns: Columns) -> Iterator[Rejection]:
 
 
 def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]:
-    """Names and values of the settings, and of the versions and machine, that two recordings do
-    not share.
-    """
+    """Names and values of the settings, versions and machine that differ between two recordings."""
     a, b = (
         _flat(msgspec.to_builtins(r.columns.recording.settings), "")
         | {f"made with {name}": value for name, value in r.columns.recording.metadata.items()}
         | {"skill": r.skill}
         for r in (one, other)
     )
-    values = ((name, a.get(name, "not told"), b.get(name, "not told")) for name in sorted({*a, *b}))
+    values = ((name, a.get(name, "unknown"), b.get(name, "unknown")) for name in sorted({*a, *b}))
     return [found for found in values if found[1] != found[2]]
 
 
@@ -290,8 +288,8 @@ def _flat(value: Any, path: str) -> dict[str, Any]:
 
 
 def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end_s: float) -> str:
-    """In one sentence, what kept the tool from a place between two times [s] since `begun_s` of the
-    recording, since which times are told.
+    """A sentence on what kept the tool from a via-point between two times [s], which count from
+    `begun_s` of the recording.
     """
     begin_s, until_s = begun_s + start_s, begun_s + end_s
     stops = [s for s in found.spans if s.mode is not Mode.FOLLOW and s.start_s < until_s and s.end_s > begin_s]
@@ -304,5 +302,5 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     if not hands_m:
         return f"no place {place!r} was taught"
     if best := found.best_m(place):
-        return f"with the hands where {place!r} was taught, the tool came only within {1000 * best:.0f} mm of it"
-    return f"the hands came only within {100 * min(hands_m):.0f} cm of where {place!r} was taught"
+        return f"with the hands where {place!r} was taught, the tool came no nearer than {1000 * best:.0f} mm"
+    return f"the hands came no nearer than {100 * min(hands_m):.0f} cm to where {place!r} was taught"

@@ -1,4 +1,4 @@
-"""Which stages of its task a session went through, as the service believed then."""
+"""The most probable stages of the task during a session."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from service.core.skill.stages import MOST_STAGES
 from service.report.columns import Columns, runs
 
-LEAST_S = 0.3  # a belief that changes for less has hesitated: it is told with the stage around it
+LEAST_S = 0.3  # a shorter stage is taken for hesitation, and merged with the one before
 
 
 class Stage(NamedTuple):
-    """A stage from one via-point to the next: since the first tick, and how long [s]; how probable
-    it was in the middle of that time (the median).
+    """A stage from one via-point to the next: start since the first tick and duration [s], and the
+    median of its probability.
     """
 
     start_s: float
@@ -25,12 +25,12 @@ class Stage(NamedTuple):
 
     @property
     def name(self) -> str:
-        """From where to where."""
+        """The via-points at which the stage begins and ends."""
         return f"{self.begins} to {self.ends}"
 
 
 def stages(columns: Columns) -> list[Stage]:
-    """The stages, one after the other; none where the skill has no via-points."""
+    """The stages, in order; none if the skill has no via-points."""
     frames, times, found = columns.frames, columns.times, list[Stage]()
     numbers = np.where(frames["stage_belief"] > 0, frames["stage"], -1)
     in_force = np.searchsorted([one.tick for one in columns.skills], frames["tick"], side="right") - 1

@@ -1,4 +1,4 @@
-"""A report as tables: what the terminal, the page and the CSV files all show."""
+"""A report as tables, for the terminal, the page and CSV files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from service.contract.incidents import remedy, word
+from service.contract.incidents import what_happened, what_to_do, word
 from service.contract.printable import printable
 from service.contract.records import Mode
 from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
@@ -16,8 +16,8 @@ NOTHING_MISSING = "Nothing is missing in it."
 
 
 class Table(NamedTuple):
-    """A table: its name in files, its title, the heads of its columns, units in brackets, and rows
-    of texts. From column `numbers` on these are numbers; 0: those with units are.
+    """A table: its name in files, its title, the heads of its columns with units in brackets, and
+    rows of texts. Columns from `numbers` on hold numbers; with 0, those with a unit do.
     """
 
     name: str
@@ -27,43 +27,43 @@ class Table(NamedTuple):
     numbers: int = 1
 
     def is_number(self, column: int) -> bool:
-        """Whether a column holds numbers."""
+        """True if a column holds numbers."""
         return column >= self.numbers if self.numbers else self.heads[column].endswith("]")
 
 
 def tables(report: Report) -> Iterator[Table]:
-    """The tables of one report; those with nothing to tell are left out."""
+    """The tables of one report; empty ones are left out."""
     return (table for table in _tables(report) if table.rows)
 
 
 def _tables(report: Report) -> Iterator[Table]:
-    yield Table("missing", "What is missing in the recording", ("what",), tuple((line,) for line in report.lacks))
+    yield Table("missing", "Missing in the recording", ("what",), tuple((line,) for line in report.lacks))
     spans = tuple((_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans)
-    yield Table("modes", "What it did", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0)
+    yield Table("modes", "Modes of the arm", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0)
     yield Table(
         "faults",
-        "Faults, and what led to them",
-        ("at [s]", "reason", "what led to it, and what to do"),
+        "Faults",
+        ("at [s]", "reason", "what happened, what preceded it, and what to do"),
         tuple(_fault(fault) for fault in report.faults),
         numbers=0,
     )
     yield Table(
         "stages",
         "Stages of the task",
-        ("from [s]", "for [s]", "stage", "how probable [%]"),
+        ("from [s]", "for [s]", "stage", "probability [%]"),
         tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.stages),
         numbers=0,
     )
     yield Table(
         "places",
-        "Taught places",
+        "Taught via-points",
         (
-            "place",
+            "via-point",
             "taught at [s]",
-            "hands came within [cm]",
+            "hands, nearest [cm]",
             "visits",
-            "tool came within [mm]",
-            "at the end of each [mm]",
+            "tool, nearest [mm]",
+            "at the end of each visit [mm]",
         ),
         tuple(
             (
@@ -79,8 +79,8 @@ def _tables(report: Report) -> Iterator[Table]:
     )
     yield Table(
         "times",
-        "Promptness",
-        ("what", "median", "99 %", "largest", "unit", "of"),
+        "Timing and accuracy",
+        ("what", "median", "99 %", "largest", "unit", "values"),
         tuple(
             (name, *(f"{value:.{digits}f}" for value in found[:3]), unit, str(found.samples))
             for name, found, unit, digits in _times(report)
@@ -92,20 +92,24 @@ def _tables(report: Report) -> Iterator[Table]:
         yield Table(
             "approach",
             "Closest approach of the arm to a hand",
-            ("distance [cm]", "at [s]", "then", "allowed toward it [m/s]"),
+            ("distance [cm]", "at [s]", "mode then", "allowed speed toward it [m/s]"),
             ((f"{100 * near.distance_m:.1f}", _s(near.at_s), near.doing, f"{near.allowed_m_s:.2f}"),),
             numbers=0,
         )
     yield Table(
         "limits",
-        "Limits that were touched",
-        ("limit", "for [s]", "times", "first at [s]"),
-        tuple((limit.name, _s(limit.lasts_s), str(limit.times), _s(limit.first_s)) for limit in report.limits),
+        "Active limits",
+        ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
+        tuple(
+            (one.name, _s(one.lasts_s), str(one.times), _s(one.first_s), what_happened(one.name))
+            for one in report.limits
+        ),
+        numbers=0,
     )
     yield Table(
         "joints",
-        "Joints, at most",
-        ("joint", "from a limit [rad]", "of its speed [%]", "of its acceleration [%]"),
+        "Use of the joints' limits",
+        ("joint", "least distance from a limit [rad]", "of its speed limit [%]", "of its acceleration limit [%]"),
         tuple(
             (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
         ),
@@ -114,16 +118,16 @@ def _tables(report: Report) -> Iterator[Table]:
         "rejections",
         "Rejected samples",
         ("cause", "count [samples]", "first at [s]", "what to do"),
-        tuple((one.cause, str(one.samples), _s(one.first_s), remedy(one.cause)) for one in report.rejections),
+        tuple((one.cause, str(one.samples), _s(one.first_s), what_to_do(one.cause)) for one in report.rejections),
         numbers=0,
     )
 
 
-NO_LIMIT_RAD = 1000.0  # a continuous joint farther from its limits has none that matters
+NO_LIMIT_RAD = 1000.0  # limits of a continuous joint that are farther away do not matter
 
 
 def _margin(joint: Joint) -> str:
-    """Least distance of a joint from its limits [rad, or m if it slides]."""
+    """Least distance of a joint from its limits, in rad, or in m if it is prismatic."""
     if joint.kind == "continuous" and joint.margin_rad > NO_LIMIT_RAD:
         return "no limit"
     return f"{joint.margin_rad:.2f}" + (" m" if joint.kind == "prismatic" else "")
@@ -143,7 +147,7 @@ def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]
 
 
 def verdict(report: Report) -> str:
-    """The report in one sentence: how much it followed, how often it did not, and the worst."""
+    """The report in one sentence: share of following, number of stops, and the worst."""
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
     following = [span for span in report.spans if span.mode is Mode.FOLLOW]
@@ -177,7 +181,7 @@ def _times_of(count: int, what: str) -> str:
 
 
 def summary(report: Report) -> list[str]:
-    """What a report begins with, a line each; the verdict first."""
+    """The first lines of a report, beginning with the verdict."""
     lacks = len(report.lacks)
     hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
     return [
@@ -189,12 +193,14 @@ def summary(report: Report) -> list[str]:
 
 
 def comparison(reports: Sequence[Report]) -> Iterator[Table]:
-    """Figures of several reports side by side, of two with their differences; then the settings."""
+    """Figures of several reports side by side; for two reports also differences, and settings that
+    differ.
+    """
     told = [{figure.name: figure for figure in report.figures()} for report in reports]
     two = len(reports) == 2
     rows = []
     for name in dict.fromkeys(name for one in told for name in one):
-        figures = [one.get(name) for one in told]  # None: a place that was not taught there
+        figures = [one.get(name) for one in told]  # None: a via-point that was not taught there
         values = [figure and figure.value for figure in figures]
         known = next(figure for figure in figures if figure is not None)
         if any(values):
@@ -211,7 +217,7 @@ def comparison(reports: Sequence[Report]) -> Iterator[Table]:
 
 
 def names_of(reports: Sequence[Report]) -> list[str]:
-    """A name for each report that no other has: its file's, numbered where it is not the first."""
+    """A unique name for each report: that of its file, with a number if it is not the first."""
     seen: dict[str, int] = {}
     names = []
     for report in reports:

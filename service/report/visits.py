@@ -1,6 +1,4 @@
-"""How well taught places were met: where the tool was while the hands were where a place was
-taught.
-"""
+"""Accuracy at taught via-points: the tool's position while the hands were where one was taught."""
 
 from __future__ import annotations
 
@@ -13,14 +11,15 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector
 from service.report.columns import Columns, runs
 
-NEAR_M = 0.03  # hands nearer than this, or than its radius, to where a place was taught are there
-PAUSE_S, LEAST_S = 0.3, 0.1  # hands that leave for less have not left; that come for less have not come
-SETTLED_S = 0.1  # at a visit's end, over which the tool is where it came to
+NEAR_M = 0.03  # hands visit a via-point if nearer than this, or than its radius, to where it was taught
+PAUSE_S = 0.3  # hands that leave for a shorter time have not left
+LEAST_S = 0.1  # a shorter visit does not count
+SETTLED_S = 0.1  # the tool's final distance is averaged over this time at the end of a visit
 
 
 class Visit(NamedTuple):
-    """A time when the hands were at a place: since the recording's first tick, and how long [s];
-    the tool's least distance from where it was taught, and that at the end [m].
+    """A time of the hands at a via-point: start since the first tick and duration [s]; the tool's
+    least and final distance from where it was taught [m].
     """
 
     start_s: float
@@ -30,9 +29,9 @@ class Visit(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A taught place while it was in force [s], the visits to it, and how near the hands came to
-    where it was taught: the farther one of the two, or the one that conducts alone [m]; infinite
-    where none was seen.
+    """A taught via-point: the time in which it was in force [s], the least distance of the hands
+    from where it was taught [m], and its visits. Of two hands, the farther one counts; the distance
+    is infinite if none was seen.
     """
 
     name: str
@@ -43,12 +42,12 @@ class Place(NamedTuple):
 
     @property
     def best_m(self) -> float | None:
-        """The tool's least distance over all visits [m]; None without any."""
+        """The tool's least distance over all visits [m]; None without a visit."""
         return min((visit.nearest_m for visit in self.visits), default=None)
 
 
 def places(columns: Columns) -> list[Place]:
-    """Every place that was in force at some time, by the time it was taught."""
+    """Every via-point that was in force at some time, in the order of teaching."""
     ticks, times = columns.frames["tick"], columns.times
     found: list[Place] = []
     for point, conductor, begin, end in _taught(columns):
@@ -61,8 +60,8 @@ def places(columns: Columns) -> list[Place]:
 
 
 def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
-    """Each via-point, the side of the hand that conducts alone or None, and the ticks from and
-    before which it was in force so.
+    """Each via-point, the side of the single leading hand or None, and the first tick at which it
+    was in force, and the first at which it was no longer.
     """
     begun: dict[tuple[ViaPoint, int | None], int] = {}
     over: list[tuple[ViaPoint, int | None, int, float]] = []
@@ -77,7 +76,7 @@ def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
 def _visits(
     point: ViaPoint, conductor: int | None, frames: Records, times: Vector, period_s: float
 ) -> tuple[float, list[Visit]]:
-    """How near the hands came, and when they were there."""
+    """The least distance of the hands, and their visits."""
     sides = [0, 1] if conductor is None else [conductor] * 2
     taught, hands = np.array([point.left, point.right])[sides], frames["hands"][:, sides]
     seen = (frames["hand_ages"][:, sides] >= 0).all(axis=1)
@@ -103,7 +102,7 @@ def _visits(
 
 
 def _closed(there: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """The same, with gaps of at most so many filled."""
+    """The same values with gaps up to a length filled."""
     filled = there.copy()
     for begin, end in runs(there):
         if not there[begin] and end - begin <= longest and begin > 0 and end < len(there):

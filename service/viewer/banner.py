@@ -8,29 +8,30 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from service.contract.incidents import explained, word
+from service.contract.incidents import title, what_happened, word
 from service.contract.records import Mode, Reason
 from service.settings import palette
+from service.settings.config import Settings
 
 WIDTH, HEIGHT = 640, 80  # pixels
 LETTERS, MARGIN = 44, 24
 
 
-def title(mode: int, reason: int) -> str:
-    """Mode and reason in words: `hold: no hands`."""
-    return ": ".join(filter(None, (word(Mode(mode)), word(Reason(reason)).replace("_", " "))))
+def headline(mode: int, reason: int) -> str:
+    """Mode and reason as one title: `hold: no hands yet`."""
+    return ": ".join(filter(None, (title(word(Mode(mode))), title(word(Reason(reason))))))
 
 
-def line(mode: int, reason: int) -> str:
-    """The same for the log, and what the reason means."""
-    return ": ".join(filter(None, (title(mode, reason), explained(Reason(reason)).why)))
+def log_line(mode: int, reason: int, settings: Settings) -> str:
+    """The headline, and what happened."""
+    return ": ".join(filter(None, (headline(mode, reason), what_happened(word(Reason(reason)), settings))))
 
 
 @functools.cache
 def banner(mode: int, reason: int) -> NDArray[np.uint8]:
-    """The picture (HEIGHT, WIDTH, 3) that shows mode and reason."""
+    """The picture (HEIGHT, WIDTH, 3) that shows the headline."""
     image = Image.new("RGB", (WIDTH, HEIGHT), palette.MODES[Mode(mode)])
-    draw, text, size = ImageDraw.Draw(image), title(mode, reason), LETTERS
+    draw, text, size = ImageDraw.Draw(image), headline(mode, reason), LETTERS
     while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:
         size -= 1
     draw.text((MARGIN, HEIGHT / 2), text, fill=(0, 0, 0), anchor="lm", font=ImageFont.load_default(size))

@@ -1,8 +1,8 @@
-"""The Rerun blueprint: three tabs of views, for the task, the timing, and what was learned.
+"""The Rerun blueprint: three tabs of views, for the task, the timing, and the learned skill.
 
-All curves share one time axis, seconds from the start; it continues behind the newest value, where
-the legends are. Each view's range follows from the limits in force, or from what was drawn: a
-single outlier does not flatten the rest.
+All curves share one time axis, seconds from the start; it continues beyond the newest value, where
+the legends are. The range of each view follows from the limits in force, or from the drawn values,
+such that a single outlier does not flatten the rest.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from service.settings.config import Settings
 
 TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
-WINDOW_S = 20.0  # of live curves
-LEGEND_SHARE = 0.175  # of the time axis, kept free for legends
-NUMBERS_SHARE = 0.032  # of the time axis: as wide as the numbers left of a curve, which modes lack
-HEADROOM = 1.25  # an axis' range over the curves' usual range
-GATE_FAR = 4.0  # a gate this many times above the curves is not drawn: it would flatten them
+WINDOW_S = 20.0  # live curves show this time
+LEGEND_SHARE = 0.175  # this share of the time axis is kept free for legends
+NUMBERS_SHARE = 0.032  # width of the numbers left of a curve, which modes lack, as share of the time axis
+HEADROOM = 1.25  # range of an axis / usual range of its curves
+MAX_GATE_RATIO = 4.0  # a gate farther above the curves is not drawn, as it would flatten them
 EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
 
 
 class PlotView(NamedTuple):
-    """One view of curves: their path, title, and the range shown unless what was drawn is known;
-    `fixed` ranges stay in any case.
+    """One view of curves: path, title and range. Unless the range is `fixed`, that of the drawn
+    values replaces it.
     """
 
     origin: str
@@ -41,7 +41,7 @@ class PlotView(NamedTuple):
 
 
 def plot_views(settings: Settings) -> dict[str, PlotView]:
-    """All views of curves by path, with the ranges that follow from the settings."""
+    """All views of curves by path, with ranges from the settings."""
     joints, tool, period_us = settings.joints, settings.tool, 1e6 * settings.period_s
     velocity, acceleration, kinds = max(joints.velocity), max(joints.acceleration), joints.every_kind
     unit = "rad" if set(joints.units) == {"rad"} else "rad or m"
@@ -56,18 +56,18 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
         for view in (
             PlotView("/error", "Tool to target [mm]", 0, 60),
             PlotView("/turn", "Tool turned from the target [°]", 0, 10),
-            PlotView("/gripper", "Gripper: how far closed [%]", 0, 110, True),
-            PlotView("/stage", "Stage of the task: its number, and how probable it is", 0, 8, True),
-            PlotView("/deviation", "How sure, and how far hands are off what is known [mm]", 0, 250),
+            PlotView("/gripper", "Gripper closure [%]", 0, 110, True),
+            PlotView("/stage", "Stage of the task: number and probability", 0, 8, True),
+            PlotView("/deviation", "Uncertainty, and deviation of the hands [mm]", 0, 250),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
             PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
             PlotView("/joints/velocity", f"Joint velocity [{unit}/s]", -velocity, velocity),
             PlotView("/joints/position", f"Joint position [{unit}]", lowest, highest, True),
             PlotView("/joints/acceleration", f"Joint acceleration [{unit}/s²]", -acceleration, acceleration),
-            PlotView("/joints/error", f"Joint, measured less commanded [{unit}]", 0, settings.arm.fault_error_rad),
+            PlotView("/joints/error", f"Joint error, measured - commanded [{unit}]", 0, settings.arm.fault_error_rad),
             PlotView("/latency", "Hand to command [ms]", 0, 20),
-            PlotView("/timing/lateness", "How late a tick begins [µs]", 0, period_us / 2),
+            PlotView("/timing/lateness", "Lateness of a tick [µs]", 0, period_us / 2),
             PlotView("/timing/work", "Work of a tick [µs]", 0, period_us),
             PlotView("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
             PlotView("/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.stale_ms, True),
@@ -84,12 +84,12 @@ def blueprint(
     end_s: float | None = None,
     tab: str = TABS[0],
 ) -> rrb.Blueprint:
-    """The blueprint of a live view, or of a file that lasts `end_s` [s] and whose curves reach up
-    to `tops`. `gate_m` is the deviation [m] above which the skill in force holds.
+    """The blueprint of a live view, or of a file with a duration of `end_s` [s] and curves up to
+    `tops`. `gate_m` is the deviation [m] above which the arm holds with the skill in force.
     """
     views, reached = plot_views(settings), dict(tops or {})
     tops = {origin: HEADROOM * top for origin, top in reached.items()}
-    gate_mm, most_mm = 1e3 * gate_m, GATE_FAR * reached.get("/deviation", views["/deviation"].high)
+    gate_mm, most_mm = 1e3 * gate_m, MAX_GATE_RATIO * reached.get("/deviation", views["/deviation"].high)
     if gate_mm <= most_mm:
         tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
     left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
@@ -134,8 +134,8 @@ def blueprint(
         plot("/deviation"),
         rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
         rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
-        modes(),  # below the curves: its time is theirs
-        row_shares=[3, 3, 3, 5, 2.6],  # the joints have seven names
+        modes(),  # below the curves, with the same time axis
+        row_shares=[3, 3, 3, 5, 2.6],  # the legend of the joints has seven names
     )
     task = rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
     timing = rrb.Horizontal(
@@ -145,7 +145,7 @@ def blueprint(
     )
     learning = rrb.Horizontal(
         _scene(
-            "What was learned, and taught places",
+            "The learned skill, and taught via-points",
             "+ /skill/**",
             "+ /scene/**",
             "- /scene/banner/**",

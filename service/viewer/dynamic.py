@@ -1,4 +1,4 @@
-"""The dynamic part: frames as Rerun chunks, the scene at 100 Hz, the curves at the full rate."""
+"""The dynamic part of the drawing: the scene at 100 Hz, curves at the full rate of the loop."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from service.core.skill.model import REGION_95, standard_deviations
 from service.core.skill.pose import CLOSED, UNKNOWN
 from service.settings import palette
 from service.settings.config import Settings
-from service.viewer.banner import banner, line
+from service.viewer.banner import banner, log_line
 from service.viewer.blueprint import TIMELINE
 from service.viewer.static import ArmModels
 
 SCENE_HZ = 100
 TRAIL_S, TRAIL_HZ = 3.0, 20
-TRAIL_BREAK_M = 0.15  # a longer step between two corners is no motion of one hand
-NEAREST_SHOWN_M = 0.5  # a hand farther off needs no line to the arm
-SAME_M = 1e-5  # rounding: at most this much apart, a deviation and the target's are the same
-TINY = 1e-4  # scale of each link of an arm that is not to be seen: the viewer takes 0 for an error
+TRAIL_BREAK_M = 0.15  # a longer step between two corners of a trail is not a motion of the hand
+NEAREST_SHOWN_M = 0.5  # a nearer hand is connected with the arm by a line
+SAME_M = 1e-5  # smaller differences of deviations come from rounding
+TINY = 1e-4  # scale that makes the links of an arm invisible; the viewer rejects 0
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
-REPEAT_S = 0.5  # the mode is sent again to live viewers, for those that connect later or leave frames out
+REPEAT_S = 0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
 Columns = Callable[..., rr.chunk.Chunk]
 
 
@@ -45,14 +45,14 @@ class DrawnFrame(NamedTuple):
 
 
 class DynamicScene:
-    """Turns batches of frames into chunks; remembers what the next batch continues."""
+    """Convert batches of frames into chunks, with the state that the next batch continues."""
 
     def __init__(self, models: ArmModels, settings: Settings, *, live: bool) -> None:
         rate_hz, names = settings.rate_hz, settings.joints.names
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
-        self._live = live
+        self._live, self._settings = live, settings
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
@@ -68,14 +68,14 @@ class DynamicScene:
         self.restart()
 
     def restart(self) -> None:
-        """Starts another file: its time begins at 0, and the mode is sent again."""
+        """Start another file: its time begins at 0, and the mode is sent again."""
         self._followed = False
         self._shown: tuple[int, int] | None = None
         self._mode_sent_ns = 0
         self._last_tick = -1
         self._start_ns: int | None = None
         self.end_s = 0.0
-        self.peaks: dict[str, list[float]] = {}  # of each view of curves, one for each batch
+        self.peaks: dict[str, list[float]] = {}  # peaks of each view, one for each batch
 
     def set_gate(self, deviation_m: float) -> None:
         """Sets the deviation [m] above which the skill in force holds."""
@@ -119,7 +119,7 @@ class DynamicScene:
             yield from self._trail(frames, corners, columns)
 
     def _unmeasured(self, time_ns: NDArray[np.int64]) -> Iterator[rr.chunk.Chunk]:
-        """The measured arm too small to see: links that are nowhere are errors to the viewer."""
+        """The measured arm, too small to see: links without a pose are errors to the viewer."""
         for number, joint in enumerate(self._ghost):
             if joint is not None:
                 size = rr.Transform3D.columns(scale=[(TINY, TINY, TINY)])
@@ -168,7 +168,7 @@ class DynamicScene:
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # where the gate compares something else
+        other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
         yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
@@ -195,8 +195,8 @@ class DynamicScene:
         yield from scalars("/age", np.flatnonzero(seen.any(axis=1)), ages)
 
     def _rotation_error(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
-        """Angle between tool and target (T,) [°], of the part that `[tool] orientation` names; NaN
-        where the arm does not follow.
+        """Angle between tool and target (T,) [°], as `[tool] orientation` defines it; NaN while the
+        arm does not follow.
         """
         angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
         for name in names:  # a frame may be damaged
@@ -230,7 +230,9 @@ class DynamicScene:
             yield columns("/scene/banner", [i], texture)
         for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
-            yield columns("/log", [i], rr.TextLog.columns(text=[line(modes[i], reasons[i])], level=[level]))
+            yield columns(
+                "/log", [i], rr.TextLog.columns(text=[log_line(modes[i], reasons[i], self._settings)], level=[level])
+            )
 
     def _scene(
         self,
@@ -272,8 +274,8 @@ class DynamicScene:
             yield columns("/scene/nearest", near, strips)
 
     def _nearest(self, frame: Record, seen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], str]:
-        """The line (2, 3) from the nearest hand to the arm, and its length as text; where no hand
-        is near a point, and no text.
+        """The line (2, 3) from the nearest hand to the arm, and its length as text; without a hand
+        nearby, a point and no text.
         """
         body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
         placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
@@ -290,7 +292,7 @@ class DynamicScene:
         return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
 
     def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
-        """The trails of the last TRAIL_S; each restarts where its hand was lost meanwhile."""
+        """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
         tracks = [(name, frames["hands"][:, side], frames["hand_ages"][:, side]) for side, name in enumerate(SIDES)]
         tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1)))
         for name, positions, ages in tracks:
@@ -309,9 +311,9 @@ class DynamicScene:
 
 
 def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Of which frames (T,) there is a target: while one hand conducts and the other was never seen,
-    a prediction is told by its covariance.
+    """Mask (T,) of the frames with a target. If one hand leads and the other was never seen, the
+    covariance shows whether there is a prediction.
     """
     is_predicted = np.any(frames["covariance"], axis=(1, 2))
-    told: NDArray[np.bool_] = np.where(is_predicted, seen.any(axis=1), seen.all(axis=1))
-    return told
+    mask: NDArray[np.bool_] = np.where(is_predicted, seen.any(axis=1), seen.all(axis=1))
+    return mask

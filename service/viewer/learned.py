@@ -1,7 +1,7 @@
-"""A skill in the scene: demonstrations and reference as faint lines and points, and via-points
-with the hands' radius within which they hold.
+"""A skill in the scene: demonstrations as faint lines, the reference as points, and via-points with
+the radius of their neighbourhood.
 
-It is read from the arrays of the skill's file; what is missing there is not drawn.
+The skill is read from the arrays of its file; missing ones are not drawn.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from service.learning.demonstration import Demonstration, fingerprint
 from service.settings import palette
 from service.viewer.scene_objects import Column, row
 
-MOST_POINTS = 300  # of a line
-MOST_FILES, MOST_FOLDERS = 60, 20
+MAX_LINE_POINTS = 300
+MAX_FILES, MAX_FOLDERS = 60, 20  # files and folders that are searched for demonstrations
 Point = tuple[float, float, float]
 
 
 class MarkedViaPoint(NamedTuple):
-    """A via-point with a name: positions of hands and tool [m], and the hands' radius within which
-    it holds [m]. Without a radius it was demonstrated, not taught.
+    """A via-point with a name: positions of hands and tool [m], and the radius of the hands'
+    neighbourhood [m]. Without a radius, it was demonstrated, not taught.
     """
 
     name: str
@@ -47,7 +47,7 @@ class MarkedViaPoint(NamedTuple):
 
 class SkillContents(NamedTuple):
     """The contents of a skill's file: reference points of the tool (N, 3) [m], via-points, the
-    deviation above which it holds [m], the figures of its learning.
+    deviation above which the arm holds [m], and the figures of its learning.
     """
 
     name: str
@@ -79,7 +79,7 @@ def skill_contents(skill: bytes) -> SkillContents:
             printable_values(msgspec.json.decode(str(arrays["figures"]))) if "figures" in arrays else {},
         )
     except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"a skill of which nothing can be drawn: {in_words(error)}") from None
+        raise ValueError(f"a skill that cannot be drawn: {in_words(error)}") from None
 
 
 def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
@@ -92,16 +92,17 @@ def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
 
 
 def demonstrations(skill: SkillContents, folder: Path) -> list[Demonstration]:
-    """The demonstrations that a skill was learned from, if a folder or one below it holds them all.
+    """The demonstrations that a skill was learned from, if a folder or one below it holds all of
+    them.
 
-    They are found by the names in the skill's figures, or by the order of the folder's files, and
-    checked by their hash.
+    They are found by the names in the skill's figures, or by the order of the files, and checked by
+    their hash.
     """
     names = [str(row.get("name")) for row in skill.figures.get("demonstrations", ())]
     below = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
-    for searched in (folder, *below[:MOST_FOLDERS]):
+    for searched in (folder, *below[:MAX_FOLDERS]):
         paths = [searched / f"{name}.mcap" for name in names] or sorted(searched.glob("demonstration-*.mcap"))[
-            :MOST_FILES
+            :MAX_FILES
         ]
         found: list[Demonstration] = []
         with contextlib.suppress(RecordingError, OSError):
@@ -116,7 +117,7 @@ def skill_chunks(skill: SkillContents, shown: list[Demonstration], at: Column) -
     """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
     for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
         trajectories = [getattr(one, name)[:, :3] for one in shown]
-        lines = [one[:: 1 + len(one) // MOST_POINTS].astype(np.float32) for one in trajectories]
+        lines = [one[:: 1 + len(one) // MAX_LINE_POINTS].astype(np.float32) for one in trajectories]
         style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}
         yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
     count = len(skill.reference)
@@ -144,18 +145,25 @@ def about(skill: SkillContents, shown: int) -> str:
     lines = [f"# {as_markdown(skill.name or 'skill')}", ""]
     if len(skill.reference):
         lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
-    lines.append(f"Learned from {shown} demonstrations (faint lines)." if shown else "Its demonstrations are not here.")
-    lines.append(f"It holds where it is off what it knows by more than {1000 * skill.threshold:.0f} mm.")
-    lines += ["", "## Places", ""]
+    lines.append(
+        f"Learned from {shown} demonstrations (faint lines)." if shown else "Its demonstrations were not found."
+    )
+    lines.append(f"The arm holds if the deviation from what the skill knows exceeds {1000 * skill.threshold:.0f} mm.")
+    lines += ["", "## Via-points", ""]
     if skill.via_points:
-        lines += ["| place | tool x, y, z [m] | within [mm] of the hands | goes with |", "|---|---|---|---|"]
+        lines += ["| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |", "|---|---|---|---|"]
         for point in skill.via_points:
             at = ", ".join(f"{value:.3f}" for value in point.tool)
             lines.append(f"| {as_markdown(point.name)} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
     else:
         lines.append("None.")
     if rows:
-        lines += ["", "## Held out", "", "| demonstration | error [mm] | worst [mm] | within 95 % [%] |"]
+        lines += [
+            "",
+            "## Held-out errors",
+            "",
+            "| demonstration | error [mm] | worst [mm] | within the 95 % region [%] |",
+        ]
         lines.append("|---|---|---|---|")
         for row in rows:
             cells = [

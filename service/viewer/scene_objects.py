@@ -12,18 +12,16 @@ from service.contract.messages import BASE, SceneObject
 from service.contract.printable import printable
 from service.settings import palette
 
-LABEL_OFFSET_M = (
-    0.06  # of an object's name: above it, clear of via-points' names; toward the arm where the tool holds it
-)
+LABEL_OFFSET_M = 0.06  # names of objects stand above them; names of held objects, toward the arm
 Column = Callable[..., rr.chunk.Chunk]
 
 
 def object_chunks(
     objects: Iterable[SceneObject], before: Iterable[str], labelled: Iterable[str], at: Column
 ) -> Iterator[rr.chunk.Chunk]:
-    """The chunks that show the objects, and clear those in `before` that are gone.
+    """The chunks that show the objects, and clear those in `before` that have disappeared.
 
-    Names that are `labelled` already are not shown again. `at` makes a chunk of one row from a path
+    Names that are already `labelled` are not shown again. `at` makes a chunk of one row from a path
     and columns.
     """
     names, labelled = set(), set(labelled)

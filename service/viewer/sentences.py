@@ -1,4 +1,4 @@
-"""The notes of a recording as sentences, for the viewer's log."""
+"""Notes of a recording as sentences, for the viewer's log."""
 
 from __future__ import annotations
 
@@ -7,41 +7,35 @@ from typing import Any
 import msgspec
 
 from service.contract.explain import in_file
+from service.contract.incidents import ORDERS
 
-_ORDERS = {
-    "hold": "An operator stopped the arm; it stays until resumed.",
-    "resume": "An operator let the arm go on.",
-    "reset": "An operator ended the fault.",
-}
-_ASKED = {"via_points": "Teaching", "skill": "Loading a skill", **{name: f"A request to {name}" for name in _ORDERS}}
+_REQUESTS = {"via_points": "Teaching", "skill": "Loading a skill", **{name: f"A request to {name}" for name in ORDERS}}
 
 
 def sentence(note: str) -> str:
-    """A note as a sentence; one that is plain text already stays as it is."""
-    asked, _, rest = note.partition(" ")
-    if asked not in _ASKED:
+    """A note as a sentence; plain text is returned unchanged."""
+    name, _, rest = note.partition(" ")
+    if name not in _REQUESTS:
         return note
     outcome, _, why = rest.partition(": ")
     if outcome in ("refused", "failed"):
-        return f"{_ASKED[asked]} {'was refused' if outcome == 'refused' else outcome}: {in_file(why)}"
+        return f"{_REQUESTS[name]} {'was refused' if outcome == 'refused' else outcome}: {in_file(why)}"
     try:
         request = msgspec.json.decode(rest, type=dict[str, Any])
     except msgspec.DecodeError:
         return note
-    if asked == "skill":
-        return f"Skill {request.get('name')} is in force."
-    return _taught(request) if asked == "via_points" else _ORDERS[asked]
-
-
-def _taught(request: dict[str, Any]) -> str:
     match request:
+        case _ if name in ORDERS:
+            return f"{ORDERS[name].capitalize()}."
+        case _ if name == "skill":
+            return f"Skill {request.get('name')} is in force."
         case {"op": "add", "points": [*points]}:
             return f"Taught: {_list([str(point.get('name')) for point in points if isinstance(point, dict)])}."
         case {"op": "remove", "names": [*names]}:
-            return f"Forgotten: {_list(names)}."
+            return f"Removed: {_list(names)}."
         case {"op": "clear"}:
-            return "All that was taught is forgotten."
-    return "Via-points were asked for."
+            return "All via-points were removed."
+    return "The via-points were listed."
 
 
 def _list(names: list[str]) -> str:

@@ -1,7 +1,6 @@
 """The static part of the scene: the arm and its ghost, table, reach, names and colours.
 
-Millimetres, microseconds and degrees of transparency are chosen here, in `dynamic` and
-`blueprint`, and nowhere else.
+Units, sizes and transparencies of the drawing are chosen here, in `dynamic` and in `blueprint`.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.contract.incidents import title, word
 from service.contract.records import SIDES, Mode, Reason
 from service.core.frame import STAGES
 from service.core.separation.body import body_of
@@ -30,10 +30,10 @@ from service.settings.urdf import Urdf
 from service.viewer.banner import HEIGHT, WIDTH
 from service.viewer.blueprint import EYE, LOOK_AT, UP
 
-GHOST = "measured/"  # before the names of its frames
+GHOST = "measured/"  # prefix of its frames' names
 ARC_STEPS = 48
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-BANNER_AT = (0.55, 0.66, -0.44)  # right of, above and before the point that the camera looks at
+BANNER_AT = (0.55, 0.66, -0.44)  # right of, above and in front of the point that the camera looks at
 BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 VISUAL = "/visual_geometries/"
@@ -43,13 +43,13 @@ _DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 class ArmModels:
     """The arm as commanded and as measured: one URDF, loaded twice under different names.
 
-    `body` are its capsules, which are drawn where meshes are not found or not drawn, shapes
-    `undrawn`, and around meshes that they cover. `remark` says so; it is empty where all are drawn.
-    Meshes take `mesh_mb` at most [MB], for both.
+    `body` holds the capsules, which are drawn around meshes, and instead of meshes that are missing
+    or cannot be drawn (`undrawn`). `remark` names those; it is empty if all are drawn. All meshes
+    take at most `mesh_mb` [MB].
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
-        live = urdf == urdf_path(settings)  # else it is a recording's, which has its meshes covered
+        live = urdf == urdf_path(settings)  # otherwise the URDF is a recording's, whose meshes are already covered
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
         self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
         with tempfile.TemporaryDirectory() as folder:
@@ -77,9 +77,9 @@ class ArmModels:
 
 
 def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
-    """Writes the URDF that Rerun reads: without masses, prefixes and collision shapes, of which it
-    draws none, in UTF-8, and with the files of meshes named in full. Visual shapes whose mesh is
-    not found are left out; returns what to say of them, or an empty text.
+    """Write the URDF that Rerun reads: in UTF-8, with full paths of meshes, and without masses,
+    prefixes and collision shapes, which are not drawn. Visual shapes without their mesh are left
+    out; return a remark about them, or an empty text.
     """
     robot, origin = element_of(urdf), urdf_path(settings)
     for link in robot.findall("link"):
@@ -102,7 +102,7 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
-    """Logs everything that never changes."""
+    """Log everything that never changes."""
 
     def fix(path: str, *archetypes: Any) -> None:
         stream.log(path, *archetypes, static=True)
@@ -138,7 +138,7 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
 def _log_arm(
     stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, undrawn: tuple[str, ...], *, ghost: bool
 ) -> None:
-    """Logs the shapes of the arm: solid, or transparent as a ghost."""
+    """Log the shapes of the arm: solid, or transparent as a ghost."""
     fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
     colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
@@ -161,7 +161,7 @@ def _log_arm(
 def _log_capsules(
     fix: Any, tree: rr.urdf.UrdfTree, path: str, models: ArmModels, settings: Settings, *, ghost: bool
 ) -> None:
-    """Logs the capsules of the arm, those of each joint in the frame of the link that it moves."""
+    """Log the capsules of the arm, each in the frame of its link."""
     moved = [joint.child_link for name in settings.joints.names if (joint := tree.get_joint_by_name(name)) is not None]
     root, body, faint = tree.root_link().name, models.body, ghost or not models.remark
     for link in np.unique(body.capsules["link"]):
@@ -183,7 +183,7 @@ def _log_capsules(
 
 
 def _log_surroundings(fix: Any, settings: Settings) -> None:
-    """Logs the table, the obstacles and the arm's reach."""
+    """Log the table, the obstacles and the arm's reach."""
     (x, y, top), (half_x, half_y) = settings.table.centre, settings.table.half_size
     solid = rr.components.FillMode.Solid
     half = [(half_x, half_y, 0.0095)]
@@ -203,7 +203,10 @@ def _log_surroundings(fix: Any, settings: Settings) -> None:
                 fill_mode=solid,
             ),
         )
-    faint, thin = palette.faint(palette.GREY, 0.08), rr.Radius.ui_points(0.5)  # in pixels: constant near the camera
+    faint, thin = (
+        palette.faint(palette.GREY, 0.08),
+        rr.Radius.ui_points(0.5),
+    )  # width in pixels, constant near the camera
     fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=thin))
 
 
@@ -225,7 +228,7 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
 
 
 def _log_names(fix: Any, settings: Settings) -> None:
-    """Logs names, units and colours of the curves, and the labels and colours of the modes."""
+    """Log names, units and colours of the curves, and labels and colours of the modes."""
     joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
     units = settings.joints.units
     series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
@@ -247,7 +250,7 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/gripper/predicted", "predicted [%]", palette.TARGET),
         ("/gripper/commanded", "commanded [%]", palette.TOOL),
         ("/stage/number", "number [1]", palette.TOOL),
-        ("/stage/probable", "how probable it is [1]", palette.TARGET),
+        ("/stage/probable", "probability [1]", palette.TARGET),
         ("/deviation/target", "target, 1 σ [mm]", palette.TARGET),
         ("/deviation/hands", "hands [mm]", palette.OFF),
         ("/deviation/gate", "holds above [mm]", palette.GATE),
@@ -269,11 +272,12 @@ def _log_names(fix: Any, settings: Settings) -> None:
         policy = rr.components.AggregationPolicy.Max if is_largest else None
         widths = [1.5] * len(names)
         fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
-    for path, names, colours_packed in (
-        ("/mode", [mode.name.lower() for mode in Mode], [palette.packed(palette.MODES[mode]) for mode in Mode]),
-        ("/reason", [reason.name.lower() for reason in Reason], [palette.packed(palette.GREY)] * len(Reason)),
+    for path, members, colours_packed in (
+        ("/mode", Mode, [palette.packed(palette.MODES[mode]) for mode in Mode]),
+        ("/reason", Reason, [palette.packed(palette.GREY)] * len(Reason)),
     ):
-        labels = [name.replace("_", " ") for name in names]
+        names = [word(member) for member in members]
+        labels = [title(name) for name in names]
         fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))
     fix("/scene/banner", _board())
 

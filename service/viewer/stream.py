@@ -1,7 +1,7 @@
-"""Sends a Rerun scene into a file, to live viewers, or both.
+"""The stream of a Rerun scene into a file, to live viewers, or both.
 
-Frames are sent by columns, a batch at a time. Where a destination fails (full disk, used port) it
-is given up and named in `problems`; the other goes on.
+Frames are sent by columns, a batch at a time. A destination that fails (full disk, used port) is
+closed and named in `problems`; the other one continues.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ from service.viewer.static import ArmModels, log_static
 from service.viewer.thinning import Thinning
 
 FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.2
-THIN_BATCH_S = 10.0  # of a file with a budget: each batch takes 50 kB beside its frames
-LIVE_MB = 24  # for viewers that connect later, the arm's meshes aside: the newest 20 s at 500 Hz, which curves show
-LIVE_WAITING = 5  # batches; where a viewer lags the oldest are left out
+THIN_BATCH_S = 10.0  # batch of a file with a budget, because each batch takes 50 kB beside its frames
+LIVE_MB = 24  # memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
+LIVE_WAITING = 5  # batches that wait for a slow viewer; beyond it, the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
-REPEAT_S = 10.0  # skill and objects are sent again to live viewers, for those that connect later
+SCENE_REPEAT_S = 10.0  # interval at which live viewers get skill and objects again, as they connect late
 
 
 class ViewerError(ExplainedError, RuntimeError):
-    """Something cannot be shown; the message says what, and what would help."""
+    """Something cannot be shown; the message says what, and what to do."""
 
 
 class _Destination:
@@ -88,7 +88,7 @@ class _Destination:
         self.redirect(name, sink, path)
 
     def redirect(self, name: str, sink: Any, path: Path | None = None) -> None:
-        """Sends the scene to another sink from now on, which may be the file at `path`.
+        """Send the scene to another sink from now on, which may be the file at `path`.
 
         The static part is sent first; skill and objects follow with the first frame.
         """
@@ -98,7 +98,7 @@ class _Destination:
         self._repeated_ns, self._open = 0, True
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(self._settings.cell)
-        # no more often than this: Rerun keeps 1.5 MB of each for good
+        # once per sink, because Rerun keeps 1.5 MB of each blueprint permanently
         self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
         log_static(self._stream, self.models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
@@ -106,13 +106,13 @@ class _Destination:
             self._thinning.restart(self._size())
 
     def _size(self) -> int:
-        """Bytes in the file; 0 where there is none."""
+        """Bytes in the file; 0 without a file."""
         with contextlib.suppress(OSError):
             return 0 if self._path is None else self._path.stat().st_size
         return 0
 
     def add(self, shown: DrawnFrame) -> None:
-        """Adds one frame."""
+        """Add one frame."""
         if not self._repeated_ns:
             self._repeat(shown.time_ns)
             if self.models.remark:
@@ -122,18 +122,18 @@ class _Destination:
             self._pending.append(kept)
         if self._pending and shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
             self.send()
-        if self._live and shown.time_ns - self._repeated_ns > REPEAT_S * 1e9:
+        if self._live and shown.time_ns - self._repeated_ns > SCENE_REPEAT_S * 1e9:
             self._repeat(shown.time_ns)
 
     def _repeat(self, time_ns: int) -> None:
-        """Sends skill and objects, also for viewers that connect later."""
+        """Send skill and objects, also for viewers that connect later."""
         self._repeated_ns = time_ns
         if self._skill is not None:
             self.put(list(learned.skill_chunks(*self._skill, self._at(time_ns))))
         self._put_objects(time_ns)
 
     def learn(self, skill: SkillContents, demonstrations: list[Demonstration]) -> None:
-        """Shows the skill that is in force from now on."""
+        """Show the skill that is in force from now on."""
         self._skill = skill, demonstrations
         self._dynamic.set_gate(skill.threshold)
         if self._repeated_ns:
@@ -142,7 +142,7 @@ class _Destination:
             self._put_objects(self._repeated_ns)
 
     def show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
-        """Shows the objects on the bench."""
+        """Show the objects on the bench."""
         before, self._objects = self._objects, objects
         if not self._repeated_ns or objects == before:
             return
@@ -153,13 +153,13 @@ class _Destination:
             self._put_objects(time_ns, before)
 
     def _put_objects(self, time_ns: int, before: Iterable[SceneObject] = ()) -> None:
-        """Shows the objects; one that a place is named after has its name there."""
+        """Show the objects; an object whose name a via-point has gets no second label."""
         places = () if self._skill is None else (point.name for point in self._skill[0].via_points)
         known = (one.name for one in before)
         self.put(list(scene_objects.object_chunks(self._objects, known, places, self._at(time_ns))))
 
     def log(self, text: str, level: str, time_ns: int) -> None:
-        """Adds one line to the log."""
+        """Add one line to the log."""
         self.put([self._at(time_ns, to_ns=LOG_NS)("/log", *rr.TextLog.columns(text=[text], level=[level]))])
 
     def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
@@ -168,7 +168,7 @@ class _Destination:
         return lambda path, *columns: rr.chunk.Chunk.from_columns(path, index, list(columns))
 
     def send(self) -> None:
-        """Sends what is pending."""
+        """Send what is pending."""
         if self._pending:
             batch, self._pending = self._pending, []
             if self._thinning is not None:
@@ -177,8 +177,8 @@ class _Destination:
         self._send_moved()
 
     def _send_moved(self) -> None:
-        """Sends where the objects have been since the last batch, in few chunks: a chunk of one row
-        takes 50 times as much of a file as a row.
+        """Send the objects' motion since the last batch in few chunks: a chunk of one row takes 50
+        times as much of a file as a row.
         """
         if self._moved:
             moved, self._moved = self._moved, []
@@ -186,7 +186,7 @@ class _Destination:
             self.put(list(scene_objects.moved_chunks([objects for _, objects in moved], index)))
 
     def _finish(self) -> None:
-        """Sends what is pending; to a file also its blueprint, with the curves' ranges."""
+        """Send what is pending; to a file also its blueprint, with the curves' ranges."""
         self.send()
         if self._open and not self._live and self._dynamic.end_s > 0:
             tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
@@ -200,16 +200,16 @@ class _Destination:
         return np.inf if self._skill is None else self._skill[0].threshold
 
     def put(self, chunks: list[rr.chunk.Chunk]) -> None:
-        """Hands chunks to the stream."""
+        """Pass chunks to the stream."""
         self._stream.send_chunks(chunks)
 
     def flush(self) -> None:
-        """Sends what is pending; raises if it does not arrive."""
+        """Send what is pending; raises if it does not arrive."""
         self.send()
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     def close(self) -> None:
-        """Ends the file or the server."""
+        """End the file or the server."""
         self._finish()
         self._stream.disconnect()
 
@@ -218,7 +218,7 @@ class _Live(_Destination):
     """A server for live viewers, fed on a thread of its own.
 
     A viewer that stalls does not delay the drawing: the oldest batches are left out. Seconds count
-    from the time [ms] that ends the recording's id, by which a page tells how old a picture is.
+    from the time [ms] at the end of the recording's id, from which a page computes a picture's age.
     """
 
     def __init__(self, port: int, **common: Any) -> None:
@@ -245,7 +245,7 @@ class _Live(_Destination):
             self._come.clear()
             while self._waiting:
                 self._stream.send_chunks(self._waiting.popleft())
-                self._stream.flush()  # until the server has them: else they wait in Rerun, where nothing limits them
+                self._stream.flush()  # waits for the server; otherwise they queue up in Rerun without a limit
 
     def put(self, chunks: list[rr.chunk.Chunk]) -> None:
         self._waiting.append(chunks)
@@ -264,9 +264,9 @@ class _Live(_Destination):
 
 
 class Viewer:
-    """Draws frames as a Rerun scene into a file, for live viewers, or both.
+    """Draw frames as a Rerun scene into a file, for live viewers, or both.
 
-    What fails is listed in `problems`, not raised.
+    Failures are listed in `problems`, not raised.
     """
 
     def __init__(
@@ -279,16 +279,14 @@ class Viewer:
         live_port: int | None = None,
         mb_per_hour: float = 0.0,
     ) -> None:
-        """`mb_per_hour` [MB/h] is the most that files grow by, for which frames are left out; 0: no
-        limit.
-        """
+        """`mb_per_hour` [MB/h] limits the growth of files, by leaving out frames; 0: no limit."""
         self.problems: list[str] = []
         self.url: str | None = None
         self.rrd: str | None = None
         self._settings = settings
         self._measured: NDArray[np.float64] | None = None
         self._skill, self._learned_from = b"", ""
-        self._unread: SkillContents | None = None  # its demonstrations are still to be read, which takes a while
+        self._unread: SkillContents | None = None  # its demonstrations have not been read yet
         self._remarks: list[str] = []  # for the log, with the next frame
         self._demonstrations: list[Demonstration] = []
         self._destinations: list[_Destination] = []
@@ -315,14 +313,14 @@ class Viewer:
 
     @property
     def arm_remark(self) -> str:
-        """A sentence on meshes of the arm that are not drawn; empty where all are."""
+        """A sentence on meshes of the arm that are not drawn; empty if all are."""
         return next((one.models.remark for one in self._destinations), "")
 
     def draw_into(self, rrd: Path) -> None:
-        """Ends the file drawn into, if there is one, and continues in another.
+        """End the current file, if there is one, and continue in another.
 
-        Each file can be viewed alone. One endless file would fill the memory: Rerun keeps a list
-        of all that was sent.
+        Each file can be viewed alone. One endless file would fill the memory, because Rerun keeps a
+        list of everything that was sent.
         """
         name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
         self.rrd = None
@@ -340,7 +338,7 @@ class Viewer:
 
     @contextlib.contextmanager
     def _contained(self, name: str, destination: _Destination | None) -> Iterator[None]:
-        """Within it an exception is noted in `problems`, and ends only this destination."""
+        """Context in which an exception is noted in `problems`, and ends only this destination."""
         try:
             yield
         except Exception as error:
@@ -358,7 +356,7 @@ class Viewer:
     def add(
         self, frame: Record, time_ns: int, timing: Record | None = None, events: Iterable[tuple[str, bytes]] = ()
     ) -> None:
-        """Draws a frame at a time [ns], and the arm and skill in its `events` (kind, bytes)."""
+        """Draw a frame at a time [ns], and the arm and skill in its `events` (kind, bytes)."""
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):
@@ -377,7 +375,7 @@ class Viewer:
         self._each(lambda destination: destination.add(shown))
 
     def learn(self, skill: bytes) -> None:
-        """Draws a skill's demonstrations and via-points from now on."""
+        """Draw a skill's demonstrations and via-points from now on."""
         if skill == self._skill:
             return
         self._skill = skill
@@ -396,7 +394,7 @@ class Viewer:
         self._each(lambda destination: destination.learn(skill, self._demonstrations))
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Shows a note: objects on the bench, or a line in the log (a warning under `log`)."""
+        """Show a note: objects on the bench, or a line in the log (a warning under `log`)."""
         if key == OBJECTS:
             found = msgspec.json.decode(text, type=tuple[SceneObject, ...])
             self._each(lambda destination: destination.show_objects(found, time_ns))
@@ -404,23 +402,23 @@ class Viewer:
             self.log(sentence(text), "WARN" if key == "log" else "INFO", time_ns)
 
     def log(self, text: str, level: str, time_ns: int) -> None:
-        """Shows a line in the log; level is INFO, WARN or ERROR."""
+        """Show a line in the log; level is INFO, WARN or ERROR."""
         shown = printable(text)
         self._each(lambda destination: destination.log(shown, level, time_ns))
 
     def flush(self) -> None:
-        """Sends what is pending, and waits until the file has it."""
+        """Send what is pending, and wait until the file has it."""
         self._each(lambda destination: destination.flush())
 
     def close(self) -> None:
-        """Ends the file and the live view."""
+        """End the file and the live view."""
         self._each(lambda destination: destination.flush())
         self._each(lambda destination: destination.close())
         self._destinations = []
 
 
 def rerun_program() -> Path:
-    """The Rerun program that came with the library: it need not be on the path."""
+    """The Rerun program that is installed with the library; it need not be on the path."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
         raise ViewerError("the Rerun program is not installed: pip install rerun-sdk")

@@ -1,4 +1,4 @@
-"""Selects the frames that a drawing can hold within a budget of its file."""
+"""Selection of the frames that fit into a drawing within the budget of its file."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 from service.core.frame import TIMING, Record
 from service.viewer.dynamic import DrawnFrame
 
-SHARE, LEAST_SHARE = 0.8, 0.2  # of the budget; what is left of it for frames at least
-FRAME_BYTES = 1800.0  # of a drawn frame, before the file shows how many it takes
-MOST_FRAME_BYTES = 2.0 * FRAME_BYTES  # of the estimate: what else grows in the file does not thin the frames for ever
+SHARE = 0.8  # share of the budget that is used
+LEAST_SHARE = 0.2  # least share of the budget for frames
+FRAME_BYTES = 1800.0  # size of a drawn frame, before it is estimated from the file
+MAX_FRAME_BYTES = 2.0 * FRAME_BYTES  # limit of the estimate, which contains everything that grows in the file
 PEAKS = ("lateness_us", "work_us", "latency_us", "stages_us")
 
 
 class Thinning:
-    """Keeps one of several frames, so that files of `segment_s` [s] take at most `mb_per_hour`.
+    """Keep one of several frames, so that files of `segment_s` [s] take at most `mb_per_hour`.
 
-    Frames at which mode or reason change are kept in any case. A frame that is kept has the largest
-    times of those left out before it. How many are left out follows from the size of the file.
+    Frames at which mode or reason change are always kept. A kept frame has the largest times of the
+    frames left out before it. The number left out follows from the size of the file.
     """
 
     def __init__(self, mb_per_hour: float, *, rate_hz: int, segment_s: float) -> None:
@@ -31,18 +32,18 @@ class Thinning:
 
     @property
     def every(self) -> int:
-        """One of so many frames is kept."""
+        """Number of frames of which one is kept."""
         share = max(LEAST_SHARE, SHARE - self._static / self._segment_s / self._budget_bytes_s)
         every = math.ceil(self._frame_bytes * self._rate_hz / (share * self._budget_bytes_s))
         return min(max(1, every), self._rate_hz)
 
     def restart(self, size: int) -> None:
-        """Another file begins, which has `size` bytes before the first frame."""
+        """Start another file, which has `size` bytes before the first frame."""
         self._static, self._sent, self._last_tick = size, 0, -1
         self._every = self.every
 
     def kept(self, shown: DrawnFrame) -> DrawnFrame | None:
-        """The frame as it is to be drawn; None: it is left out."""
+        """The frame to be drawn; None if it is left out."""
         frame = shown.frame
         tick, outcome = int(frame["tick"]), (int(frame["mode"]), int(frame["reason"]))
         if tick // self._every == self._last_tick // self._every and outcome == self._last_outcome:
@@ -60,8 +61,8 @@ class Thinning:
         return shown._replace(timing=timing)
 
     def sent(self, count: int, size: int) -> None:
-        """So many more frames are on their way to the file, which has `size` bytes without them."""
+        """Count frames on their way to the file, which has `size` bytes without them."""
         if self._sent and size > self._static:
-            self._frame_bytes = min((size - self._static) / self._sent, MOST_FRAME_BYTES)
+            self._frame_bytes = min((size - self._static) / self._sent, MAX_FRAME_BYTES)
             self._every = self.every
         self._sent += count

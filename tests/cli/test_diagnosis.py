@@ -4,6 +4,7 @@ wrong, with what is wanted and what to do.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import msgspec
@@ -12,6 +13,7 @@ import pytest
 
 from service.cli.diagnosis import Y_UP, Finding, findings
 from service.cli.status import line, rows
+from service.contract.incidents import what_to_do
 from service.contract.requests import Percentiles, Source, Status
 from service.core.geometry import rotation
 from service.settings.config import converted
@@ -63,7 +65,7 @@ def diagnosed(travels: dict[str, tuple[float, float]] | None = None, **changed: 
 
 
 def wrongs(found: list[Finding]) -> list[str]:
-    return [finding.line() for finding in found if finding.level == "wrong"]
+    return [finding.text() for finding in found if finding.level == "wrong"]
 
 
 def source(name: str, **changed: Any) -> dict[str, Source]:
@@ -101,7 +103,7 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
         (
             {"sources": source("left", rate_hz=0.0, age_ms=3000.0, fresh=False)},
             "left hand",
-            ("nothing came for 3.0 s", "30 to 500 Hz on lab/hands/left", "start the tracker"),
+            ("nothing arrived for 3.0 s", "30 to 500 Hz on lab/hands/left", "start the tracker"),
         ),
         ({"sources": source("left", rate_hz=12.0)}, "left hand", ("12 Hz", "30 to 500 Hz", "as often")),
         (
@@ -123,16 +125,20 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
         (
             {"sources": source("left", rejected={"older": 90})},
             "left hand",
-            ("45% of what came contradicts", "one publisher of lab/hands/left", "stop one"),
+            ("45% of the samples contradict", "one publisher of lab/hands/left", "stop one"),
         ),
-        ({"sources": source("right", contested=0.3)}, "right hand", ("30% of what came", "one publisher", "stop one")),
+        (
+            {"sources": source("right", contested=0.3)},
+            "right hand",
+            ("30% of the samples", "one publisher", "stop one"),
+        ),
         (
             {"sources": source("left", scatter_mm=9.0)},
             "left hand",
-            ("scatters by 9 mm an axis, 8 accepted", "stop one"),
+            ("scatter by 9 mm on each axis, 8 accepted", "stop one"),
         ),
-        ({"sources": source("left", clock_ms=-4000.0)}, "left hand's clock", ("4 s after it comes", "chrony")),
-        ({"sources": source("left", clock_ms=5000.0)}, "left hand's clock", ("5 s before it comes", "no latency")),
+        ({"sources": source("left", clock_ms=-4000.0)}, "left hand's clock", ("4 s after it arrives", "chrony")),
+        ({"sources": source("left", clock_ms=5000.0)}, "left hand's clock", ("5 s before it arrives", "no latency")),
         ({"command_heard": False}, "arm's driver", ("nobody listens to lab/joints/command",)),
         (
             {"hands_m": {"left": (0.8, -0.2, 0.9), "right": (0.9, 0.3, 0.1)}},
@@ -169,10 +175,10 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
 def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     changed: dict[str, Any], what: str, words: tuple[str, ...]
 ) -> None:
-    lines = [finding.line() for finding in diagnosed(**changed) if finding.level == "wrong" and finding.what == what]
+    lines = [finding.text() for finding in diagnosed(**changed) if finding.level == "wrong" and finding.what == what]
     assert lines
     assert all(word in "\n".join(lines) for word in words), lines
-    assert all(" | wanted: " in line and " | what to do: " in line and "\n" not in line for line in lines)
+    assert all(re.fullmatch(r"wrong .*\n +required: .*\n +what to do: .*", line) for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +196,7 @@ def test_the_doctor_tells_how_long_the_disk_lasts(scribe: dict[str, Any], told: 
     recording = {"state": "recording", "free_mb": 50_000.0, **scribe}
     (line,) = [one for one in diagnosed(scribe=recording) if one.what == "disk"]
     assert line.level == "ok"
-    assert told in line.line() + " |"
+    assert told in line.text() + " |"
 
 
 def test_what_need_not_be_mended_is_a_note() -> None:
@@ -205,14 +211,14 @@ def test_what_need_not_be_mended_is_a_note() -> None:
 
 def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_near() -> None:
     ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
-    assert rows(ahead)["latency"] == "unknown: the left hand's stamps are 4 s ahead of this daemon's clock"
+    assert rows(ahead)["latency"] == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
     assert rows(HEALTHY)["latency"] == "p50 1.00, p99 2.00, max 3.00 ms"
     gone = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
     unseen = msgspec.structs.replace(HEALTHY, sources={"left": gone, "right": gone})
     assert rows(unseen)["nearest"] == "no hand is seen"
     assert "not seen for 5.0 s" in line(unseen)
     one = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": gone})
-    assert rows(one)["nearest"].endswith("; the left one counts where it was last seen")
+    assert rows(one)["nearest"].endswith("; the left hand is assumed where it was last seen")
     assert "±" in line(HEALTHY)
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
@@ -237,7 +243,7 @@ def test_a_unit_that_is_wrong_is_told_with_the_setting_to_write() -> None:
     first = wrongs(diagnosed(mode="hold", reason="no_hands", sources=left))[0]
     assert "left hand" in first
     assert "looks like mm" in first
-    assert 'what to do: write unit = "mm" under [hands]' in first
+    assert 'and restart the daemon: unit = "mm"' in first
 
 
 def test_joints_in_degrees_are_told_with_the_joints_name() -> None:
@@ -251,12 +257,10 @@ def test_joints_in_degrees_are_told_with_the_joints_name() -> None:
 def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> None:
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
     told = wrongs(diagnosed(travels, mode="fault", reason="arm_error", because="a joint was 0.102 rad off"))
-    assert "b was told to go 0.31 rad and it has not moved since commands began" in told[0]
+    assert "b was commanded to move by 0.31 rad, but has not moved since commands began" in told[0]
     assert "are the drives on?" in told[0]
     assert [line.split()[1] for line in told] == ["arm's", "mode"]
-    alone = wrongs(diagnosed(mode="fault", reason="arm_error", because="now b is off by 0.1 rad", remedy="see what"))
-    assert "now b is off" in alone[0]
-    assert "what to do: see what; if it has not moved since commands began: are the drives on?" in alone[0]
+    assert "whether its drives are on" in what_to_do("arm_error")
 
 
 @pytest.mark.parametrize(
@@ -304,7 +308,7 @@ def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]])
 def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
     raised = [((-0.2, 0.9 + up, 0.5), (0.2, 0.95 + up / 2, 0.51)) for up in (0.0, 0.1, 0.2)]
     told = [line for line in wrongs(paths(*raised)) if "tracker's axes" in line]
-    assert "write base_from_tracker = [0, 0, 0, 0.7071, 0, 0, 0.7071] under [hands]" in told[0]
+    assert "write base_from_tracker = [0, 0, 0, 0.7071, 0, 0, 0.7071]" in told[0]
     settings = converted({"hands": {"base_from_tracker": list(Y_UP)}}, origin="here")
     turned = rotation(settings.hands.base_from_tracker[3:]) @ np.array([0.0, 1.0, 0.0])
     assert np.allclose(turned, [0, 0, 1], atol=1e-4)
@@ -320,7 +324,7 @@ def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
     first = msgspec.structs.replace(HEALTHY, target_m=(0.5, 0.2, 0.3))
     now = msgspec.structs.replace(first, tick=2000, time_ns=first.time_ns + 2 * 10**9, target_m=(0.5, 0.15, 0.3))
     told = wrongs(findings(first, now, own_ns=now.time_ns, own_version="0.1.0"))
-    assert "tool               off its target by 15 cm or more for 2.0 s" in told[0]
+    assert "tool               15 cm or more from its target for 2.0 s" in told[0]
     held_back = msgspec.structs.replace(now, flags=("separation",))
     found = findings(first, held_back, own_ns=now.time_ns, own_version="0.1.0")
     assert [(one.level, "give it room" in one.remedy) for one in found if one.what == "tool"] == [("note", True)]
@@ -338,15 +342,15 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     }
     found = diagnosed(**unseen)
     assert {finding.level for finding in found} == {"ok"}
-    assert "right hand         nothing comes, and the skill does without it" in [one.line()[7:] for one in found]
+    assert "right hand         nothing arrives; the skill does not need it" in [one.text()[7:] for one in found]
     assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
     gone = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
-    assert "nothing came for 3.0 s" in wrongs(diagnosed(**unseen | gone))[0]  # it may be anywhere
+    assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | gone))[0]  # it may be anywhere
     seen = {"sources": HEALTHY.sources, "hand_age_ms": HEALTHY.hand_age_ms, "hands_m": HEALTHY.hands_m}
     assert not wrongs(diagnosed(**unseen | seen))
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
-    assert rows(now)["target"] == "none: it needs the left hand"
-    assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: it needs both hands"
+    assert rows(now)["target"] == "none: the skill needs the left hand"
+    assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: the skill needs both hands"
 
 
 def test_a_rejected_sample_is_followed_by_what_to_do_about_that_one() -> None:

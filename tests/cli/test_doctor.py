@@ -103,9 +103,11 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         wrong = {finding["what"]: finding for finding in found if finding["level"] == "wrong"}
         assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
         assert all(finding["wanted"] and finding["remedy"] for finding in wrong.values())
-        assert "no joint states came yet" in wrong["mode"]["found"]
-        assert wrong["left hand"]["found"] == "nothing comes, but on thirdhand/hands/Left"
-        assert wrong["left hand"]["remedy"].startswith("let it publish thirdhand/hands/left; or start the tracker")
+        assert "no joint states arrived yet" in wrong["mode"]["found"]
+        assert wrong["left hand"]["found"] == "nothing arrives, but on thirdhand/hands/Left"
+        assert wrong["left hand"]["remedy"].startswith(
+            "let it publish under the cell's key, thirdhand/hands/left; or start the tracker"
+        )
 
         with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
@@ -166,7 +168,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         watch.stderr.close()
         assert "hold (stale_hand)" in said
         assert "left not seen for" in said
-        assert (watch.returncode, "nothing comes on thirdhand/status" in ended) == (1, True)
+        assert (watch.returncode, "nothing arrives on thirdhand/status" in ended) == (1, True)
         log = daemon.log.read_text()
         assert log.count("left hand: rejected as wrong_frame: frame 'camera'") == 1
         assert main(["doctor", "--connect", daemon.endpoint]) == 1
@@ -191,7 +193,7 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
         token.undeclare()  # type: ignore[no-untyped-call]
     said = capsys.readouterr().out
     assert "nobody answers on lab/status" in said
-    assert "give --cell: lab/bench2 can be reached here" in said
+    assert "give the name of the cell by --cell: here, lab/bench2 can be reached" in said
 
 
 def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from service.cli.demo import too_busy
 from service.cli.status import rows
-from service.contract.incidents import Evidence, explained
+from service.contract.evidence import Evidence, explained
 from service.contract.records import Mode, Reason
 from service.contract.requests import Source
 from service.daemon.machine import Machine
@@ -83,7 +83,7 @@ def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
     for reason in Reason:
         blamed = explained(reason, seen).why.startswith("this machine was too busy, the loop was up to 45 ms late; ")
         assert blamed == (reason in (Reason.STALE_HAND, Reason.ARM_ERROR, Reason.ARM_SILENT))
-        assert blamed == ("see what else runs on this machine" in explained(reason, seen).remedy)
+        assert blamed == ("see what else runs on this machine" in explained(reason, seen).what_to_do)
     refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'")
     assert "busy" not in explained(Reason.STALE_HAND, seen._replace(sources={"left": refused})).why
 

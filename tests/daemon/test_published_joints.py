@@ -79,7 +79,7 @@ def test_a_part_of_the_arm_that_nobody_publishes_is_named(daemon: Daemon) -> Non
         because = daemon.client.status().because
         time.sleep(0.01)
     assert because == (
-        f"what comes of the arm is rejected as incomplete: joints ['{JOINTS[3]}'] missing among 6, "
+        f"what arrives from the arm is rejected as incomplete: joints ['{JOINTS[3]}'] missing among 6, "
         + ", ".join(name for name in JOINTS if name != JOINTS[3])
     )
 

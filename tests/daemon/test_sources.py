@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from service.contract.incidents import explained
+from service.contract.evidence import explained
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import Cause
@@ -137,7 +137,7 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
         cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
         told = cell.status(k / 500)
         if k > 1000:
-            assert re.fullmatch(r"joint states come at \d\.\d Hz, 10 Hz at least needed", told.because)
+            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", told.because)
             assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
     assert told.reason == "arm_not_ready"
 
@@ -152,7 +152,7 @@ def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: in
         if k > 1000 and told.reason == "stale_hand":
             told_of.add(told.because)
             for side in ("left", "right"):
-                assert re.search(rf"the {side} hand comes at \d\.\d Hz, 10 Hz at least needed", told.because)
+                assert re.search(rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", told.because)
             assert told.remedy == "publish hands more often, or raise [hands] stale_ms"
     assert told_of
 
@@ -202,9 +202,9 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
     assert (told_held.rejected, told_stepped.rejected) == ({"ahead": 1}, {"ahead": 1})
     delayed, ahead = told_held.sources["right"], told_stepped.sources["right"]
     assert delayed.refused.endswith("which was held up for 1.99 s on its way; the clock is right")
-    assert delayed.advice == "see what holds samples up: the network, or a publisher or daemon that is too busy"
+    assert delayed.advice == "find what holds samples up: the network, or a publisher or daemon that is too busy"
     assert ahead.refused.endswith("after the newest accepted one: its clock stepped ahead")
-    assert ahead.advice.startswith("mend the publisher's clock")
+    assert ahead.advice.startswith("correct the publisher's clock")
     assert delayed.advice in held.cell.log[-1]
 
 
@@ -247,9 +247,9 @@ def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
             cell.status(k / 500)
     told = cell.status(0.6)
     assert (told.mode, told.reason) == ("hold", "stale_hand")
-    assert "the left hand was last seen 400 ms ago, as what comes is rejected as swapped: at (" in told.because
+    assert "the left hand was last seen 400 ms ago, as what arrives is rejected as swapped: at (" in told.because
     assert "where the other hand was; left and right look exchanged" in told.because
-    assert told.remedy == "the tracker takes left for right: let it see both hands apart for a moment"
+    assert told.remedy == "let the tracker see both hands apart for a moment: it takes left for right"
     assert sum("rejected as swapped" in line for line in cell.log) == 2
 
 
@@ -264,7 +264,7 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
             told = cell.status(1.0 + k / 500)
     assert told.reason == "stale_hand"
     assert told.because == "the left hand was last seen 502 ms ago"
-    assert told.remedy.startswith("look at the tracker; growing counters")
+    assert told.remedy.startswith("look at the tracker; if a counter")
     assert told.rejected == {"out_of_range": 1}
 
 
@@ -278,7 +278,7 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     told = cell.status(0.4)
     assert (told.mode, told.reason) == ("hold", "no_hands")
     assert told.because == (
-        "the left hand has not been seen yet, as what comes is rejected as wrong_frame: "
+        "the left hand has not been seen yet, as what arrives is rejected as wrong_frame: "
         "frame 'camera'; 'base', 'optitrack' or none accepted"
     )
     assert told.remedy == "set [hands] frame and base_from_tracker, or publish in base"
@@ -318,13 +318,13 @@ def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_s
 def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell = Cell(skill)
     cell.tell()
-    assert cell.status(0.0).because == "no joint states came yet"
+    assert cell.status(0.0).because == "no joint states arrived yet"
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
-    assert "what comes of the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
+    assert "what arrives from the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
     cell.tell(("arm", joints(2)))
     told = cell.status(0.2)
-    assert told.because == "the arm has not told one posture for long enough"
-    assert told.remedy == "wait: it begins by itself once the arm has rested within its limits for 0.1 s"
+    assert told.because == "the arm has not rested in one posture for long enough"
+    assert told.remedy == "wait: the service begins by itself once the arm has rested within its limits for 0.1 s"
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))

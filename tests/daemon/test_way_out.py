@@ -21,7 +21,7 @@ def test_an_arm_that_is_stuck_says_so_and_comes_out(tmp_path: Path) -> None:
     ):
         hands.left, hands.right = (0.986, -0.354, 0.075), (0.78, 0.06, 0.11)
         stuck = daemon.until(lambda status: "stuck" in status["flags"] or status["reason"] == "blocked", 30.0)
-        assert "off its target" in stuck["because"], stuck
+        assert "from its target" in stuck["because"], stuck
         assert stuck["remedy"]
         leaving = daemon.until(lambda status: "on its way out" in status["because"], 30.0)
         assert (leaving["mode"], leaving["reason"]) == ("hold", "blocked")

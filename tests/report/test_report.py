@@ -130,7 +130,7 @@ def test_the_initial_approach_of_the_tool_is_no_error_of_following(
     found = Report(columns)
     stops = [span for span in found.spans if span.mode is not Mode.FOLLOW]
     found.spans = tuple(span for span in found.spans if span not in stops)  # else a stop is the worst
-    prompt = next(one for one in tables(found) if one.title == "Promptness")
+    prompt = next(one for one in tables(found) if one.title == "Timing and accuracy")
     if far_ticks == 0:
         assert found.initial_mm is None
         assert found.lag_mm == before.lag_mm
@@ -168,7 +168,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     # made in process, without a status: what the first frame of each holds
     assert re.fullmatch(r"the left hand was last seen [23]\d\d ms ago", held[Reason.STALE_HAND].why)
     asked = held[Reason.OPERATOR]
-    assert (asked.why, asked.remedy) == ("a hold was requested, or the daemon was stopped", "thirdhand resume")
+    assert (asked.why, asked.remedy) == ("an operator requested a hold, or the daemon was stopped", "thirdhand resume")
     far = re.fullmatch(
         r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
@@ -257,9 +257,14 @@ def test_a_place_of_one_hand_is_met_by_it_wherever_the_other_is(
 @pytest.mark.parametrize(
     ("what", "reason", "why", "about"),
     [
-        ("silent", Reason.ARM_SILENT, "no joint states for 1", "the arm told nothing for 100 ms"),
-        ("pushed", Reason.ARM_ERROR, "now wam/elbow_pitch_joint is off by 0.1", "the arm was measured farther from"),
-        ("fast", Reason.TOOL_SPEED, " m/s, 1 accepted", "the tool was measured faster than [tool] fault_speed"),
+        ("silent", Reason.ARM_SILENT, "no joint states for 1", "no joint states arrived for 100 ms ([arm] silent_ms)"),
+        (
+            "pushed",
+            Reason.ARM_ERROR,
+            "now wam/elbow_pitch_joint is off by 0.1",
+            "a joint was measured more than 0.1 rad",
+        ),
+        ("fast", Reason.TOOL_SPEED, " m/s, 1 accepted", "the tool was measured faster than 1 m/s ([tool] fault"),
         ("failed", Reason.SERVICE, "the request thread failed: out of paper", "the request thread failed: out of"),
     ],
 )
@@ -365,7 +370,7 @@ def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Repo
     told = why_missed(session, "glass", begun_s=0.2, start_s=0.0, end_s=1.0)
     best_m = session.best_m("glass")
     assert best_m is not None
-    assert told.startswith("with the hands where 'glass' was taught, the tool came only within")
+    assert told.startswith("with the hands where 'glass' was taught, the tool came no nearer than")
     assert told.endswith(f" {1000 * best_m:.0f} mm of it")
     assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
 

@@ -126,7 +126,7 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
         ["follow"],
     ]
     assert Counter(row["TextLog:text"][0] for row in rows["/log"]) == {
-        "hold: no hands: a hand has not been seen since the start": 1,
+        "hold: no hands yet: a hand has not been seen since the start": 1,
         "follow": 1,
         "handover taught": 1,
     }
@@ -335,17 +335,17 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     for name, over in (("board", (0, 0, -0.01)), ("glass", (0.5, 0.38, 0.22))):
         assert values(rows[f"/scene/things/{name}/name"], "Points3D:labels")[0] == [name]
         assert values(rows[f"/scene/things/{name}/name"], "Points3D:positions")[0][0] == pytest.approx(over)
-    assert ["All that was taught is forgotten."] in values(rows["/log"], "TextLog:text")
+    assert ["All via-points were removed."] in values(rows["/log"], "TextLog:text")
 
 
 @pytest.mark.parametrize(
     ("note", "said"),
     [
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
-        ('via_points {"op": "remove", "names": ["a"]}', "Forgotten: a."),
+        ('via_points {"op": "remove", "names": ["a"]}', "Removed: a."),
         ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
         ('skill {"name": "soldering"}', "Skill soldering is in force."),
-        ("hold {}", "An operator stopped the arm; it stays until resumed."),
+        ("hold {}", "The operator stopped the arm, which holds until it is resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),
         ("hold what", "hold what"),
         ("3 ticks before tick 7 are not recorded", "3 ticks before tick 7 are not recorded"),

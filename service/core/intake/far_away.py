@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from service.contract.incidents import figures
+from service.contract.evidence import figures
 from service.core.intake.stage import UNIT_M
 from service.core.intake.tuning import MAX_HAND_DISTANCE_M
 
