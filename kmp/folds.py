@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from kmp.checks import Array
+from kmp.cross_validation import rms
 from kmp.database import Database
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
@@ -58,7 +59,7 @@ class Fold:
         for penalty in penalties:
             try:
                 miss = (system.mean(penalty) - self.held_outputs)[:, :outputs]
-                found.append(float(np.sqrt((miss**2).sum(axis=1).mean())))
+                found.append(rms(miss))
             except ValueError:  # not solvable to working precision: no candidate
                 found.append(np.inf)
         return found

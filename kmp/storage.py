@@ -10,10 +10,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import named_arrays
 from kmp.checks import brief, check_kind
+from kmp.named_arrays import from_arrays, to_arrays
 from kmp.primitive import KMP
-from kmp.value_arrays import KIND, from_arrays, to_arrays
 
 _FORMAT = 1
 
@@ -61,7 +60,7 @@ def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: 
         "input_unit": np.array(input_unit),
         "output_unit": np.array(output_unit),
     }
-    arrays: dict[str, Any] = units | (named_arrays.to_arrays(value) if isinstance(value, KMP) else to_arrays(value))
+    arrays: dict[str, Any] = units | to_arrays(value)
     with Path(path).open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
@@ -89,7 +88,6 @@ def load(path: str | Path) -> Stored:
             f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."
         )
     try:
-        value = from_arrays(arrays) if KIND in arrays else named_arrays.from_arrays(arrays)
-        return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))
+        return Stored(from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -1,11 +1,13 @@
-"""The low rank solution of a database, by the normal equations of the cost (4)."""
+"""The low rank solution of a database, by the normal equations of the cost (4); and after an
+adaptation, conditioned on a few more normals.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +16,12 @@ from scipy.linalg import blas, lapack
 from kmp.checks import Array, brief, numbers
 from kmp.database import Changes, Database
 from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians
 from kmp.hyperparameters import Hyperparameters
 from kmp.immutable import Immutable, frozen
 from kmp.inverse_cholesky import InverseCholeskyFactor
+from kmp.kernel import between
 from kmp.linear_algebra import kron_identity
-from kmp.low_rank.conditioned import Conditioned
 from kmp.low_rank.error_bound import error_bounds
 from kmp.low_rank.features import BLOCK, KEPT, Features
 from kmp.solution import ErrorBounds, check_resolved
@@ -243,3 +246,168 @@ def _add_information(total: Array, z: Array, precision: Array) -> None:
             total[:, i, :, j] += share
             if i != j:
                 total[:, j, :, i] += share.T
+
+
+class _System(NamedTuple):
+    """The equations of the U changes."""
+
+    cross: Array
+    """(r D, U O) L^-1 of their features, with the factor L of the base's normal equations."""
+    lu: Array
+    """(U O, U O) the factors of their covariance, given the base."""
+    pivots: NDArray[np.intc]
+
+    def solve(self, right: Array) -> Array:
+        # SciPy counts the given pivots from one while it solves: threads that share them would see.
+        return np.asarray(lapack.dgetrs(self.lu, self.pivots.copy(), right)[0])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Conditioned(Immutable):
+    """The low rank solution after V points were added and R taken out: U = V + R changes.
+
+    Adding is a term of rank O for each point. A point is taken out by adding it again with minus
+    its covariance. The kernel's residual between added points is kept, so that they are met
+    wherever they are; between them and the base's points it is neglected: it is below the square
+    root of the tolerance. The members are those of `Solution`.
+    """
+
+    _not_pickled = frozenset({"database"})
+
+    base: LowRank
+    changes: Changes
+
+    representation: ClassVar[Literal["low_rank"]] = "low_rank"
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        return self.base.hyperparameters
+
+    @cached_property
+    def database(self) -> Database:
+        return self.base.database.changed(self.changes)
+
+    @cached_property
+    def functionals(self) -> Functionals:
+        """The r pivots, then the V via-points."""
+        return Functionals.concatenated([self.base.functionals, self.changes.functionals])
+
+    @property
+    def centres(self) -> Array:
+        """(r + V, I) where they are."""
+        return self.functionals.inputs
+
+    @cached_property
+    def weights(self) -> Array:
+        """(r + V, O) the weights of the kernels there."""
+        base, penalty, d = self.base, self.hyperparameters.lambda_mean, self.base.w.shape[1]
+        shared = penalty == self.hyperparameters.lambda_covariance
+        system = self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
+        mean = (self._z.T @ base.w).reshape(len(self._points), -1)
+        wanted = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
+        pull = system.solve((wanted - mean).ravel())
+        back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
+        columns = self._added_columns
+        w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]
+        added = pull.reshape(len(self._points), -1)[: self._added]
+        return frozen(np.concatenate([base.features.kernel_weights(w), added]))
+
+    @cached_property
+    def error_bounds(self) -> ErrorBounds:
+        return error_bounds(self, self.base.features, added=self._added)
+
+    def solved(self) -> Self:
+        self.weights  # noqa: B018
+        self._covariance_system  # noqa: B018
+        return self
+
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        z, root = self.base.whitened_one(row)
+        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0])
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        z, roots = self.base.whitened(rows)
+        return self._posterior_covariance(rows.reshape(len(z), z.shape[2], -1), z, roots)
+
+    def adapted(self, changes: Changes) -> LowRank | Conditioned:
+        return self.base.adapted(changes)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Conditioned:
+        return Conditioned(self.base.with_hyperparameters(hyperparameters), self.changes)
+
+    def with_weights(self, weights: Array) -> Self:
+        return self._with_cached(weights=weights)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        return self.base.to_arrays()
+
+    @property
+    def _added(self) -> int:
+        return len(self.changes.inputs)
+
+    @property
+    def _added_columns(self) -> int:
+        return self._added * self.base.features.kernel.channels
+
+    @cached_property
+    def _points(self) -> Database:
+        """The U points, the added first."""
+        database, replaced = self.base.database, self.changes.replaced
+        functionals = Functionals.concatenated([self.changes.functionals, database.functionals.take(replaced)])
+        normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
+        return Database(functionals, normals)
+
+    @cached_property
+    def _z(self) -> Array:
+        """The features (r, U C) of the U points."""
+        return frozen(self.base.features(self._points.functionals))
+
+    @cached_property
+    def _covariance_system(self) -> _System:
+        return self._system("lambda_covariance", self.base.covariance_factor)
+
+    def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
+        """(M, O, O), of rows (M, C, (r + V) C), features (M, r, C), L^-1 of these (M, r D, O)."""
+        m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
+        columns, system = self._added_columns, self._covariance_system
+        residual = (
+            rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]
+        )  # (M, C, V C)
+        cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
+        split = cross.reshape(m, c, d, -1, d)
+        for i in range(d):
+            split[:, :, i, :columns, i] += residual
+        cross = split.reshape(m * c * d, -1)
+        gain = system.solve(cross.T).T.reshape(m, c * d, -1)
+        within = penalty * (roots.transpose(0, 2, 1) @ roots)
+        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
+        return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
+
+    def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
+        parameters, added = self.hyperparameters, Database(self.changes.functionals, self.changes.points)
+        check_resolved(
+            parameters, added, first=len(self.base.database) - len(self.changes.replaced), name=name, both=True
+        )
+        penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
+        (r, columns), d, count = self._z.shape, self.base.w.shape[1], len(self._points)
+        first = self._added_columns
+        lifted, residual = np.zeros((r, d, columns, d)), np.zeros((columns, d, columns, d))
+        left = (
+            between(parameters.kernel, added.functionals, added.functionals) - self._z[:, :first].T @ self._z[:, :first]
+        )
+        for i in range(d):
+            lifted[:, i, :, i] = self._z
+            residual[:first, i, :first, i] = left
+        cross, _ = lapack.dtrtrs(base_factor, lifted.reshape(r * d, -1), lower=1)
+        matrix = penalty * (cross.T @ cross) + residual.reshape(columns * d, columns * d)
+        blocks = matrix.reshape(count, -1, count, columns * d // count)
+        points = np.arange(count)
+        sign = np.where(points < self._added, penalty, -penalty)
+        blocks[points, :, points, :] += sign[:, None, None] * self._points.reference.covariance
+        lu, pivots, info = lapack.dgetrf(matrix)
+        if info or not np.isfinite(lu).all():
+            raise ValueError(
+                f"The via-points contradict each other to working precision, with lambda {penalty:g}. "
+                "Give those that are near to others more variance."
+            )
+        return _System(frozen(cross), frozen(lu), frozen(pivots))

@@ -11,7 +11,7 @@ from kmp.dense import Dense
 from kmp.inner import Inner
 from kmp.linear_algebra import kron_identity
 from kmp.low_rank import LowRank
-from kmp.low_rank.conditioned import Conditioned
+from kmp.low_rank.solution import Conditioned
 from kmp.solution import Solution, mean_at
 
 S = np.random.default_rng(0).normal(size=(40, 2))
