@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,7 @@ STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
     *("NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_STAGE", "NO_GRIPPER"),
     *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
 }
+CONVENIENCES = {("kmp.primitive", "kmp.storage")}  # `KMP.save` and `KMP.load` import what stores primitives
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
     "what comes from outside": (
         {
@@ -87,6 +89,32 @@ def imported(path: Path) -> set[str]:
     return found
 
 
+def modules_imported(folder: Path) -> dict[str, set[str]]:
+    """The modules of PACKAGES that each module imports, also in functions and for types alone."""
+    paths = [path.relative_to(folder) for package in PACKAGES for path in (folder / package).rglob("*.py")]
+    names = {".".join(path.with_suffix("").parts).removesuffix(".__init__"): folder / path for path in paths}
+    found: dict[str, set[str]] = {}
+    for module, path in names.items():
+        imports: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imports |= {name.name for name in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                parts = {f"{node.module}.{name.name}" for name in node.names}
+                imports |= parts & names.keys() if parts <= names.keys() else parts & names.keys() | {node.module}
+        found[module] = (imports & names.keys()) - {module}
+    return found
+
+
+def circle(imports: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle; empty if there is none."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
 def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
     """The import contracts of a tree, checked."""
     code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
@@ -105,6 +133,21 @@ def test_import_contracts_hold() -> None:
     done = contracts(ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 broken" in done.stdout
+
+
+def test_no_modules_import_each_other_in_a_circle(tmp_path: Path) -> None:
+    imports = modules_imported(ROOT)
+    for module, other in CONVENIENCES:
+        imports[module].remove(other)
+    assert circle(imports) == []
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    with (tmp_path / "service" / "learning" / "records.py").open("a", encoding="utf-8") as file:
+        file.write("\n\ndef late() -> None:\n    from service.learning.regions import calibrated\n")
+    planted = modules_imported(tmp_path)
+    for module, other in CONVENIENCES:
+        planted[module].remove(other)
+    assert {"service.learning.records", "service.learning.regions"} <= set(circle(planted))
 
 
 @pytest.mark.parametrize(("lines", "broken"), PLANTED.values(), ids=PLANTED)

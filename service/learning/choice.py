@@ -1,11 +1,24 @@
-"""References straight from the demonstrations, and the hyper-parameters that predict best a
-demonstration which is left out.
+"""Primitives straight from demonstrations, with the hyper-parameters that predict held-out persons
+best.
 
-The prior mean is constant, or linear in the hands where that predicts clearly better: people who
-work elsewhere on a table are then followed there, where a constant would hold the tool back. The
-mean is that of kernel ridge regression, whose residuals with one demonstration left out come
-from one inverse (Rasmussen and Williams 2006, section 5.4.2, for blocks). The covariance must hold
-what people do differently and what nobody showed: both are scaled to those residuals.
+The N reference points s_n are samples of the demonstrations, y_n their outputs. The prior mean p is
+constant, or affine in the inputs where that predicts clearly better: takes from all over a table
+are then predicted everywhere, where a constant mean would hold the tool back. With the kernel's
+vector k(s) and matrix K, r = `noise`, q = `spread` and d = `deviation`,
+
+    mean         m(s) = p(s) + k(s) (K + r S)^-1 (y - p)
+    covariance   C(s) = d² (k(s, s) - k(s) (K + q S)^-1 k(s)ᵀ)
+    scatter      S_n ~ (1 - a) Σ_m w_nm e_m e_mᵀ + a |e|² I,   w_nm ~ exp(-|s_n - s_m|² / (2 l²))
+
+S is scaled so that the mean of its traces is 3; e are the residuals without each point's person,
+|e|² the mean of their squared coordinates, a = SHARED, l = LOCAL_M, and the w_nm add up to 1. ell,
+r and p are those with the smallest residuals, of (K + r I)^-1; q is the least one under which the
+residuals are about as likely as under any. With C_1 the covariance for d = 1, H persons and
+sigma = NOISE_M,
+
+    d² = max((H + 1) / (H - 1) mean(eᵀ C_1^-1 e), mean(trace(sigma² C_1^-1))) / 3
+
+as each of H persons is predicted by H - 1 whose scatter was measured on the same few.
 """
 
 from __future__ import annotations
@@ -19,63 +32,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP, AffineMean, GaussianKernel, Gaussians
+from kmp.cross_validation import (
+    held_out_covariances,
+    held_out_residuals,
+    mahalanobis,
+    preferred,
+    rms,
+    squared_distances,
+)
 from service.core.frame import Vector
 from service.learning.skill_file import SkillError
 from service.settings.config import ToolSettings
 
-ELLS = 2.0 ** np.arange(-1.0, 4.0)  # [1/m²] beyond these, via-points bend everything or nothing
-NARROW = 2.0 ** np.arange(-1.0, 6.0)  # [1/m²] of more inputs than positions: hands are farther from each other there
-NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # a reference point's variance over the kernel's, for the mean
-SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # the same, for the covariance
-AS_LIKELY = 0.05  # [nat] less likely is as good: then what grows most off the data
-LOCAL_M = 0.08  # distance of hands over which demonstrations are alike in how much they differ
-SHARED = 0.15  # of the scatter that is everywhere the same, as few demonstrations tell little of one place
-REGIONS = (2.366, 7.815)  # chi-square of three degrees of freedom: the 50 and 95 % regions of a normal in space
-CLEARLY = 0.9  # a linear mean must have less than this share of a constant one's error: it extrapolates
-RIDGE_M = 0.005  # along which hands hardly moved, as trackers and fingers tremble, the tool is said to stay
-RIDGES = (RIDGE_M, 0.05)  # [m] of more inputs than positions, of which some tell nothing that others do not
-MAX_GAIN = ToolSettings().max_gain  # of a linear mean, as of the way between via-points
-NOISE_M = 0.001  # of a good tracker, each axis: demonstrations without noise tell no more of people
-DWELL = 0.25  # share of the reference points that goes by time, the rest by the hands' way
+ELLS_PER_M2 = 2.0 ** np.arange(-1.0, 4.0)  # beyond these, via-points bend everything or nothing
+RICH_ELLS_PER_M2 = 2.0 ** np.arange(-1.0, 6.0)  # inputs with memory or turns are farther from each other
+NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # r = variance of a reference point / variance of the kernel
+SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # q, the same ratio for the covariance
+LIKELIHOOD_TOLERANCE_NAT = 0.05  # a spread less likely by this much counts as equally likely
+LOCAL_M = 0.08  # l, the standard deviation of the weights with which residuals are averaged
+SHARED = 0.15  # a, the share of the scatter that is the same everywhere
+RIDGE_M = 0.005  # an input that varies by less, as trembling hands do, does not move the affine mean
+RICH_RIDGES_M = (RIDGE_M, 0.05)  # the second one suppresses inputs that repeat what others tell
+LINEAR_SHARE = 0.9  # an affine mean extrapolates, so its error must be below this share of a constant one's
+MAX_GAIN = ToolSettings().max_gain  # largest singular value of an affine mean, as between via-points
+NOISE_M = 0.001  # sigma, the noise of a good tracker on each axis, which made demonstrations lack
+DWELL_SHARE = 0.25  # this share of the reference points is even in time, the rest along the hands' path
+LEAST_POINTS = 4  # reference points of a demonstration
 
 
 class Parameters(NamedTuple):
-    """What `Choice.primitive` needs."""
+    """Hyper-parameters of a primitive, see the equations of this module."""
 
     ell: float  # [1/m²] of the kernel
-    noise: float  # a reference point's variance over the kernel's, for the mean
-    spread: float  # the same, for the covariance
-    deviation: float  # [m] standard deviation far from all data
-    ridge_m: float | None = None  # of the linear prior mean; None: it is constant
+    noise: float  # r
+    spread: float  # q
+    deviation: float  # [m] d, the standard deviation far from all data
+    ridge_m: float | None = None  # of the affine prior mean; None if the prior mean is constant
 
 
 def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
-    """About `count` of the samples (T, 6), (T, 3) [m], evenly along the hands' way and a little
-    along the time, so that rests keep some.
+    """About `count` samples of hands (T, 6) and tool (T, 3) [m], evenly along the hands' path and,
+    so that rests keep some, a little along time.
     """
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(hands, axis=0), axis=1))])
-    along = way / max(way[-1], 1e-9) + DWELL * np.linspace(0.0, 1.0, len(way))
-    kept = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(way) - 1))
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(hands, axis=0), axis=1))])
+    along = path / max(path[-1], 1e-9) + DWELL_SHARE * np.linspace(0.0, 1.0, len(path))
+    kept = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1))
     return hands[kept], tool[kept]
 
 
-def in_time(inputs: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
-    """About `count` of the samples (T, I), (T, 3), evenly in time, as an error counts at any."""
+def even_in_time(inputs: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
+    """About `count` samples of inputs (T, I) and tool (T, 3), evenly in time."""
     kept = np.unique(np.linspace(0.0, len(inputs) - 1, count).round().astype(int))
     return inputs[kept], tool[kept]
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Reference points of H demonstrations: inputs (N, I), outputs (N, 3) [m], and owners (N,),
-    which are left out one after the other: a demonstration, or those of a person.
+    """Reference points of demonstrations: inputs (N, I), outputs (N, 3) [m] and the persons (N,)
+    that are held out one after the other.
     """
 
     inputs: Vector
     outputs: Vector
     owner: NDArray[np.intp]
-    alike: bool = False  # whether each point is as sure about all outputs: a covariance is found in a ninth of the time
-    even: bool = False  # whether the points are even in time, and the mean beneath chosen with the kernel
+    isotropic: bool = False  # true if S is a multiple of I at each point, which costs a ninth of the time
+    rich: bool = False  # true if points are even in time, and the prior mean is chosen with the kernel
 
     @classmethod
     def of(
@@ -83,37 +104,36 @@ class Choice:
         pairs: Sequence[tuple[Vector, Vector]],
         points: int,
         *,
-        together: NDArray[np.intp] | None = None,
-        alike: bool = False,
-        even: bool = False,
+        persons: NDArray[np.intp] | None = None,
+        isotropic: bool = False,
+        rich: bool = False,
     ) -> Choice:
-        """About so many points of the demonstrations' inputs (T, I) and tools (T, 3) [m], of which
-        those are left out `together` (H,) that have the same number; each alone, if not given.
+        """About `points` reference points of demonstrations, each inputs (T, I) and tool (T, 3)
+        [m], by `persons` (H,); None if each is by another person.
         """
-        each = max(4, points // len(pairs))
-        parts = [(in_time if even else thinned)(hands, tool, each) for hands, tool in pairs]
-        numbers = np.arange(len(parts), dtype=np.intp) if together is None else together
-        owner = np.repeat(numbers, [len(hands) for hands, _ in parts])
-        return cls(np.concatenate([h for h, _ in parts]), np.concatenate([t for _, t in parts]), owner, alike, even)
+        each = max(LEAST_POINTS, points // len(pairs))
+        parts = [(even_in_time if rich else thinned)(inputs, tool, each) for inputs, tool in pairs]
+        numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
+        inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return cls(inputs, outputs, np.repeat(numbers, [len(one) for one, _ in parts]), isotropic, rich)
 
     @cached_property
     def _constant(self) -> Vector:
         return np.asarray(self.outputs.mean(axis=0))
 
-    def _kept(self, without: int | None) -> NDArray[np.bool_]:
-        return np.ones(len(self.owner), bool) if without is None else self.owner != without
-
     @cached_property
     def _squares(self) -> Vector:
-        norms = (self.inputs**2).sum(axis=1)
-        squares = norms[:, None] + norms - 2.0 * self.inputs @ self.inputs.T
-        return np.asarray(np.maximum(0.5 * (squares + squares.T), 0.0))
+        return squared_distances(self.inputs)
 
-    def mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
-        """The root mean square error [m] and the parameters of the mean that predicts best a
-        demonstration left out, with this ell or the best; `spread` and `deviation` say nothing yet.
+    @cached_property
+    def _targets(self) -> dict[tuple[float | None, int], Vector]:
+        return {}
 
-        Raises SkillError where nothing can be left out.
+    def best_mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
+        """The root mean square residual [m] and the parameters of the best mean, with this ell or
+        any of the module's; `spread` and `deviation` are 1.
+
+        Raises SkillError if all points are of one person.
         """
         count = len(np.unique(self.owner))
         if count < 2:
@@ -121,89 +141,72 @@ class Choice:
                 f"{count} demonstration given: at least 2 needed, as what is learned from the others must predict "
                 "each; record another"
             )
-        ells, ridges = (NARROW, RIDGES) if self.even else (ELLS, (RIDGE_M,))
+        ells, ridges = (RICH_ELLS_PER_M2, RICH_RIDGES_M) if self.rich else (ELLS_PER_M2, (RIDGE_M,))
         ells = ells if ell is None else np.array([ell])
-        beneath = (None, *ridges) if may_be_linear and self.even else (None,)
-        tried = list(self._tried(ells, beneath))
+        tried = list(self._tried(ells, (None, *ridges) if may_be_linear and self.rich else (None,)))
         constant = min((one for one in tried if one[1].ridge_m is None), key=lambda one: one[0])
         if not may_be_linear:
             return constant
-        # Of positions the kernel's length stays: off the data the covariance grows as fast, and the
-        # gate holds what it would hold over a constant, however straight the way was.
-        tried = tried if self.even else list(self._tried(np.array([constant[1].ell]), ridges))
+        # Over positions both means have the same kernel, so off the data the covariance grows
+        # equally fast and the gate holds the same hands.
+        tried = tried if self.rich else list(self._tried(np.array([constant[1].ell]), ridges))
         linear = min((one for one in tried if one[1].ridge_m is not None), key=lambda one: one[0])
-        return linear if linear[0] < (1.0 if self.even else CLEARLY) * constant[0] else constant
+        return linear if linear[0] < (1.0 if self.rich else LINEAR_SHARE) * constant[0] else constant
 
     def _tried(self, ells: Vector, ridges: Sequence[float | None]) -> Iterator[tuple[float, Parameters]]:
         for ell in ells.tolist():
-            for noise, missed in zip(NOISES.tolist(), self._missed(ell, NOISES, ridges), strict=True):
-                for ridge_m, residuals in zip(ridges, missed, strict=True):
+            for noise, by_ridge in zip(NOISES.tolist(), self._residuals(ell, NOISES, ridges), strict=True):
+                for ridge_m, residuals in zip(ridges, by_ridge, strict=True):
                     yield rms(residuals), Parameters(ell, noise, 1.0, 1.0, ridge_m)
 
     def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
-        """Those that predict best a demonstration left out, with this ell or the best; over a
-        linear mean, where it may be, only if they do so clearly better.
+        """The parameters that predict held-out persons best, with this ell or any of the module's.
 
-        Raises SkillError where nothing can be left out.
+        Raises SkillError if all points are of one person.
         """
-        _, unscaled = self.mean(ell, may_be_linear=may_be_linear)
-        over = unscaled if self.even or unscaled.ridge_m is None else self.mean(unscaled.ell)[1]
-        spread = self._spread(unscaled.ell, self.residuals(over.ell, over.noise, over.ridge_m))
+        _, unscaled = self.best_mean(ell, may_be_linear=may_be_linear)
+        basis = unscaled if self.rich or unscaled.ridge_m is None else self.best_mean(unscaled.ell)[1]
+        spread = self._spread(unscaled.ell, self.residuals(basis.ell, basis.noise, basis.ridge_m))
         unscaled = unscaled._replace(spread=spread)
         residuals = self.residuals(unscaled.ell, unscaled.noise, unscaled.ridge_m)
         squares, floors = [], []
-        owners = np.unique(self.owner)
-        for left_out in owners.tolist():
-            mine = self.owner == left_out
-            found = self.primitive(unscaled, residuals, without=left_out).predict(self.inputs[mine])
+        persons = np.unique(self.owner)
+        for person in persons.tolist():
+            mine = self.owner == person
+            found = self.primitive(unscaled, residuals, without=person).predict(self.inputs[mine])
             squares.append(mahalanobis(self.outputs[mine] - found.mean, found.covariance))
             floors.append(NOISE_M**2 * np.trace(np.linalg.inv(found.covariance), axis1=1, axis2=2))
-        # Of H demonstrations each is predicted by H - 1 whose scatter was measured on the same few.
-        few = (len(owners) + 1) / (len(owners) - 1)
+        few = (len(persons) + 1) / (len(persons) - 1)
         scale = max(few * np.concatenate(squares).mean(), np.concatenate(floors).mean()) / 3
         return unscaled._replace(deviation=float(np.sqrt(scale)))
 
     def residuals(self, ell: float, noise: float, ridge_m: float | None = None) -> Vector:
-        """By how far the mean from the other demonstrations misses each point (N, 3) [m]."""
-        return np.asarray(self._missed(ell, np.array([noise]), (ridge_m,))[0, 0])
+        """The residuals (N, 3) [m] of each point without its person."""
+        return np.asarray(self._residuals(ell, np.array([noise]), (ridge_m,))[0, 0])
 
-    def _missed(self, ell: float, noises: Vector, ridges: Sequence[float | None]) -> Vector:
-        """The residuals (J, R, N, 3) [m] with each noise (J,) over each mean beneath (R,): by one
-        eigendecomposition, as noise moves eigenvalues alone.
-        """
-        values, vectors = np.linalg.eigh(np.exp(-ell * self._squares))
-        out = np.empty((len(noises), len(ridges), *self.outputs.shape))
-        for h in np.unique(self.owner).tolist():
-            mine, departures = self.owner == h, [self._departures(ridge_m)[h] for ridge_m in ridges]
-            rows = vectors[mine] / (values + noises[:, None])[:, None]
-            missed = np.linalg.solve(rows @ vectors[mine].T, rows @ (vectors.T @ np.hstack(departures)))
-            out[:, :, mine] = missed.reshape(*missed.shape[:2], len(ridges), 3).swapaxes(1, 2)
-        return out
+    def _residuals(self, ell: float, noises: Vector, ridges: Sequence[float | None]) -> Vector:
+        """The residuals (J, R, N, 3) [m] for noises (J,) and prior means of these ridges (R,)."""
+        kernel, shape = np.exp(-ell * self._squares), (len(noises), len(self.owner), len(ridges), 3)
+        found = held_out_residuals(
+            kernel, noises, self.owner, lambda person: np.hstack([self._target(ridge_m, person) for ridge_m in ridges])
+        )
+        return np.asarray(found.reshape(shape).swapaxes(1, 2))
 
-    def _departures(self, ridge_m: float | None) -> dict[int, Vector]:
-        """By how much outputs (N, 3) depart from the mean beneath, without each demonstration."""
-        if ridge_m not in self._known:
-            owners = np.unique(self.owner).tolist()
-            self._known[ridge_m] = {h: self._departing(ridge_m, self._kept(h)) for h in owners}
-        return self._known[ridge_m]
-
-    @cached_property
-    def _known(self) -> dict[float | None, dict[int, Vector]]:
-        return {}
-
-    def _departing(self, ridge_m: float | None, kept: NDArray[np.bool_]) -> Vector:
+    def _target(self, ridge_m: float | None, without: int) -> Vector:
+        """The outputs (N, 3) minus the prior mean that is fitted without a person."""
         if ridge_m is None:
             return np.asarray(self.outputs - self._constant)
-        mean = ridge(self.inputs[kept], self.outputs[kept], ridge_m)
-        return np.asarray(self.outputs - self.inputs @ mean.matrix.T - mean.offset)
+        if (ridge_m, without) not in self._targets:
+            kept = self.owner != without
+            mean = ridge(self.inputs[kept], self.outputs[kept], ridge_m)
+            self._targets[ridge_m, without] = self.outputs - self.inputs @ mean.matrix.T - mean.offset
+        return self._targets[ridge_m, without]
 
     def primitive(self, parameters: Parameters, residuals: Vector, *, without: int | None = None) -> KMP:
-        """The primitive of all demonstrations but one.
-
-        The covariance of IJRR 2019 has two free scales: with N / lambda_c the square of `deviation`
-        it comes to that far from the data, and Sigma is then what gives each point its `spread`.
+        """The primitive of all persons but one, with the covariance of IJRR 2019:
+        N / lambda_c = d² and lambda_c Sigma_n = q S_n; for the mean, lambda Sigma_n = r S_n.
         """
-        kept = self._kept(without)
+        kept = np.ones(len(self.owner), bool) if without is None else self.owner != without
         lambda_covariance = kept.sum() / parameters.deviation**2
         size = parameters.spread / lambda_covariance
         return KMP.fit(
@@ -218,64 +221,41 @@ class Choice:
         )
 
     def _scatter(self, residuals: Vector, kept: NDArray[np.bool_]) -> Vector:
-        """Scatter (n, 3, 3) of the residuals around each of the kept points, over its mean."""
+        """The scatter S (n, 3, 3) of the residuals around the kept points."""
         known = residuals[kept]
-        near = np.exp(-0.5 * self._squares[np.ix_(kept, kept)] / LOCAL_M**2)
-        near /= near.sum(axis=1, keepdims=True)
-        local = np.einsum("nm,mi,mj->nij", near, known, known)
-        if self.alike:
+        weights = np.exp(-0.5 * self._squares[np.ix_(kept, kept)] / LOCAL_M**2)
+        weights /= weights.sum(axis=1, keepdims=True)
+        local = np.einsum("nm,mi,mj->nij", weights, known, known)
+        if self.isotropic:
             local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         local = (1 - SHARED) * local + SHARED * max((known**2).mean(), 1e-12) * np.eye(3)
         return np.asarray(local / (np.trace(local, axis1=1, axis2=2).mean() / 3))
 
     def _spread(self, ell: float, residuals: Vector) -> float:
-        """The spread under which these residuals are most likely, at whatever scale; of those as
-        likely the least, with which the covariance grows most off the data.
+        """The least q under which the residuals are about as likely as under any, at any scale; the
+        covariance then grows most off the data.
         """
         scatter = self._scatter(residuals, np.ones(len(self.owner), bool))
-        likelihoods = []
-        for covariance in self._left_out(np.exp(-ell * self._squares), scatter):
-            scale = mahalanobis(residuals, covariance).mean() / 3
-            likelihoods.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariance)[1].mean()))
-        return float(SPREADS[np.flatnonzero(np.array(likelihoods) <= min(likelihoods) + AS_LIKELY)[0]])
-
-    def _left_out(self, kernel: Vector, scatter: Vector) -> Vector:
-        """The covariances (J, N, 3, 3) at each point given the other demonstrations, in units of
-        the kernel, where the points' noise is each of SPREADS (J,) times their scatter (N, 3, 3):
-        by one eigendecomposition of the kernel over that, of one output where all are alike.
-        """
-        roots = np.linalg.cholesky(scatter[:, :1, :1] if self.alike else scatter)
-        white, (count, width, _) = np.linalg.inv(roots), roots.shape
-        total = np.einsum("nm,nik,mjk->nimj", kernel, white, white, optimize=True).reshape(2 * [count * width])
-        values, vectors = np.linalg.eigh(total)
-        out = np.empty((len(SPREADS), count, width, width))
-        for h in np.unique(self.owner):
-            mine = np.flatnonzero(self.owner == h)
-            rows, each = vectors[(width * mine[:, None] + np.arange(width)).ravel()], np.arange(len(mine))
-            blocks = np.linalg.inv(rows / (values + SPREADS[:, None])[:, None] @ rows.T)
-            found = blocks.reshape(-1, len(mine), width, len(mine), width)[:, each, :, each].swapaxes(0, 1)
-            out[:, mine] = roots[mine] @ (found - SPREADS[:, None, None, None] * np.eye(width)) @ roots[mine].mT
-        return 0.5 * (out + out.mT) * np.eye(3) if self.alike else 0.5 * (out + out.mT)
+        if self.isotropic:
+            scatter = scatter[:, :1, :1]
+        costs = []
+        for covariance in held_out_covariances(np.exp(-ell * self._squares), scatter, SPREADS, self.owner):
+            covariances = covariance * np.eye(3) if self.isotropic else covariance
+            scale = mahalanobis(residuals, covariances).mean() / 3
+            costs.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariances)[1].mean()))
+        return float(preferred(SPREADS.tolist(), costs, min(costs) + LIKELIHOOD_TOLERANCE_NAT))
 
 
-def ridge(hands: Vector, tool: Vector, ridge_m: float = RIDGE_M) -> AffineMean:
-    """The linear mean of a tool (N, 3) [m] for inputs (N, I) [m], by ridge regression; its gain is
-    MAX_GAIN at most.
+def ridge(inputs: Vector, outputs: Vector, ridge_m: float = RIDGE_M) -> AffineMean:
+    """The affine mean of outputs (N, 3) [m] over inputs (N, I) [m] by ridge regression,
+
+        A = Yᵀ X (Xᵀ X + N ridge_m² I)^-1
+
+    for centred X and Y, with the singular values of A limited to MAX_GAIN.
     """
-    centre, middle = hands.mean(axis=0), tool.mean(axis=0)
-    off = hands - centre
-    square = off.T @ off + len(hands) * ridge_m**2 * np.eye(hands.shape[1])
-    u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (tool - middle)).T, full_matrices=False)
+    centre, middle = inputs.mean(axis=0), outputs.mean(axis=0)
+    off = inputs - centre
+    square = off.T @ off + len(inputs) * ridge_m**2 * np.eye(inputs.shape[1])
+    u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (outputs - middle)).T, full_matrices=False)
     matrix = (u * np.minimum(gains, MAX_GAIN)) @ v
     return AffineMean(matrix, middle - matrix @ centre)
-
-
-def rms(errors: Vector) -> float:
-    """Root mean square length of errors (M, 3) [m]."""
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
-
-
-def mahalanobis(errors: Vector, covariance: Vector) -> Vector:
-    """Squared Mahalanobis distances (M,) of errors (M, 3) under covariances (M, 3, 3)."""
-    white = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ni,ni->n", errors, white))

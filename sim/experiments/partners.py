@@ -18,8 +18,8 @@ import numpy as np
 
 from service.contract.requests import TOLERANCE_M
 from service.core.skill.model import LEVELS
-from service.learning.judgement import Figures
 from service.learning.learn import learn
+from service.learning.records import Figures
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
 from sim.experiments.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from service.learning.choice import ELLS, NOISES, REGIONS, Choice, mahalanobis, rms, thinned
+from kmp.cross_validation import mahalanobis, rms
+from service.core.skill.model import CHI_SQUARE, LEVELS
+from service.learning.choice import ELLS_PER_M2, NOISES, Choice, thinned
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
@@ -48,7 +50,7 @@ def test_the_residuals_left_out_are_those_of_primitives_fitted_without(choice: C
 
 def test_the_choice_is_as_good_as_any_that_was_tried(choice: Choice) -> None:
     found = choice.parameters()
-    errors = {(ell, noise): rms(choice.residuals(ell, noise)) for ell in ELLS for noise in NOISES}
+    errors = {(ell, noise): rms(choice.residuals(ell, noise)) for ell in ELLS_PER_M2 for noise in NOISES}
     assert errors[found.ell, found.noise] == min(errors.values())
     assert choice.parameters(8.0).ell == 8.0
 
@@ -86,6 +88,7 @@ def test_people_who_were_not_seen_are_where_the_skill_says_they_may_be() -> None
     unseen = [shown(900 + seed) for seed in range(10)]
     hands, tools = (np.concatenate(parts) for parts in zip(*unseen, strict=True))
     error, expected, within = [], [], []
+    regions = [CHI_SQUARE[LEVELS.index(level)] for level in (0.5, 0.95)]
     for draw in range(4):
         choice = Choice.of([shown(100 * draw + seed) for seed in range(50, 55)], 120)
         found = choice.parameters()
@@ -93,7 +96,7 @@ def test_people_who_were_not_seen_are_where_the_skill_says_they_may_be() -> None
         errors = tools - predicted.mean
         error.append(rms(errors))
         expected.append(np.sqrt(np.trace(predicted.covariance, axis1=1, axis2=2).mean()))
-        within.append((mahalanobis(errors, predicted.covariance)[:, None] <= REGIONS).mean(axis=0))
+        within.append((mahalanobis(errors, predicted.covariance)[:, None] <= regions).mean(axis=0))
     assert np.mean(error) < 0.026
     assert np.mean(expected) == pytest.approx(np.mean(error), rel=0.25)
     half, most = np.mean(within, axis=0)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from kmp import KMP, AffineMean, GaussianKernel, Gaussians
+from kmp.cross_validation import rms
 from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
-from service.learning.baselines import left_out, linear
-from service.learning.choice import MAX_GAIN, RIDGE_M, Choice, ridge, rms
+from service.learning.baselines import held_out_errors, linear
+from service.learning.choice import MAX_GAIN, RIDGE_M, Choice, ridge
 from service.learning.gate import nonsense
-from service.learning.learn import Evidence, learn
+from service.learning.learn import learn
+from service.learning.records import Evidence
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.learning.via_points import adapted
 from support.circling import circling
@@ -37,7 +39,7 @@ def skill(evidence: Evidence) -> StoredSkill:
 
 @pytest.fixture(scope="module")
 def choice(evidence: Evidence) -> Choice:
-    return Choice.of(evidence.paths, 120)
+    return Choice.of([(one.take.hands, one.take.position) for one in evidence.held_out], 120)
 
 
 def mean_of(skill: StoredSkill) -> AffineMean:
@@ -53,12 +55,12 @@ def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant
     error = rms(np.concatenate([one.errors for one in evidence.held_out]))
     constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
     over_constant = [
-        tool - choice.primitive(constant, residuals, without=h).mean(hands)
-        for h, (hands, tool) in enumerate(evidence.paths)
+        one.take.position - choice.primitive(constant, residuals, without=h).mean(one.take.hands)
+        for h, one in enumerate(evidence.held_out)
     ]
     assert error < 0.010
     assert error < 0.6 * rms(np.concatenate(over_constant))
-    assert error < 0.75 * rms(np.concatenate(left_out(evidence.paths, np.arange(5), linear)))
+    assert error < 0.75 * rms(np.concatenate(held_out_errors([one.take for one in evidence.held_out], linear)))
 
 
 def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without(choice: Choice) -> None:
@@ -77,7 +79,7 @@ def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without
 
 def test_off_the_data_it_is_refused_as_over_a_constant(skill: StoredSkill, choice: Choice, evidence: Evidence) -> None:
     """Where the mean extrapolates, the gate holds; and no less than with the constant mean."""
-    some = np.concatenate([hands[::20] for hands, _ in evidence.paths])
+    some = np.concatenate([one.take.hands[::20] for one in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
