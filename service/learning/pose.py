@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.cross_validation import rms
+from kmp.direct import DirectSelection, Parameters
 from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector
 from service.core.geometry import angles
 from service.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from service.learning.ambiguity import contradictions
-from service.learning.choice import Choice, Parameters
+from service.learning.choice import selection_of
 from service.learning.records import HeldOut, Pose, Verdict, persons_of
 
 CONSTANT_RAD = math.radians(5.0)  # an orientation that stays this near to its mean counts as constant
@@ -122,7 +123,7 @@ def _learned_turn(
     persons = persons_of([one.take for one in held_out])
     zetas = [log(q, mean) for q in unit]
     pairs = [(one.inputs, zeta) for one, zeta in zip(held_out, zetas, strict=True)]
-    choice = Choice.of(pairs, points, persons=persons, isotropic=True)
+    choice = selection_of(pairs, points, persons=persons, isotropic=True)
     several = len(np.unique(persons)) > 1
     parameters = choice.parameters() if several else SINGLE_TAKE
     residuals = choice.residuals(parameters.ell, parameters.noise)
@@ -160,7 +161,7 @@ def _learned_gripper(
         return None, None, []
     unknown = [one.take.name for one in held_out if one.take.closure is None]
     remarks = [f"{', '.join(unknown)} without gripper: it is learned from the others"] * bool(unknown)
-    choice = Choice.of(known, points)
+    choice = selection_of(known, points)
     right, prior = None, np.array([UNDECIDED])
     if len(known) > 1:
         right = 100.0 * float(np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(known))]).mean())
@@ -170,9 +171,9 @@ def _learned_gripper(
     return LearnedGripper(primitive), right, remarks
 
 
-def _is_right(choice: Choice, take: int, prior: Vector, ell: float) -> NDArray[np.bool_]:
+def _is_right(choice: DirectSelection, take: int, prior: Vector, ell: float) -> NDArray[np.bool_]:
     """Return whether the gripper that the other takes lead to is right at a take's points (N,)."""
-    mine = choice.owner == take
+    mine = choice.group == take
     others = _fitted(choice.inputs[~mine], choice.outputs[~mine], GaussianKernel(ell), prior)
     gripper, found = UNKNOWN, []
     for closure in others.mean(choice.inputs[mine])[:, 0].tolist():

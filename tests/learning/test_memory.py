@@ -27,7 +27,7 @@ def peak_mb():
 takes = []
 for seed in range({TAKES}):
     stamps_ns, left, right, tool = (part[:{SAMPLES}] for part in circling(seed)[:4])
-    takes.append(Demonstration(stamps_ns, left, right, tool, person=str(seed // 3)))
+    takes.append(Demonstration(stamps_ns, left, right, tool, person=str(seed // 6)))
 before = peak_mb()
 learn(takes, ell=8.0)
 print(before, peak_mb())

@@ -20,7 +20,7 @@ from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import features
-from service.learning.choice import Choice
+from service.learning.choice import selection_of
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of
 from service.learning.gate import CEILING_M
@@ -137,9 +137,9 @@ def refit(kind: Inputs, takes: Sequence[Take], inputs: Sequence[Vector], points:
     is_rich = bool(kind.order or kind.turned)
     pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
     count = RICH_TIMES * points if is_rich else points
-    choice = Choice.of(pairs, count, persons=persons_of(takes), isotropic=is_rich, rich=is_rich)
+    choice = selection_of(pairs, count, persons=persons_of(takes), isotropic=is_rich, rich=is_rich)
     parameters = choice.parameters(ell, may_be_linear=True)
-    residuals = choice.residuals(parameters.ell, parameters.noise, parameters.ridge_m)
+    residuals = choice.residuals(parameters.ell, parameters.noise, parameters.ridge)
     return lambda without: choice.primitive(parameters, residuals, without=without)
 
 
@@ -149,7 +149,7 @@ def _chosen(takes: Sequence[Take], points: int, progress: Progress) -> tuple[Inp
     for kind in kinds:
         progress(f"trying {kind.name}")
         pairs = [(kind.of(take.demonstration), take.position) for take in takes]
-        choice = Choice.of(pairs, points, persons=persons_of(takes), rich=True)
+        choice = selection_of(pairs, points, persons=persons_of(takes), rich=True)
         tried_m[kind.name] = choice.best_mean(may_be_linear=True)[0]
     least_m = min(tried_m.values())
     return preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M)), tried_m
