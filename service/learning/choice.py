@@ -18,7 +18,7 @@ RIDGE_M = 0.005  # an input that varies by less, as trembling hands do, does not
 NOISE_M = 0.001  # noise of a good tracker on each axis
 DWELL_SHARE = 0.25  # this share of the reference points is even in time, the rest along the hands' path
 LEAST_POINTS = 4  # reference points of a demonstration
-POSITIONS = Scales(
+POSITION_SCALES = Scales(
     ells=(2.0 ** np.arange(-1.0, 4.0)).tolist(),  # [1/m²] beyond these, via-points bend everything or nothing
     ridges=(RIDGE_M,),
     linear_share=0.9,  # an affine mean extrapolates, so it must be clearly better
@@ -26,7 +26,7 @@ POSITIONS = Scales(
     local=0.08,  # [m]
     noise=NOISE_M,
 )
-RICH = POSITIONS._replace(
+RICH_SCALES = POSITION_SCALES._replace(
     ells=(2.0 ** np.arange(-1.0, 6.0)).tolist(),  # [1/m²] inputs with memory or turns are farther from each other
     ridges=(RIDGE_M, 0.05),  # [m] the second one suppresses inputs that repeat what others tell
     linear_share=1.0,
@@ -51,7 +51,7 @@ def selection_of(
     numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     group = np.repeat(numbers, [len(one) for one, _ in parts])
-    return DirectSelection(inputs, outputs, group, RICH if rich else POSITIONS, isotropic, joint=rich)
+    return DirectSelection(inputs, outputs, group, RICH_SCALES if rich else POSITION_SCALES, isotropic, joint=rich)
 
 
 def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:

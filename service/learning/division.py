@@ -30,15 +30,13 @@ from service.learning.skill_file import SkillError
 
 SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
 SAME_M = 0.05  # positions of a hand that are this near to each other in all demonstrations are the same
-OFF_M = 0.06  # a distance from the segment costs its square over this one's
-FARTHEST = 25.0  # largest cost of a distance, twice
+OFF_M = 0.06  # unit of the distances d_i
+FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
 DIRECTED = 2.0  # gain of moving along the segment
 CORRELATED_S = 0.2  # samples within this time count as one
-NEXT, ANOTHER, LATER = (
-    2.0,
-    12.0,
-    3.0,
-)  # costs of a change to the next stage, of any other, and of each stage skipped first
+NEXT = 2.0  # cost of a change to the next stage
+ANOTHER = 12.0  # cost of any other change
+LATER = 3.0  # cost of each stage that is left out at the beginning
 NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}

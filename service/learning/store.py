@@ -11,7 +11,7 @@ from service.learning.records import Fitted, Pose
 from service.learning.skill_file import StoredSkill, with_file
 from service.learning.takes import Division, conductor_of
 
-MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions by this distance
+BOX_MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions by this distance
 
 
 def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement: Judgement) -> StoredSkill:
@@ -23,7 +23,7 @@ def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement:
         orientation=pose.orientation,
         turn=pose.turn,
         gripper=pose.gripper,
-        workspace=np.stack([positions.min(axis=0) - MARGIN_M, positions.max(axis=0) + MARGIN_M]),
+        workspace=np.stack([positions.min(axis=0) - BOX_MARGIN_M, positions.max(axis=0) + BOX_MARGIN_M]),
         threshold=fitted.gate.threshold,
         learned_from=fingerprint(take.demonstration for take in division.takes),
         components=division.options.components or 0,

@@ -52,18 +52,15 @@ def divided(demonstrations: Sequence[Demonstration], names: Sequence[str], optio
             raise SkillError(f"{name}: {error}") from None
     repeats = _repeats(demonstrations)
     kept = [i for i in range(len(demonstrations)) if i not in repeats]
-    remarks = repeated = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in repeats.items()]
+    repeated = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in repeats.items()]
     demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
     if max(map(moved_m, demonstrations)) < LEAST_M:
         raise SkillError(
             f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"
         )
     check_count(names, options.components, "".join(f"; {remark}" for remark in repeated))
-    if len(names) == 1:
-        remarks = [
-            *repeated,
-            "one demonstration: none was held out, so its error is of what was learned, and judges nothing",
-        ]
+    single = "one demonstration: none was held out, so its error is of what was learned, and judges nothing"
+    remarks = [*repeated, *[single] * (len(names) == 1)]
     hand = _conducting(demonstrations, names)
     conductor = None if hand == "both" else SIDES.index(hand)
     if conductor is not None:

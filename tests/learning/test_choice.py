@@ -11,7 +11,7 @@ from kmp import KMP, GaussianKernel, Gaussians
 from kmp.cross_validation import mahalanobis, rms
 from kmp.direct import DirectSelection
 from service.core.skill.model import CHI_SQUARE, LEVELS
-from service.learning.choice import POSITIONS, selection_of, thinned
+from service.learning.choice import POSITION_SCALES, selection_of, thinned
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
@@ -53,7 +53,7 @@ def test_the_choice_is_as_good_as_any_that_was_tried(choice: DirectSelection) ->
     found = choice.parameters()
     errors = {
         (ell, noise): rms(choice.residuals(ell, noise))
-        for ell in POSITIONS.ells
+        for ell in POSITION_SCALES.ells
         for noise in 10.0 ** np.arange(-3.0, 0.1, 0.5)
     }
     assert errors[found.ell, found.noise] == min(errors.values())
