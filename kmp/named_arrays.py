@@ -1,8 +1,13 @@
-"""A primitive as named arrays, exact to the bit, as a file holds them."""
+"""Values of this package as named arrays, exact to the bit: what their files hold.
+
+A primitive has the names of `_NAMES`. Any other value has its kind, and its fields by name; a value
+in a value, also a primitive, has the field's name before its own names.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -16,10 +21,16 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.low_rank import LowRank
-from kmp.predictor import Inner
+from kmp.mixture import GaussianMixture
+from kmp.orientation import OrientationKMP
+from kmp.predictor import Inner, Uncertainty
 from kmp.primitive import KMP
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
+from kmp.query import MotionPrediction
+from kmp.references.correlation import Correlation, Improvement
+from kmp.references.frames import CoordinateFrame, LocalKMP
+from kmp.selection import Learned, Score
 from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
@@ -30,10 +41,38 @@ _NAMES = (
 )
 _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
+KIND = "kind"
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        *(KMP, OrientationKMP, LocalKMP, CoordinateFrame, LinearConstraints, AffineMean),
+        *(Gaussians, GaussianMixture, GaussianKernel, VelocityKernel, PeriodicKernel),
+        *(Correlation, Improvement, Learned, Score, Uncertainty, MotionPrediction),
+    )
+}
 
 
-def to_arrays(primitive: KMP) -> dict[str, NDArray[Any]]:
-    """The arrays for `from_arrays`, by name: base, via-points, fitted weights, parameters."""
+def to_arrays(value: object) -> dict[str, NDArray[Any]]:
+    """The arrays for `from_arrays`, by name; of a primitive its base, via-points, fitted weights
+    and parameters.
+
+    Raises ValueError if the value is not of this package.
+    """
+    return _of_primitive(value) if isinstance(value, KMP) else _of_value(value, "")
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """The value of the arrays of `to_arrays`, a primitive with its stored weights.
+
+    Other names are ignored. `predict` and `adapt` of a primitive compute the factors when they
+    first need them, to the same bits with the same libraries and kind of processor. Raises
+    ValueError if an array is missing, or the arrays do not belong together.
+    """
+    check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
+    return _value(arrays, "") if KIND in arrays else _primitive(arrays)
+
+
+def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
     base, changes, solution = primitive.base.inner.solution, primitive.inner.changes, primitive.inner.solution
     parameters = base.hyperparameters
     arrays = {
@@ -66,14 +105,7 @@ def to_arrays(primitive: KMP) -> dict[str, NDArray[Any]]:
     return arrays | base.to_arrays()
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> KMP:
-    """The primitive of the arrays of `to_arrays`, with the stored weights.
-
-    Other names are ignored. `predict` and `adapt` compute the factors when they first need them, to
-    the same bits with the same libraries and kind of processor. Raises ValueError if an array is
-    missing, or the arrays do not belong together.
-    """
-    check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
+def _primitive(arrays: Mapping[str, NDArray[Any]]) -> KMP:
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
         raise ValueError(
@@ -156,3 +188,48 @@ def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
     if (channels := float(numbers("channels", arrays["channels"]))) != 2:
         raise ValueError(f"channels: {channels:g} given, 2 needed where it is given.")
     return VelocityKernel(float(numbers("ell", arrays["ell"])))
+
+
+def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
+    kind = type(value).__name__
+    if _KINDS.get(kind) is not type(value):
+        raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
+    arrays = {prefix + KIND: np.array(kind)}
+    if isinstance(value, KMP):
+        return arrays | {prefix + name: array for name, array in _of_primitive(value).items()}
+    for name in _fields(value):
+        arrays |= _of_field(getattr(value, name), prefix + name)
+    return arrays
+
+
+def _value(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
+    kind = _KINDS.get(str(arrays[prefix + KIND]))
+    if kind is None:
+        raise ValueError(f"{prefix}{KIND}: {arrays[prefix + KIND]!s:.60} given, one of {', '.join(_KINDS)} needed.")
+    if kind is KMP:
+        return _primitive({name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)})
+    return kind(**{name: _field(arrays, prefix + name) for name in _fields(kind)})
+
+
+def _fields(kind: Any) -> tuple[str, ...]:
+    return tuple(one.name for one in fields(kind)) if is_dataclass(kind) else kind._fields
+
+
+def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:
+    if value is None:
+        return {}
+    if isinstance(value, tuple) and not hasattr(value, "_fields"):
+        parts = [_of_field(part, f"{name}.{i}") for i, part in enumerate(value)]
+        return {f"{name}.count": np.array(len(value))} | {key: array for part in parts for key, array in part.items()}
+    if isinstance(value, (np.ndarray, float, int, str)):
+        return {name: np.array(value)}
+    return _of_value(value, f"{name}.")
+
+
+def _field(arrays: Mapping[str, NDArray[Any]], name: str) -> Any:
+    if name in arrays:
+        array = np.array(arrays[name])
+        return frozen(array) if array.ndim else array.item()
+    if f"{name}.count" in arrays:
+        return tuple(_field(arrays, f"{name}.{i}") for i in range(int(arrays[f"{name}.count"])))
+    return _value(arrays, f"{name}.") if f"{name}.{KIND}" in arrays else None

@@ -18,6 +18,7 @@ from kmp.arrays.checks import Array, check_kind, checked_demonstrations, one_of,
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
+from kmp.cross_validation import preferred, rms
 from kmp.functionals import Functionals
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.mixture import GaussianMixture, mixture_of
@@ -138,8 +139,7 @@ class _Recipe:
         some = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
         inputs, outputs = data[h][0][some], data[h][1][some]
         miss = (mixture.regress(inputs).mean - outputs)[:, : outputs.shape[1] // self.channels]
-        rmse = float(np.sqrt((miss**2).sum(axis=1).mean()))
-        return Fold(rest.inputs, rest.reference, rest.prior_mean, inputs, outputs, rmse)
+        return Fold(rest.inputs, rest.reference, rest.prior_mean, inputs, outputs, rms(miss))
 
 
 class _Folds(NamedTuple):
@@ -318,17 +318,16 @@ class _Search:
 
     def _shortest(self, folds: _Folds, best: _Tried, scores: list[Score]) -> _Tried:
         """The parameters of the shortest lengths whose RMSE is within 3 % of the best."""
-        chosen = best
         if self.kernel is not None:
-            return chosen
+            return best
         *lengths, penalty = best.parameters
         last = max(_ELLS) * 0.5 / self._spread(folds)  # beyond it, a via-point is a spike
         penalties = [0.0] if self.lambda_mean else [penalty + np.log(one) for one in _AROUND]
+        found = [best]
         for factor in _SHORTER[(_SHORTER * np.exp(lengths)[:, None] <= _ROUNDED * last[:, None]).all(axis=0)]:
-            found = min(self._tried(folds, tuple(one + np.log(factor) for one in lengths), penalties, scores))
-            if found.rmse <= _AS_GOOD * best.rmse:
-                chosen = found
-        return chosen
+            found.append(min(self._tried(folds, tuple(one + np.log(factor) for one in lengths), penalties, scores)))
+        shortest_first = found[::-1]
+        return preferred(shortest_first, [one.rmse for one in shortest_first], _AS_GOOD * best.rmse)
 
     def _grid(self, folds: _Folds, scores: list[Score]) -> _Tried:
         variances = self._spread(folds)

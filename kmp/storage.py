@@ -8,40 +8,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import named_arrays
 from kmp.arrays.checks import brief, check_kind
-from kmp.arrays.immutable import frozen
-from kmp.constraints import LinearConstraints
-from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel
-from kmp.mixture import GaussianMixture
-from kmp.orientation import OrientationKMP
-from kmp.predictor import Uncertainty
+from kmp.named_arrays import from_arrays, to_arrays
 from kmp.primitive import KMP
-from kmp.problem.hyperparameters import AffineMean
-from kmp.query import MotionPrediction
-from kmp.references.correlation import Correlation, Improvement
-from kmp.references.frames import CoordinateFrame, LocalKMP
-from kmp.selection import Learned, Score
-from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _FORMAT = 1  # number of the file format
-_KIND = "kind"
-_KINDS: dict[str, Any] = {
-    kind.__name__: kind
-    for kind in (
-        *(KMP, OrientationKMP, LocalKMP, CoordinateFrame, LinearConstraints, AffineMean),
-        *(Gaussians, GaussianMixture, GaussianKernel, VelocityKernel, PeriodicKernel),
-        *(Correlation, Improvement, Learned, Score, Uncertainty, MotionPrediction),
-    )
-}
 
 
 class Stored(NamedTuple):
@@ -87,7 +64,7 @@ def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: 
         "input_unit": np.array(input_unit),
         "output_unit": np.array(output_unit),
     }
-    arrays: dict[str, Any] = units | (named_arrays.to_arrays(value) if isinstance(value, KMP) else value_arrays(value))
+    arrays: dict[str, Any] = units | to_arrays(value)
     with Path(path).open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
@@ -115,59 +92,6 @@ def load(path: str | Path) -> Stored:
             f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."
         )
     try:
-        value = value_of(arrays) if _KIND in arrays else named_arrays.from_arrays(arrays)
-        return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))
+        return Stored(from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def value_arrays(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays of a value and of its kind, with this prefix before each name.
-
-    Raises ValueError if the value is not of this package.
-    """
-    kind = type(value).__name__
-    if _KINDS.get(kind) is not type(value):
-        raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
-    arrays = {prefix + _KIND: np.array(kind)}
-    if isinstance(value, KMP):
-        return arrays | {prefix + name: array for name, array in named_arrays.to_arrays(value).items()}
-    for name in _fields(value):
-        arrays |= _of_field(getattr(value, name), prefix + name)
-    return arrays
-
-
-def value_of(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
-    """The value of the arrays of `value_arrays`. Raises ValueError if its kind is unknown."""
-    kind = _KINDS.get(str(arrays[prefix + _KIND]))
-    if kind is None:
-        raise ValueError(f"{prefix}{_KIND}: {arrays[prefix + _KIND]!s:.60} given, one of {', '.join(_KINDS)} needed.")
-    if kind is KMP:
-        return named_arrays.from_arrays(
-            {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}
-        )
-    return kind(**{name: _field(arrays, prefix + name) for name in _fields(kind)})
-
-
-def _fields(kind: Any) -> tuple[str, ...]:
-    return tuple(one.name for one in fields(kind)) if is_dataclass(kind) else kind._fields
-
-
-def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:
-    if value is None:
-        return {}
-    if isinstance(value, tuple) and not hasattr(value, "_fields"):
-        parts = [_of_field(part, f"{name}.{i}") for i, part in enumerate(value)]
-        return {f"{name}.count": np.array(len(value))} | {key: array for part in parts for key, array in part.items()}
-    if isinstance(value, (np.ndarray, float, int, str)):
-        return {name: np.array(value)}
-    return value_arrays(value, f"{name}.")
-
-
-def _field(arrays: Mapping[str, NDArray[Any]], name: str) -> Any:
-    if name in arrays:
-        array = np.array(arrays[name])
-        return frozen(array) if array.ndim else array.item()
-    if f"{name}.count" in arrays:
-        return tuple(_field(arrays, f"{name}.{i}") for i in range(int(arrays[f"{name}.count"])))
-    return value_of(arrays, f"{name}.") if f"{name}.{_KIND}" in arrays else None

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,7 @@ STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
     *("MAX_SKILL_DISTANCE_M", "FARTHEST_REPORTED_M", "TABLE_DEPTH_M"),  # of files, of reports, of a shape
     *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
 }
+CONVENIENCES = {("kmp.primitive", "kmp.storage")}  # `KMP.save` and `KMP.load` import what stores primitives
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
     "what comes from outside": (
         {
@@ -88,6 +90,32 @@ def imported(path: Path) -> set[str]:
     return found
 
 
+def modules_imported(folder: Path) -> dict[str, set[str]]:
+    """The modules of PACKAGES that each module imports, also in functions and for types alone."""
+    paths = [path.relative_to(folder) for package in PACKAGES for path in (folder / package).rglob("*.py")]
+    names = {".".join(path.with_suffix("").parts).removesuffix(".__init__"): folder / path for path in paths}
+    found: dict[str, set[str]] = {}
+    for module, path in names.items():
+        imports: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imports |= {name.name for name in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                parts = {f"{node.module}.{name.name}" for name in node.names}
+                imports |= parts & names.keys() if parts <= names.keys() else parts & names.keys() | {node.module}
+        found[module] = (imports & names.keys()) - {module}
+    return found
+
+
+def circle(imports: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle; empty if there is none."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
 def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
     """The import contracts of a tree, checked."""
     code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
@@ -106,6 +134,21 @@ def test_import_contracts_hold() -> None:
     done = contracts(ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 broken" in done.stdout
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    imports = modules_imported(ROOT)
+    for module, other in CONVENIENCES:
+        imports[module].remove(other)
+    assert circle(imports) == []
+
+
+@pytest.mark.parametrize("late", ["def f():\n    import service.a", "if TYPE_CHECKING:\n    from service.a import A"])
+def test_a_circle_is_found_also_in_functions_and_for_types_alone(late: str, tmp_path: Path) -> None:
+    (tmp_path / "service").mkdir()
+    for name, text in (("a", "from service import b"), ("b", "from service.c import C"), ("c", late)):
+        (tmp_path / "service" / f"{name}.py").write_text(text, encoding="utf-8")
+    assert set(circle(modules_imported(tmp_path))) == {"service.a", "service.b", "service.c"}
 
 
 @pytest.mark.parametrize(("lines", "broken"), PLANTED.values(), ids=PLANTED)

@@ -16,6 +16,7 @@ from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
+from kmp.cross_validation import rms
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, between
@@ -61,8 +62,8 @@ class Fold:
         for penalty in penalties:
             try:
                 miss = (system.mean(penalty) - self.held_outputs)[:, :outputs]
-                found.append(float(np.sqrt((miss**2).sum(axis=1).mean())))
-            except ValueError:  # not solvable to working precision
+                found.append(rms(miss))
+            except ValueError:  # not solvable to working precision: no candidate
                 found.append(np.inf)
         return found
 

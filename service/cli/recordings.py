@@ -24,10 +24,11 @@ from service.files.pose_streams import SIDES, PoseTopic
 from service.files.recording import Recording
 from service.files.replay import replay as replayed
 from service.files.shipped import cell_of
-from service.learning.judgement import table
-from service.learning.learn import Evidence, check_count
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
+from service.learning.records import Evidence
+from service.learning.table import table
+from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
 
 COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old

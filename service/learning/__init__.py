@@ -1,1 +1,1 @@
-"""From demonstrations to a skill, from that to one through taught via-points, and its file."""
+"""From demonstrations to a skill, its adaptation to via-points, and its file."""

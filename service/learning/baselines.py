@@ -1,56 +1,64 @@
-"""What a skill is set beside: predictions that need no learning, of demonstrations left out."""
+"""Baselines: simple predictions of held-out takes that a skill is compared with."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from service.core.frame import Vector
-from service.learning.demonstration import Demonstration
+from service.learning.records import Take
 
 Predictor = Callable[[Vector, Vector, Vector], Vector]
+LINEAR, LOOK_UP, SAME_TIME = "linear", "look-up", "same elapsed time"  # in a skill's figures
 
 
-def linear(hands: Vector, tool: Vector, asked: Vector) -> Vector:
-    """The tool (M, 3) [m] for hands `asked` (M, 6): the linear function that fits hands (T, 6) and
-    tool (T, 3) best.
+def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
+    """The errors (T, 3) [m] of each take by baselines from other persons' takes, by name; empty if
+    there is one person only.
+    """
+    if len({take.person for take in takes}) < 2:
+        return {}
+    return {
+        LINEAR: held_out_errors(takes, linear),
+        LOOK_UP: held_out_errors(takes, look_up),
+        SAME_TIME: [one.demonstration.tool[:, :3] - same_time(one, others) for one, others in _with_others(takes)],
+    }
+
+
+def linear(hands: Vector, tool: Vector, queries: Vector) -> Vector:
+    """The tool (M, 3) [m] for hands `queries` (M, 6), by the affine function that fits hands (T, 6)
+    and tool (T, 3) best.
     """
     fitted, *_ = np.linalg.lstsq(np.column_stack([hands, np.ones(len(hands))]), tool, rcond=None)
-    return np.asarray(np.column_stack([asked, np.ones(len(asked))]) @ fitted)
+    return np.asarray(np.column_stack([queries, np.ones(len(queries))]) @ fitted)
 
 
-def look_up(hands: Vector, tool: Vector, asked: Vector) -> Vector:
-    """The tool (M, 3) [m] where hands (T, 6) are nearest to those `asked` (M, 6)."""
-    return np.asarray(tool[cKDTree(hands).query(asked)[1]])
+def look_up(hands: Vector, tool: Vector, queries: Vector) -> Vector:
+    """The tool (M, 3) [m] at those of the hands (T, 6) that are nearest to `queries` (M, 6)."""
+    return np.asarray(tool[cKDTree(hands).query(queries)[1]])
 
 
-def left_out(paths: Sequence[tuple[Vector, Vector]], together: NDArray[np.intp], predict: Predictor) -> list[Vector]:
-    """Errors (T, 3) [m] of each demonstration, hands (T, 6) and tool (T, 3) [m], predicted from
-    those that are not left out `together` (H,) with it; none where there are no others.
-    """
-    if len(set(together.tolist())) < 2:
-        return []
+def held_out_errors(takes: Sequence[Take], predict: Predictor) -> list[Vector]:
+    """The errors (T, 3) [m] of each take, predicted from other persons' takes."""
     errors = []
-    for (hands, tool), group in zip(paths, together, strict=True):
-        others = [path for path, other in zip(paths, together, strict=True) if other != group]
-        known, shown = (np.concatenate(parts) for parts in zip(*others, strict=True))
-        errors.append(tool - predict(known, shown, hands))
+    for one, others in _with_others(takes):
+        hands, tool = (np.concatenate(parts) for parts in zip(*((o.hands, o.position) for o in others), strict=True))
+        errors.append(one.position - predict(hands, tool, one.hands))
     return errors
 
 
-def same_time(demonstrations: Sequence[Demonstration], together: NDArray[np.intp]) -> list[Vector]:
-    """As `left_out`, where the tool is said to be in the mean of the others after as much time."""
-    if len(set(together.tolist())) < 2:
-        return []
-    errors = []
-    for one, group in zip(demonstrations, together, strict=True):
-        others = [other for other, its in zip(demonstrations, together, strict=True) if its != group]
-        means = [
-            np.mean([np.interp(one.seconds, other.seconds, other.tool[:, axis]) for other in others], axis=0)
-            for axis in range(3)
-        ]
-        errors.append(one.tool[:, :3] - np.stack(means, axis=1))
-    return errors
+def same_time(take: Take, others: Sequence[Take]) -> Vector:
+    """The mean position (T, 3) [m] of the other takes' tool after the same time."""
+    seconds, found = take.demonstration.seconds, [one.demonstration for one in others]
+    means = [
+        np.mean([np.interp(seconds, other.seconds, other.tool[:, axis]) for other in found], axis=0)
+        for axis in range(3)
+    ]
+    return np.stack(means, axis=1)
+
+
+def _with_others(takes: Sequence[Take]) -> list[tuple[Take, list[Take]]]:
+    """Each take, and those of other persons."""
+    return [(one, [other for other in takes if other.person != one.person]) for one in takes]

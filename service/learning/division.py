@@ -1,5 +1,12 @@
-"""Division of demonstrations that name the via-points of a task into its stages, from via-point to
-via-point.
+"""Division of demonstrations into the stages of their task, each from a via-point to the next.
+
+The stages k(t) are those of least cost (Viterbi 1967):
+
+    Σ_t c(k(t), t) dt / CORRELATED_S + Σ of the costs of changes
+    c(k, t) = Σ_i min(d_i² / OFF_M², FARTHEST) / 2 - DIRECTED tanh(u_i / DIRECTION_SPEED_MPS)
+
+with i = left hand, right hand and tool, d_i its distance from its segment, and u_i its speed along
+it.
 """
 
 from __future__ import annotations
@@ -21,34 +28,41 @@ from service.core.skill.tuning import DIRECTION_SPEED_MPS
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import SkillError
 
-SMOOTHED_S = 0.28  # width of the window over the hands in demonstrations
-SAME_M = 0.05  # positions of a hand that are no farther apart, in any demonstration, are one
-OFF_M, FARTHEST = 0.06, 25.0  # of a way, in whose squares stages are told apart; and the most that counts
-DIRECTED = 2.0  # what it counts that hands and tool go the stage's way
-CORRELATED_S = 0.2  # samples that follow each other so soon tell the same
-NEXT, ANOTHER, LATER = 2.0, 12.0, 3.0  # what it costs to go to the next stage, to any other, to begin a stage later
-NEAR = 0.15  # of the way, to an end of it
-FAR_M = 0.10  # a via-point that the tool never came so near is given wrong
+SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
+SAME_M = 0.05  # positions of a hand that are this near to each other in all demonstrations are the same
+OFF_M = 0.06  # unit of the distances d_i
+FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
+DIRECTED = 2.0  # gain of moving along the segment
+CORRELATED_S = 0.2  # samples within this time count as one
+NEXT = 2.0  # cost of a change to the next stage
+ANOTHER = 12.0  # cost of any other change
+LATER = 3.0  # cost of each stage that is left out at the beginning
+NEAR = 0.15  # shares that differ by less are near to each other
+FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
-def task_of(demonstrations: Sequence[Demonstration]) -> Task | str:
-    """The task of demonstrations, or why there is none, empty where no via-points are named."""
+def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
+    """The task of demonstrations, and why there is none although they name via-points."""
     named = [tuple(point.name for point in one.places) for one in demonstrations]
     if not any(named):
-        return ""
+        return None, ""
     if len(set(map(frozenset, named))) > 1:
-        return "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
+        return None, (
+            "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
+        )
     names = Counter(named).most_common(1)[0][0]
     if not 2 <= len(names) <= MOST_STAGES + 1:
-        return f"{len(names)} named via-points: 2 to {MOST_STAGES + 1} are learned between"
+        return None, f"{len(names)} named via-points: 2 to {MOST_STAGES + 1} are learned between"
     at = np.array([[[*p.left, *p.right] for p in ordered(one.places, names)] for one in demonstrations])
     corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
-    return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)]))
+    return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)])), ""
 
 
 def _corners(at: Vector) -> Indices:
-    """Which of its own positions a hand is at, (N,), for those (D, N, 3) in D demonstrations."""
+    """The index (N,) of a hand's position at each via-point, for positions (D, N, 3) [m] in D
+    demonstrations.
+    """
     out: list[int] = []
     for i in range(at.shape[1]):
         alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
@@ -57,14 +71,15 @@ def _corners(at: Vector) -> Indices:
 
 
 def ordered(points: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
+    """The via-points in the order of these names."""
     by_name = {point.name: point for point in points}
     return (by_name[name] for name in names)
 
 
 def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
-    """In words, which via-points the tool never came near in which demonstrations, by their names.
+    """Warnings about via-points that the tool never came near in some demonstrations.
 
-    Raises SkillError for one that it came near in none.
+    Raises SkillError if it came near in none.
     """
     warned = []
     for named, follow in zip(task.names, task.follow.tolist(), strict=True):
@@ -82,7 +97,9 @@ def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration]
 
 
 def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) -> Vector:
-    """The tool's distance (T,) from a via-point [m], there or with the hand that it follows."""
+    """The tool's distances (T,) [m] from a via-point, or from it moved with the hand that the tool
+    follows, whichever is smaller.
+    """
     off = demonstration.tool[:, :3] - point.tool
     out: Vector = np.linalg.norm(off, axis=1)
     if follow == NONE:
@@ -93,24 +110,22 @@ def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) ->
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A demonstration (T samples) in the stages of its task: which one it is (T,), and what is
-    learned of it, how far along hands (T, 2) and tool (T,) are, and the tool's offset (T, 3) [m].
-    """
+    """A demonstration (T samples) in the stages of its task."""
 
     at: NamedViaPoints
-    stages: Records  # (K,) where they were
-    moving: Vector  # (T, 3, 6) the hands' motion
-    stillness: Vector  # (T, 2) of each hand
-    tool: Vector  # (T, 3)
-    labels: Indices
-    along: Vector
-    off: Vector  # (T, 2) [m] how far hands are off their ways
-    wanted: Vector  # (T, OUTPUTS)
+    stages: Records  # (K,) at the via-points of the demonstration
+    moving: Vector  # (T, 3, 6) position, velocity and acceleration of the hands
+    stillness: Vector  # (T, 2) of each hand, 0 to 1
+    tool: Vector  # (T, 3) [m]
+    labels: Indices  # (T,) numbers of the stages
+    along: Vector  # (T, 2) shares of the stage that the hands have covered
+    off: Vector  # (T, 2) [m] distances of the hands from their segments
+    wanted: Vector  # (T, OUTPUTS) share of the stage that the tool has covered, and its offset (3,) [m]
     period_s: float
 
     @staticmethod
     def of(task: Task, demonstration: Demonstration, late_s: float) -> Encoded:
-        """The demonstration of a teacher who is so late."""
+        """The stages and shares of a demonstration whose teacher is late by `late_s`."""
         period_s = demonstration.period_s
         window = round(SMOOTHED_S / period_s)
         hands, smooth_tool = (
@@ -142,11 +157,11 @@ class Encoded:
         return Encoded(at, stages, moving, stillness, tool, labels, along, off, wanted, period_s)
 
     def near(self, corner: tuple[float, float], stages: Sequence[int]) -> NDArray[np.bool_]:
-        """Where (T,) hands are so far along one of these stages, about."""
+        """Return whether the hands' shares are near these in one of these stages (T,)."""
         return np.asarray(np.isin(self.labels, stages) & (np.abs(self.along - corner).max(axis=1) < NEAR))
 
     def rows(self, count: int) -> Indices:
-        """About so many samples, evenly along the way of hands and tool, a little along time."""
+        """About `count` rows, evenly along the path of hands and tool, and a little along time."""
         steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(axis=1)
         way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
         kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
@@ -154,9 +169,8 @@ class Encoded:
 
 
 def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
-    """Which stage it is at each sample (T,): the way through a demonstration that costs least
-    (Viterbi 1967), by how far hands and tool, of these positions and velocities (T, 3), are off a
-    stage's ways and whether they go along.
+    """The stages (T,) of least cost, for the motion (T, 3, 6) of the hands and the positions and
+    velocities (T, 3) of the tool.
     """
     count, cost = len(stages), np.zeros((len(moving), len(stages)))
     ways = [(stages["begins"][:, i], stages["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
@@ -184,7 +198,7 @@ def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], perio
 
 
 def _delayed(values: Vector, samples: int) -> Vector:
-    """Values (T, D) as they were so many samples before; before the first, they were that."""
+    """The values (T, D) delayed by a number of samples; before the first one they are constant."""
     return values[np.maximum(np.arange(len(values)) - samples, 0)]
 
 
@@ -197,7 +211,7 @@ def _smoothed(hands: Vector, samples: int) -> Vector:
 
 @compiled
 def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -> None:
-    """The beliefs (T, K) along hands that move so (T, 3, 6)."""
+    """Write the beliefs (T, K) in the stages for hands that move (T, 3, 6) to `out`."""
     for t in range(len(moving)):
         if t:
             out[t] = out[t - 1]
@@ -206,8 +220,8 @@ def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -
 
 @compiled
 def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """How far along the stages of these numbers (T,) hands (T, 6) are that are so still (T, 2), and
-    how far off their ways [m], into `out` (T, 4).
+    """Write the shares of the stages (T,) that hands (T, 6) with this stillness (T, 2) have
+    covered, and their distances from the segments [m], to `out` (T, 4).
     """
     for t in range(len(hands)):
         for side in range(2):
@@ -218,6 +232,8 @@ def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stage
 
 @compiled
 def all_followed(hands: Vector, shares: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """As `add_followed`, in the stages of these numbers (T,): to `out` (T, 3)."""
+    """Add the motion of the followed hands in the stages (T,) to `out` (T, 3), see
+    `add_followed`.
+    """
     for t in range(len(hands)):
         add_followed(hands[t], shares[t], stages[labels[t]], out[t])

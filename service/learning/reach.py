@@ -1,4 +1,4 @@
-"""Tool positions out of the arm's reach, to which a skill or its via-points would lead."""
+"""Positions of a skill or of its via-points that are out of the arm's reach."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from service.settings.config import Settings, urdf_path
 from service.settings.reachable import workspace_of
 from service.settings.urdf import Urdf
 
-REFUSED_SHARE = 0.5  # a skill is refused when a larger share of its places cannot be carried out
-RETAUGHT_M = 0.15  # [m] a task's via-point that is out of reach by less can be taught anew beside where it was learned
-NOTED_M = 0.0005  # [m] a target that is held back by less is within reach
-ANYWHERE = np.array([[-math.inf] * 3, [math.inf] * 3])  # [m] a box
+REFUSED_SHARE = 0.5  # a skill is refused if a larger share of its positions is out of reach
+RETAUGHT_M = 0.15  # a task's via-point that is out of reach by less can be taught anew
+NOTED_M = 0.0005  # a target that is held back by less is within reach
+ANYWHERE = np.array([[-math.inf] * 3, [math.inf] * 3])  # [m] box without limits
 
 
 class OutOfReach(NamedTuple):
-    """The places of a skill that are out of the arm's reach, in words (empty: none), and whether
-    that are too many.
+    """A warning about positions out of reach, empty if there are none, and whether the skill is
+    refused for them.
     """
 
     text: str
@@ -31,7 +31,7 @@ class OutOfReach(NamedTuple):
 
 
 def out_of_reach(skill: StoredSkill, distances_m: Vector, settings: Settings) -> OutOfReach:
-    """The verdict on a skill with the distances of its tool positions that `beyond_m` measures."""
+    """The verdict on a skill whose tool positions have these distances (M,) [m], see `beyond_m`."""
     number, total = int(np.count_nonzero(distances_m)), len(distances_m)
     if not number:
         return OutOfReach("", is_refused=False)
@@ -51,7 +51,7 @@ def out_of_reach(skill: StoredSkill, distances_m: Vector, settings: Settings) ->
 
 
 def accepted(settings: Settings) -> str:
-    """The reach in words."""
+    """The arm's reach in words."""
     reach = settings.reach
     centre = ", ".join(f"{value:g}" for value in reach.centre)
     return (
@@ -61,8 +61,8 @@ def accepted(settings: Settings) -> str:
 
 
 def beyond_m(settings: Settings, positions: Vector) -> Vector:
-    """Distances (M,) [m] of positions (M, 3) from `[reach]`, in which targets are held, or, where
-    it is larger, from where the joints let the tool be; 0 within both.
+    """The distances (M,) [m] of positions (M, 3) from `[reach]` or from the joints' workspace,
+    whichever is larger; 0 within both.
     """
     joints, still = settings.joints, np.zeros(3)
     held = [clamp(at, still, still, box=ANYWHERE, reach=settings.reach).position for at in positions]

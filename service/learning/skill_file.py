@@ -1,9 +1,7 @@
-"""A skill's file: one .npz without pickle.
+"""File of a skill: one .npz archive without pickle.
 
-Weights, base and via-points apart, units, what it was learned from, and a checksum of all that.
-
-What a file says is checked whole, and tried where it was learned: a skill that would harm the
-motion is never handed out.
+It holds the primitive's base, via-points and weights, units, the hash of the demonstrations, and a
+checksum. All arrays are checked, and the skill is tried where it was learned, before it is used.
 """
 
 from __future__ import annotations
@@ -33,15 +31,14 @@ from service.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
 
-POSED = 4  # the format of a skill that has orientation or gripper; of others it is the model's
+POSED = 4  # format of a skill with an orientation or a gripper; other skills have their model's formats
 FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
-TURN, GRIPPER = "turn.", "gripper."  # before the names of their primitives' arrays
-LARGEST_FILE = 100_000_000  # bytes, unpacked
-MOST_POINTS = 2500  # of the reference: a tick takes as long
-HIGHEST_GATE_M = 1.0  # a skill that is as unsure as that is not followed
-LONGEST_TEXT = 200  # letters
-LONGEST_FIGURES = 1_000_000
-RANGES = {  # of the numbers in each array
+TURN, GRIPPER = "turn.", "gripper."  # prefixes of the arrays of their primitives
+LARGEST_FILE = 100_000_000  # [B] unpacked
+MOST_POINTS = 2500  # reference points, which bound the duration of a tick
+HIGHEST_GATE_M = 1.0  # a larger threshold would let everything pass
+LONGEST_TEXT, LONGEST_FIGURES = 200, 1_000_000  # characters
+RANGES = {  # minimum, maximum and unit of the numbers in each array
     "threshold": (1e-6, HIGHEST_GATE_M, "m"),
     "tolerance": (0.0, MAX_SKILL_DISTANCE_M, "m"),
     "ell": (1e-3, 1e4, "1/m²"),
@@ -57,7 +54,7 @@ RANGES = {  # of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-REGIONS, FARTHEST_RADIUS = "regions", 1e6  # a scale, a time [s] and squared distances
+REGIONS, FARTHEST_RADIUS = "regions", 1e6  # the array holds a scale, a time [s] and squared distances
 ALL_RANGES = (
     RANGES
     | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
@@ -66,53 +63,45 @@ ALL_RANGES = (
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
+OTHERS = ("format", "units", "name", "learned_from", "places", "figures", "conductor", "turned", "checksum", "names")
 KNOWN = {
     *ALL_RANGES,
-    "format",
-    "units",
-    "name",
-    "learned_from",
-    "places",
+    *OTHERS,
     "replaced",
-    "figures",
-    "conductor",
-    "turned",
-    "checksum",
-    "names",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
     TURN + "auxiliary",
 }
-MARGIN_M = 0.25  # by which a skill may leave its box where it was learned: targets are held in it
-STEEPEST = 1000.0  # [m/m] of the tool's way to the hands'; also of its turn [rad/m], half the angle
-FARTHEST_TURN = 2.0 * np.pi  # [rad, half the angle] of an orientation from the auxiliary one; also of a closure
+MARGIN_M = 0.25  # a prediction at a learned input may leave the box by this distance
+STEEPEST = 1000.0  # [m/m] largest derivative of the tool's position; also of zeta [rad/m] and of the closure [1/m]
+FARTHEST_TURN = 2.0 * np.pi  # [rad] largest zeta of an orientation, half its angle; also largest closure
 
 
 class SkillError(ExplainedError, ValueError):
     """A skill that cannot be read, learned or adapted."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(printable_lines(text))  # which may quote what a file holds
+        super().__init__(printable_lines(text))  # the text may quote a file
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSkill(Skill):
-    """A skill beside which is what the loop has no use for."""
+    """A skill with its figures and its file, which the loop does not need."""
 
-    figures: str = field(default="", repr=False)  # JSON of what was found in learning; empty where it was not judged
-    file: bytes = field(default=b"", repr=False)  # all of it, as it is stored and recorded
+    figures: str = field(default="", repr=False)  # JSON of `Figures`; empty if the skill was not judged
+    file: bytes = field(default=b"", repr=False)  # bytes as stored and recorded
 
     @cached_property
     def tool_positions(self) -> NDArray[np.float64]:
-        """The tool (M, 3) [m] where the hands are at each of the places that the skill knows."""
+        """The tool's positions (M, 3) [m] at the skill's reference points or via-points."""
         return self.mean(self.hands, self.model.names)
 
     def for_loop(self) -> Skill:
-        """The skill alone."""
+        """The skill without figures and file."""
         return Skill(**{part.name: getattr(self, part.name) for part in fields(Skill)})
 
 
 def with_file(skill: StoredSkill) -> StoredSkill:
-    """A copy of the skill that holds the bytes of its file, made anew."""
+    """A copy of the skill with the bytes of its file."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
         format=np.array(POSED if skill.turn or skill.gripper else skill.model.formats[-1 if skill.figures else 0]),
@@ -150,8 +139,8 @@ def _digest(file: bytes) -> bytes:
 def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError.
 
-    One without a checksum, as earlier versions wrote, is taken where it was `recorded` only: a
-    recording has checksums of its own.
+    Files of earlier versions have no checksum. They are accepted if `recorded`, as recordings have
+    checksums of their own.
     """
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
         made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
@@ -195,7 +184,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         raise SkillError(f"{origin}: not a skill (the array {error} is missing)") from None
     except (pickle.UnpicklingError, zipfile.BadZipFile):
         raise SkillError(f"{origin}: not a skill (a damaged .npz archive)") from None
-    except Exception as error:  # what a damaged archive may raise is not documented by anyone
+    except Exception as error:  # NumPy does not document what a damaged archive raises
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill
 
@@ -211,15 +200,15 @@ def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[
 
 
 def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
-    """Of what kind the skill's model is: by its format or, where that is of any, by its arrays."""
+    """The kind of the skill's model, by the format or, if any model may have it, by the arrays."""
     kind = arrays["format"].item()
     own = [model for model in MODELS if model.ranges.keys() & arrays.keys() and kind == POSED]
     return next((model for model in MODELS if kind in model.formats), (*own, MODELS[0])[0])
 
 
 def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[str]:
-    """What in the arrays is not what was written, or not what any skill has."""
-    for name in sorted(set(arrays) - KNOWN):  # what kmp can hold besides, and the loop was never tried with
+    """Faults of the arrays: changes since they were written, and values that no skill has."""
+    for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
     yield from _beyond(arrays, [*RANGES, *_model(arrays).ranges], "")
     for prefix in (TURN, GRIPPER):
@@ -250,7 +239,7 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
 
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
-    """Which arrays hold what is in no range."""
+    """Faults of arrays with numbers out of their ranges."""
     for name in names:
         array, (low, high, unit) = arrays[name], ALL_RANGES[name]
         if array.dtype.kind not in "iuf":
@@ -261,7 +250,7 @@ def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: st
 
 
 def _no_regions(array: NDArray[Any]) -> Iterator[str]:
-    """Why an array is none of regions."""
+    """Faults of the array of regions."""
     if array.shape != (2 + len(LEVELS),):
         yield f"regions of shape {array.shape}, ({2 + len(LEVELS)},) needed"
     elif not (array[0] > 0 and (np.diff(array[2:]) >= 0).all()):
@@ -279,7 +268,7 @@ def _is_json(array: NDArray[Any]) -> bool:
 
 
 def _faults(skill: Skill) -> Iterator[str]:
-    """What in the file would harm the motion."""
+    """Faults of a skill that would harm the motion."""
     primitive, needed = skill.model.primitive, skill.model.shape
     inputs, outputs = primitive.inputs.shape[1], primitive.outputs
     if (inputs, outputs) != needed:
@@ -288,19 +277,19 @@ def _faults(skill: Skill) -> Iterator[str]:
     corners = skill.workspace
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         yield f"box is {corners.tolist()}, lower and upper corner needed"
-    if skill.orientation.shape != (4,) or not abs(np.linalg.norm(skill.orientation) - 1) < 1e-6:
-        yield f"orientation is {skill.orientation.tolist()}, a quaternion x y z w of norm 1 needed"
+    auxiliary = {TURN + "auxiliary": skill.turn.auxiliary} if skill.turn else {}
+    for name, quaternion in ({"orientation": skill.orientation} | auxiliary).items():
+        if quaternion.shape != (4,) or not abs(np.linalg.norm(quaternion) - 1) < 1e-6:
+            yield f"{name} is {quaternion.tolist()}, a quaternion x y z w of norm 1 needed"
     yield from _tried(skill)
     if skill.turn:
-        if skill.turn.auxiliary.shape != (4,) or not abs(np.linalg.norm(skill.turn.auxiliary) - 1) < 1e-6:
-            yield f"{TURN}auxiliary is {skill.turn.auxiliary.tolist()}, a quaternion x y z w of norm 1 needed"
         yield from _tried_beside(skill, skill.turn.primitive, TURN, outputs=3)
     if skill.gripper:
         yield from _tried_beside(skill, skill.gripper.primitive, GRIPPER, outputs=1)
 
 
 def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
-    """What is wrong with a primitive beside the position's, where it was learned and taught."""
+    """Faults of the predictions of the orientation's or the gripper's primitive at its inputs."""
     wanted, given = (skill.model.shape[0], outputs), (primitive.inputs.shape[1], primitive.outputs)
     if given != wanted:
         yield f"{name} has {given[0]} inputs and {given[1]} outputs, {wanted[0]} and {wanted[1]} needed"
@@ -315,7 +304,7 @@ def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> I
 
 
 def _tried(skill: Skill) -> Iterator[str]:
-    """What the skill does wrong where it was learned and taught: its weights are not its own."""
+    """Faults of the skill's predictions at its own inputs, as with weights of another skill."""
     with np.errstate(all="ignore"):
         tried = [(one.hands, one.mean(one.hands)) for one in (skill.model.unadapted(), skill.model)]
     low, high = skill.workspace

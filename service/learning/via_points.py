@@ -1,4 +1,4 @@
-"""Via-points: a skill made to go through taught poses, and how far it then misses each."""
+"""Adaptation of a skill to via-points, their agreement with each other, and their errors."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ from service.learning.skill_file import SkillError, StoredSkill, with_file
 from service.settings.config import ToolSettings
 
 MAX_GAIN = ToolSettings().max_gain
-NEAR_M = 0.001  # from each other: tools so near contradict nothing, nor within three times their deviations
-NOTED_M = 0.005  # a via-point missed or moved by more is told of
+NEAR_M = 0.001  # tools this near to each other never contradict each other
+DEVIATIONS = 3.0  # nor do tools within this multiple of their standard deviations
+NOTED_M = 0.005  # via-points missed or moved by more are reported
 
 
 def adapted(
     skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
-    """A new skill that goes through these via-points and no others. Raises SkillError.
+    """The skill adapted to these via-points and no others, by algorithm 1 of Huang et al. 2019.
 
-    Algorithm 1 of Huang et al. 2019, from the skill as it was learned. Via-points between which the
-    tool would have to move more than `max_gain` times as far as the hands contradict each other:
-    hands at rest tremble, and the tool would shake so many times as much. Those of a task do not:
-    what was before tells which of them hands are at.
+    Via-points between which the tool would move more than `max_gain` times as far as the hands
+    contradict each other, as the tool would amplify the trembling of resting hands. Via-points of a
+    task do not, as the skill's stages distinguish them.
+
+    Raises SkillError if the via-points contradict each other, or the tolerance [m] is negative.
     """
     if not tolerance >= 0:
         names = [point.name for point in via_points]
@@ -46,10 +48,9 @@ def adapted(
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` tells by how much
-            # The covariance of IJRR 2019 is N times that of a point that stands alone. Where the
-            # reference was scaled to that, so that predicted deviations are true, a via-point's
-            # variance must be too.
+            warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` reports it
+            # The covariance of IJRR 2019 is N times that of a single point. The reference is scaled
+            # by 1 / N unless it is a mixture's, so the variance of a via-point is scaled, too.
             weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
             skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
             at = skill.model.inputs(inputs, [point.name for point in owners])
@@ -60,22 +61,23 @@ def adapted(
 
 
 def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
-    """The via-point with both hands where the one is that conducts."""
+    """The via-point with both hands at the position of the conducting one."""
     at = (point.left, point.right)[conductor]
     return msgspec.structs.replace(point, left=at, right=at)
 
 
 def check_agreement(via_points: Sequence[ViaPoint], max_gain: float = MAX_GAIN, skill: Skill | None = None) -> None:
-    """Raises SkillError where via-points contradict each other, but for those that a skill tells
-    apart.
+    """Raise SkillError if via-points contradict each other that the skill cannot distinguish:
+
+    |tool_i - tool_j| > max_gain |hands_i - hands_j| + NEAR_M + DEVIATIONS (std_i + std_j)
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
-    told_apart = np.zeros((len(owners), len(owners)), bool) if skill is None else _told_apart(skill, owners)
+    is_distinct = np.zeros((len(owners), len(owners)), bool) if skill is None else _are_distinct(skill, owners)
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
-    allowed = max_gain * hands + NEAR_M + 3.0 * (deviations[:, None] + deviations)
-    for i, j in np.argwhere((tools > allowed) & ~told_apart)[:1].tolist():
+    allowed = max_gain * hands + NEAR_M + DEVIATIONS * (deviations[:, None] + deviations)
+    for i, j in np.argwhere((tools > allowed) & ~is_distinct)[:1].tolist():
         raise SkillError(
             f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
             f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
@@ -83,16 +85,14 @@ def check_agreement(via_points: Sequence[ViaPoint], max_gain: float = MAX_GAIN, 
         )
 
 
-def _told_apart(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
-    """Which pairs (V, V) of points are of two via-points of the skill's task: its stages tell them
-    apart.
-    """
+def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
+    """Return whether each pair (V, V) belongs to two via-points of the skill's task."""
     names = np.array([point.name if point.name in skill.model.names else "" for point in owners])
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 
 def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
-    """The via-points in force, each with the distance by which the skill misses it [m]."""
+    """The via-points in force, each with its error [m] and the error of its orientation [rad]."""
     return tuple(
         ViaPointInForce(
             **msgspec.structs.asdict(point),
@@ -104,8 +104,8 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
 
 
 def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
-    """What is to be said where one skill takes another's place: which via-points are missed, and
-    which that were there already are moved, by more than 5 mm.
+    """Warnings when one skill replaces another: via-points that are missed by more than NOTED_M,
+    and via-points of both skills that move by more.
     """
     out = [
         f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was demonstrated or taught "
@@ -128,5 +128,5 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
 
 
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:
-    """How many points `neighbourhoods` makes of via-points."""
+    """The number of points that `neighbourhoods` makes of via-points."""
     return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)

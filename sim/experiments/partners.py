@@ -22,8 +22,8 @@ import numpy as np
 
 from service.cli.main import parser
 from service.core.skill.model import LEVELS
-from service.learning.judgement import Figures
 from service.learning.learn import learn
+from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill
 from service.settings.config import Settings
 from sim.experiments.catalogue import EXPERIMENTS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.files.demonstration_reader import write_demonstration
-from service.learning.judgement import Figures
+from service.learning.records import Figures
 from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations

@@ -10,7 +10,7 @@ from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel, named_arrays
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.dense import Dense
 from kmp.low_rank import LowRank
-from kmp.low_rank.conditioned import Conditioned
+from kmp.low_rank.solution import Conditioned
 from kmp.predictor import Inner
 from kmp.solution import Solution, mean_at
 

@@ -10,8 +10,8 @@ import pytest
 
 from service.learning.ambiguity import ALIKE_M, NOISES, SAME_M, same_hands_m, tracker_noise_m
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures
 from service.learning.learn import learn
+from service.learning.records import Figures
 from support.circling import circling
 from support.taught_scene import demonstrated
 

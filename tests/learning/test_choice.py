@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from service.learning.choice import ELLS, NOISES, REGIONS, Choice, mahalanobis, rms, thinned
+from kmp.cross_validation import mahalanobis, rms
+from kmp.direct import DirectSelection
+from service.core.skill.model import CHI_SQUARE, LEVELS
+from service.learning.choice import POSITION_SCALES, selection_of, thinned
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
@@ -26,13 +29,13 @@ def shown(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def choice() -> Choice:
-    return Choice.of([shown(seed) for seed in range(4)], 60)
+def choice() -> DirectSelection:
+    return selection_of([shown(seed) for seed in range(4)], 60)
 
 
-def test_the_residuals_left_out_are_those_of_primitives_fitted_without(choice: Choice) -> None:
+def test_the_residuals_left_out_are_those_of_primitives_fitted_without(choice: DirectSelection) -> None:
     ell, noise = 4.0, 0.1
-    for one, mine in ((h, choice.owner == h) for h in range(4)):
+    for one, mine in ((h, choice.group == h) for h in range(4)):
         rest = ~mine
         reference = Gaussians(choice.outputs[rest], np.broadcast_to(np.eye(3), (rest.sum(), 3, 3)))
         fitted = KMP.fit(
@@ -46,14 +49,18 @@ def test_the_residuals_left_out_are_those_of_primitives_fitted_without(choice: C
         np.testing.assert_allclose(choice.residuals(ell, noise)[mine], expected, atol=1e-9, err_msg=str(one))
 
 
-def test_the_choice_is_as_good_as_any_that_was_tried(choice: Choice) -> None:
+def test_the_choice_is_as_good_as_any_that_was_tried(choice: DirectSelection) -> None:
     found = choice.parameters()
-    errors = {(ell, noise): rms(choice.residuals(ell, noise)) for ell in ELLS for noise in NOISES}
+    errors = {
+        (ell, noise): rms(choice.residuals(ell, noise))
+        for ell in POSITION_SCALES.ells
+        for noise in 10.0 ** np.arange(-3.0, 0.1, 0.5)
+    }
     assert errors[found.ell, found.noise] == min(errors.values())
     assert choice.parameters(8.0).ell == 8.0
 
 
-def test_the_primitive_has_the_mean_that_was_chosen_and_the_deviation_far_away(choice: Choice) -> None:
+def test_the_primitive_has_the_mean_that_was_chosen_and_the_deviation_far_away(choice: DirectSelection) -> None:
     found = choice.parameters()
     primitive = choice.primitive(found, choice.residuals(found.ell, found.noise))
     far = primitive.predict(np.full((1, 6), 50.0))
@@ -70,8 +77,8 @@ def test_rests_keep_some_of_the_points_and_motion_most() -> None:
 
 
 def test_one_demonstration_is_too_few_to_choose_by() -> None:
-    with pytest.raises(SkillError, match="1 demonstration given: at least 2 needed"):
-        Choice.of([shown(1)], 60).parameters()
+    with pytest.raises(ValueError, match="1 number given, at least 2 needed to hold one out"):
+        selection_of([shown(1)], 60).parameters()
 
 
 def test_a_penalty_without_components_is_refused(taught: list[Demonstration]) -> None:
@@ -86,14 +93,15 @@ def test_people_who_were_not_seen_are_where_the_skill_says_they_may_be() -> None
     unseen = [shown(900 + seed) for seed in range(10)]
     hands, tools = (np.concatenate(parts) for parts in zip(*unseen, strict=True))
     error, expected, within = [], [], []
+    regions = [CHI_SQUARE[LEVELS.index(level)] for level in (0.5, 0.95)]
     for draw in range(4):
-        choice = Choice.of([shown(100 * draw + seed) for seed in range(50, 55)], 120)
+        choice = selection_of([shown(100 * draw + seed) for seed in range(50, 55)], 120)
         found = choice.parameters()
         predicted = choice.primitive(found, choice.residuals(found.ell, found.noise)).predict(hands)
         errors = tools - predicted.mean
         error.append(rms(errors))
         expected.append(np.sqrt(np.trace(predicted.covariance, axis1=1, axis2=2).mean()))
-        within.append((mahalanobis(errors, predicted.covariance)[:, None] <= REGIONS).mean(axis=0))
+        within.append((mahalanobis(errors, predicted.covariance)[:, None] <= regions).mean(axis=0))
     assert np.mean(error) < 0.026
     assert np.mean(expected) == pytest.approx(np.mean(error), rel=0.25)
     half, most = np.mean(within, axis=0)

@@ -10,8 +10,8 @@ import numpy as np
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.learning.gate import FLOOR_M
-from service.learning.judgement import Figures
 from service.learning.learn import learn
+from service.learning.records import Figures
 from support.circling import circling
 
 NOISE_M = 0.002  # of a usual tracker

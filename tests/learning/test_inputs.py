@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.tuning import TURN_LAG_S
-from service.learning.demonstration import Demonstration, groups
-from service.learning.inputs import KINDS, Inputs
-from service.learning.judgement import Figures, table
+from service.learning.demonstration import Demonstration, persons
 from service.learning.learn import learn
+from service.learning.methods.held_out import swapped
+from service.learning.methods.inputs import KINDS
+from service.learning.records import Figures
 from service.learning.skill_file import StoredSkill, decoded
+from service.learning.table import table
 from sim.experiments.people.left_out import judged, left_out, predicted
 
 TIMES = np.arange(0.0, 6.0, 0.04)
@@ -130,9 +132,9 @@ def test_a_task_by_the_clock_is_told_to_be_a_timetable() -> None:
 
 def test_takes_of_a_person_are_left_out_together_where_two_are_named() -> None:
     takes = [shown(seed, "both", person) for seed, person in enumerate(("Ada", "Ada", "Bo", "Bo"))]
-    assert groups(takes).tolist() == [0, 0, 1, 1]
-    assert groups([one._replace(person="Ada") for one in takes]).tolist() == [0, 1, 2, 3]
-    assert groups([takes[0], takes[2], takes[0]._replace(person="")]).tolist() == [0, 1, 2]
+    assert persons(takes) == [0, 0, 1, 1]
+    assert persons([one._replace(person="Ada") for one in takes]) == [0, 1, 2, 3]
+    assert persons([takes[0], takes[2], takes[0]._replace(person="")]) == [0, 1, 2]
     by_person, alone = (
         figures(learn(some, points=120)) for some in (takes, [one._replace(person="") for one in takes])
     )
@@ -143,6 +145,6 @@ def test_takes_of_a_person_are_left_out_together_where_two_are_named() -> None:
 
 def test_the_other_hands_turns_and_memory_are_swapped_for_each_other() -> None:
     rows = np.arange(6 + 12 + 18.0)[None]
-    swapped = Inputs("some", order=2, turned=True).swapped(rows)[0]
+    found = swapped(rows, order=2)[0]
     wanted = [*range(6), 9, 10, 11, 6, 7, 8, 15, 16, 17, 12, 13, 14, *range(27, 36), *range(18, 27)]
-    assert swapped.tolist() == wanted
+    assert found.tolist() == wanted

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures, table
-from service.learning.learn import Evidence, learn
+from service.learning.learn import learn
 from service.learning.picture import draw, drawn
+from service.learning.records import Evidence, Figures
 from service.learning.skill_file import SkillError
+from service.learning.table import table
 from service.settings.config import Reach
 from sim.made_tasks import takes
 from support.paths import ROOT
@@ -105,7 +106,9 @@ def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_
     off, predicted = (np.asarray(line.get_ydata()) for line in stages.get_lines())
     row = seen[0].figures.demonstrations[h]
     assert np.sqrt(np.mean(off**2)) == pytest.approx(row.error_mm)
-    likely = seen[0].beliefs[h].argmax(axis=1)
+    belief = seen[0].held_out[h].belief
+    assert belief is not None
+    likely = belief.argmax(axis=1)
     shown = [patch for patch in stages.patches if patch.get_alpha()]
     assert len(shown) == 1 + np.count_nonzero(np.diff(likely))
     # what is predicted is of the tool, not how far hands are off their ways

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from kmp import KMP, AffineMean, GaussianKernel, Gaussians
+from kmp.cross_validation import rms
+from kmp.direct import DirectSelection, ridge_mean
 from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
-from service.learning.baselines import left_out, linear
-from service.learning.choice import MAX_GAIN, RIDGE_M, Choice, ridge, rms
+from service.learning.baselines import held_out_errors, linear
+from service.learning.choice import MAX_GAIN, RIDGE_M, selection_of
 from service.learning.gate import nonsense
-from service.learning.learn import Evidence, learn
+from service.learning.learn import learn
+from service.learning.records import Evidence
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.learning.via_points import adapted
 from support.circling import circling
@@ -36,8 +39,8 @@ def skill(evidence: Evidence) -> StoredSkill:
 
 
 @pytest.fixture(scope="module")
-def choice(evidence: Evidence) -> Choice:
-    return Choice.of(evidence.paths, 120)
+def choice(evidence: Evidence) -> DirectSelection:
+    return selection_of([(one.take.hands, one.take.position) for one in evidence.held_out], 120)
 
 
 def mean_of(skill: StoredSkill) -> AffineMean:
@@ -47,37 +50,39 @@ def mean_of(skill: StoredSkill) -> AffineMean:
 
 
 def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant_and_than_by_a_line(
-    evidence: Evidence, choice: Choice
+    evidence: Evidence, choice: DirectSelection
 ) -> None:
     assert mean_of(evidence.skill).matrix.shape == (3, 6)
     error = rms(np.concatenate([one.errors for one in evidence.held_out]))
     constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
     over_constant = [
-        tool - choice.primitive(constant, residuals, without=h).mean(hands)
-        for h, (hands, tool) in enumerate(evidence.paths)
+        one.take.position - choice.primitive(constant, residuals, without=h).mean(one.take.hands)
+        for h, one in enumerate(evidence.held_out)
     ]
     assert error < 0.010
     assert error < 0.6 * rms(np.concatenate(over_constant))
-    assert error < 0.75 * rms(np.concatenate(left_out(evidence.paths, np.arange(5), linear)))
+    assert error < 0.75 * rms(np.concatenate(held_out_errors([one.take for one in evidence.held_out], linear)))
 
 
-def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without(choice: Choice) -> None:
+def test_its_residuals_left_out_are_those_of_primitives_and_means_fitted_without(choice: DirectSelection) -> None:
     for h in range(5):
-        rest, mine = choice.owner != h, choice.owner == h
+        rest, mine = choice.group != h, choice.group == h
         fitted = KMP.fit(
             choice.inputs[rest],
             Gaussians(choice.outputs[rest], np.broadcast_to(np.eye(3), (rest.sum(), 3, 3))),
             kernel=GaussianKernel(2.0),
             lambda_mean=0.1,
-            prior_mean=ridge(choice.inputs[rest], choice.outputs[rest]),
+            prior_mean=ridge_mean(choice.inputs[rest], choice.outputs[rest], RIDGE_M, max_gain=MAX_GAIN),
         )
         expected = choice.outputs[mine] - fitted.mean(choice.inputs[mine])
         np.testing.assert_allclose(choice.residuals(2.0, 0.1, RIDGE_M)[mine], expected, atol=1e-9)
 
 
-def test_off_the_data_it_is_refused_as_over_a_constant(skill: StoredSkill, choice: Choice, evidence: Evidence) -> None:
+def test_off_the_data_it_is_refused_as_over_a_constant(
+    skill: StoredSkill, choice: DirectSelection, evidence: Evidence
+) -> None:
     """Where the mean extrapolates, the gate holds; and no less than with the constant mean."""
-    some = np.concatenate([hands[::20] for hands, _ in evidence.paths])
+    some = np.concatenate([one.take.hands[::20] for one in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
@@ -98,9 +103,10 @@ def test_it_moves_the_tool_no_farther_than_between_via_points_whatever_was_shown
     assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
     random = np.random.default_rng(0)
     hands = random.normal(scale=0.1, size=(200, 6))
-    steep = ridge(hands, hands @ random.normal(scale=20.0, size=(6, 3)))
+    steep = ridge_mean(hands, hands @ random.normal(scale=20.0, size=(6, 3)), RIDGE_M, max_gain=MAX_GAIN)
     assert np.linalg.norm(steep.matrix, 2) == pytest.approx(MAX_GAIN)
-    trembling = ridge(hands * [1, 1, 1, 0.01, 0.01, 0.01], hands[:, :3] + 3 * hands[:, 3:] * 0.01)
+    still = hands * [1, 1, 1, 0.01, 0.01, 0.01]
+    trembling = ridge_mean(still, hands[:, :3] + 3 * hands[:, 3:] * 0.01, RIDGE_M, max_gain=MAX_GAIN)
     assert np.abs(trembling.matrix[:, 3:]).max() < 0.2  # a hand that moved by 1 mm tells nothing
 
 

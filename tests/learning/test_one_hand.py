@@ -18,9 +18,10 @@ from service.files.demonstration_reader import read_demonstration, write_demonst
 from service.files.mcap_file import RecordingError
 from service.files.pose_streams import PoseTopic
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures, table
 from service.learning.learn import learn
+from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.table import table
 from service.learning.via_points import adapted
 from sim.made_tasks import takes
 from support.circling import circling

@@ -16,10 +16,11 @@ from service.core.skill.skill import Skill
 from service.files.shipped import shipped_skill
 from service.learning.ambiguity import SAME_M
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures
 from service.learning.learn import learn
 from service.learning.pose import learned_pose
+from service.learning.records import Figures, HeldOut
 from service.learning.skill_file import SkillError, decoded
+from service.learning.takes import aligned
 from service.learning.via_points import adapted, in_force
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
@@ -67,20 +68,18 @@ def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[D
 
 def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demonstration]) -> None:
     other = [one._replace(tool=np.hstack([one.tool[:, :3], turning(one, -TURN).tool[:, 3:]])) for one in shown]
-    found = learned_pose(
-        [one.hands for one in (*shown, other[0])],
-        [one.hands for one in (*shown, other[0])],
-        [one.tool[:, 3:] for one in (*shown, other[0])],
-        [None] * 4,
-        list("abcd"),
-        np.arange(4),
-        points=80,
-        gripper_ell=HandsKMP.gripper_ell,
-        near_m=SAME_M,
-    )
-    assert "contradicts itself" in found.unsafe[0]
-    assert "a (sample" in found.unsafe[0]
-    assert "d (sample" in found.unsafe[0]
+    takes = aligned([one._replace(gripper=None) for one in (*shown, other[0])], list("abcd"), removes_lag=False)
+    held_out = [
+        HeldOut(
+            take, np.zeros_like(take.position), np.zeros((len(take.hands), 3, 3)), np.zeros(0), take.hands, take.hands
+        )
+        for take in takes
+    ]
+    found = learned_pose(held_out, points=80, gripper_ell=HandsKMP.gripper_ell, near_m=SAME_M)
+    unsafe = next(verdict.text for verdict in found.verdicts if verdict.severity == "unsafe")
+    assert "contradicts itself" in unsafe
+    assert "a (sample" in unsafe
+    assert "d (sample" in unsafe
 
 
 def test_a_constant_orientation_and_no_gripper_stay_out_of_the_skill(coarse: Skill) -> None:

@@ -15,15 +15,15 @@ from service.core.skill.stage import SkillStage
 from service.core.skill.step import calibrate, recent
 from service.core.skill.tuning import UNSURE_M
 from service.files.shipped import shipped_skill
-from service.learning.judgement import Figures
 from service.learning.learn import learn
-from service.learning.regions import FOLDS, Apart, calibrated, folds, of_the_others
+from service.learning.records import Figures, TimedErrors
+from service.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.settings.config import Settings
 from sim.made_tasks import takes
 
 
-def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> Apart:
+def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> TimedErrors:
     """A demonstration by someone who errs as no normal says: by three times the covariance, with
     heavy tails, and early or late.
     """
@@ -32,12 +32,12 @@ def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) 
     velocity = np.clip(rng.normal(size=(count, 3)), -1, 1) * (rng.random(count) < 0.5)[:, None]
     tails = rng.standard_t(4, size=(count, 3)) * np.sqrt(np.diagonal(covariance[0]))
     errors = times * (3.0 * person * tails + late_s * rng.normal(size=(count, 1)) * velocity)
-    return Apart(errors, covariance, velocity)
+    return TimedErrors(errors, covariance, velocity)
 
 
 def test_of_one_demonstration_alone_there_are_no_others_to_tell() -> None:
     one = apart(np.random.default_rng(1))
-    assert of_the_others([one], np.arange(1)) == [(one, NORMAL)]
+    assert calibrated_without([one], np.arange(1)) == [(one, NORMAL)]
 
 
 @pytest.mark.parametrize("count", [6, 12, 40])
@@ -57,7 +57,7 @@ def test_regions_hold_on_other_people_what_they_say_at_every_level(count: int) -
 
 def test_errors_as_of_a_normal_leave_a_covariance_as_it_is() -> None:
     rng, covariance = np.random.default_rng(1), np.tile(1e-4 * np.eye(3), (150, 1, 1))
-    given = [Apart(1e-2 * rng.normal(size=(150, 3)), covariance, np.zeros((150, 3))) for _ in range(20)]
+    given = [TimedErrors(1e-2 * rng.normal(size=(150, 3)), covariance, np.zeros((150, 3))) for _ in range(20)]
     regions = calibrated(given, np.arange(len(given)))
     assert regions.scale == pytest.approx(1.0, abs=0.1)
     assert regions.radii == pytest.approx(CHI_SQUARE, rel=0.2)
@@ -68,9 +68,9 @@ def test_a_demonstration_is_judged_by_regions_that_it_had_no_part_in() -> None:
     rng = np.random.default_rng(2)
     usual = [apart(rng) for _ in range(12)]
     spoilt = [*usual[:4], apart(rng, times=30.0), *usual[5:]]
-    assert [len(block) for block in folds(np.arange(12))] == [2] * FOLDS
+    assert [len(block) for block in blocks_of(np.arange(12))] == [2] * BLOCKS
     together = np.arange(len(usual))
-    before, after = of_the_others(usual, together), of_the_others(spoilt, together)
+    before, after = calibrated_without(usual, together), calibrated_without(spoilt, together)
     assert before[4][1] == after[4][1] == after[5][1]
     assert before[0][1] != after[0][1]
     assert after[4][0].inside(after[4][1])[LEVELS.index(0.95)] < 0.5

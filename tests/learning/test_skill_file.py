@@ -19,7 +19,7 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
-from service.learning.judgement import Figures
+from service.learning.records import Figures
 from service.learning.skill_file import SkillError, decoded, with_file
 from service.learning.via_points import adapted
 from support.taught_scene import PLACES

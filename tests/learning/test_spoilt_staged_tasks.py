@@ -13,7 +13,7 @@ import pytest
 
 from service.core.skill.staged import StagedKMP
 from service.files.demonstration_reader import read_demonstration
-from service.learning.judgement import Figures
+from service.learning.records import Figures
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.experiments.people.left_out import judged, left_out, predicted

@@ -18,10 +18,11 @@ from service.core.skill.skill import Skill
 from service.core.skill.staged import StagedKMP
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of, via_points_never_reached
-from service.learning.judgement import Figures, table
 from service.learning.learn import learn
+from service.learning.methods.staged import delay_of
+from service.learning.records import Figures
 from service.learning.skill_file import SkillError, decoded
-from service.learning.stages import delay_of
+from service.learning.table import table
 from service.learning.via_points import adapted, in_force, warnings_of
 from sim.experiments.people.left_out import judged, left_out, predicted
 from sim.made_tasks import takes
@@ -105,16 +106,16 @@ def test_a_via_point_of_another_name_is_added_and_forgotten(between: Skill, show
 
 
 def test_what_cannot_be_learned_between_places_says_why(shown: list[Demonstration]) -> None:
-    assert task_of([one._replace(places=()) for one in shown]) == ""
+    assert task_of([one._replace(places=()) for one in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
-    assert "not all demonstrations name the same via-points" in str(task_of(fewer))
-    assert "1 named via-points: 2 to 65" in str(task_of([one._replace(places=one.places[:1]) for one in shown]))
+    assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
+    assert "1 named via-points: 2 to 65" in task_of([one._replace(places=one.places[:1]) for one in shown])[1]
 
 
 def test_a_place_that_the_tool_never_came_near_is_named(shown: list[Demonstration]) -> None:
     names = [f"take-{i}" for i in range(len(shown))]
-    task = task_of(shown)
-    assert not isinstance(task, str)
+    task, _ = task_of(shown)
+    assert task is not None
     assert via_points_never_reached(task, shown, names) == []
     wrong = [one._replace(places=moved(one.places, {"glass": (0.0, 0.4, 0.3)})) for one in shown]
     (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)

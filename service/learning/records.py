@@ -1,0 +1,193 @@
+"""Records that the steps of learning hand on: options, takes, predictions of held-out takes, the
+fitted model, and the figures that a skill's file holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.cross_validation import mahalanobis
+from service.core.frame import Vector
+from service.core.skill.model import Model, Regions, standard_deviations
+from service.core.skill.pose import LearnedGripper, LearnedOrientation
+from service.learning.demonstration import Demonstration
+from service.learning.gate import Gate
+from service.learning.skill_file import StoredSkill
+
+Progress = Callable[[str], None]
+
+
+class Options(NamedTuple):
+    """The options of `learn` that methods take, see there."""
+
+    points: int
+    ell: float | None  # [1/m²]
+    components: int | None
+    penalty: float | None
+    spread_m: float
+    seed: int
+
+
+class Take(NamedTuple):
+    """A demonstration with its name, the number of its person, and the T samples that are learned
+    from: hands (T, 6), tool (T, 7) and the gripper's closure (T,), if it is known.
+
+    All takes of a person are held out at once. Tool and closure may be shifted against the hands,
+    `moment` (T, 3) [m] is the tool's position when the hands were there.
+    """
+
+    name: str
+    person: int
+    demonstration: Demonstration
+    hands: Vector
+    tool: Vector
+    moment: Vector
+    closure: Vector | None
+
+    @property
+    def position(self) -> Vector:
+        """The tool's position (T, 3) [m]."""
+        return self.tool[:, :3]
+
+
+def persons_of(takes: Sequence[Take]) -> NDArray[np.intp]:
+    """The numbers (H,) of the takes' persons."""
+    return np.array([take.person for take in takes], np.intp)
+
+
+class TimedErrors(NamedTuple):
+    """The predictions of a held-out take at S samples, compared with the tool at the same moment:
+    errors (S, 3) [m], covariances (S, 3, 3) [m²], and recent velocities of the prediction (S, 3)
+    [m/s].
+    """
+
+    errors: Vector
+    covariance: Vector
+    velocity: Vector
+
+    def with_timing(self, std_s: float) -> Vector:
+        """The covariances (S, 3, 3) [m²] for this deviation of the timing: C + std_s² v vᵀ."""
+        return np.asarray(self.covariance + std_s**2 * self.velocity[:, :, None] * self.velocity[:, None, :])
+
+    def squares(self, std_s: float) -> Vector:
+        """The squared Mahalanobis distances (S,) for this standard deviation of the timing."""
+        return mahalanobis(self.errors, self.with_timing(std_s))
+
+    def expected_m(self, regions: Regions) -> Vector:
+        """The expected distances (S,) [m] of tool and prediction, root mean square."""
+        return np.asarray(np.sqrt(3 * regions.scale) * standard_deviations(self.with_timing(regions.std_s)))
+
+    def inside(self, regions: Regions) -> Vector:
+        """The shares (L,) of the samples inside the regions of each of LEVELS."""
+        squares = self.squares(regions.std_s)[:, None] / regions.scale
+        return np.asarray((squares <= regions.radii).mean(axis=0))
+
+
+class HeldOut(NamedTuple):
+    """A take as a model predicts it that was learned without its person: errors (T, 3) [m],
+    demonstrated minus predicted, covariances (T, 3, 3) [m²], and what the gate compares (T,) [m],
+    see `Model.measure`.
+
+    `inputs` (T, I) are those of the model's primitive. `known` (T, D) [m] is everything that the
+    position may depend on, so takes that agree in it and differ in the tool contradict each other.
+    """
+
+    take: Take
+    errors: Vector
+    covariance: Vector
+    gate_m: Vector
+    inputs: Vector
+    known: Vector
+    belief: Vector | None = None  # (T, K) probability of each of K stages; None if there are no stages
+    timed: TimedErrors | None = None  # None: they follow from the errors
+
+
+class Delay(NamedTuple):
+    """The teacher's delay [s], and its standard deviation over the demonstrations."""
+
+    mean_s: float
+    std_s: float
+
+
+class Fitted(NamedTuple):
+    """The result of a method: a model of the tool's position, the held-out takes and the gate."""
+
+    model: Model
+    held_out: Sequence[HeldOut]
+    gate: Gate
+    delay: Delay | None = None  # None if the method does not learn it
+    conductor: int | None = None  # the side of the only hand that the model depends on
+    taken: str = ""  # the name of the inputs that were chosen among those tried
+    tried_m: Mapping[str, float] = {}  # held-out error of each kind of inputs
+    baselines: Mapping[str, Sequence[Vector]] = {}  # errors (T, 3) [m] of each take by simpler predictions
+    remarks: Sequence[str] = ()
+
+
+class Verdict(NamedTuple):
+    """A finding about a skill: a warning, or a reason not to use it."""
+
+    severity: Literal["warning", "unsafe"]
+    text: str
+
+
+class Pose(NamedTuple):
+    """The learned orientation of the tool and the learned gripper, with their figures."""
+
+    orientation: Vector  # (4,) the mean one, quaternion x y z w
+    turn: LearnedOrientation | None  # None if the orientation is constant
+    gripper: LearnedGripper | None  # None if no demonstration has a gripper
+    turn_error_deg: float | None  # held out, root mean square
+    gripper_right: float | None  # [%] of held-out samples
+    verdicts: Sequence[Verdict]
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a held-out demonstration, or of all of them. Errors are root mean squares."""
+
+    name: str
+    error_mm: float
+    worst_mm: float
+    moment_mm: float = 0.0  # error including the tool's lag
+    predicted_mm: float  # `moment_mm` as the covariance predicts it, calibrated without this demonstration
+    within_50: float  # [%] of the samples inside the region that should contain 50 %
+    within_95: float
+    held: float  # [%] of the time in which the gate would hold
+    other_mm: dict[str, float] = {}  # errors of baselines
+
+
+class Figures(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures that a skill's file holds. Shares are in per cent."""
+
+    demonstrations: tuple[Row, ...]
+    all: Row
+    gate_mm: float
+    held_std: float = 0.0  # standard deviation of `held` over the demonstrations
+    swapped: float  # share of wrong samples that the gate holds: left and right hand swapped
+    beside: float  # the same with both hands displaced by 30 cm
+    one_beside: float  # the same with one hand displaced by 30 cm
+    ambiguous: float  # share of the samples that contradict another: same hands, other tool
+    beyond_reach: float  # share of the tool's path
+    orientation_error_deg: float | None = None  # held out, root mean square; None if it was not learned
+    gripper_right: float | None = None  # share of held-out samples
+    warnings: tuple[str, ...] = ()
+    unsafe: tuple[str, ...] = ()  # reasons not to use the skill
+    tried_mm: dict[str, float] = {}  # held-out error of each kind of inputs
+    taken: str = ""  # the kind of inputs that was chosen
+    by_person: bool = False  # true if all demonstrations of a person were held out at once
+    delay_s: float | None = None  # the teacher's delay; None if it was not learned
+    delay_std_s: float = 0.0  # its standard deviation over the demonstrations
+    alone: bool | msgspec.UnsetType = msgspec.UNSET  # true if one hand conducts alone, and `beside` refers to it
+
+
+class Evidence(NamedTuple):
+    """The basis of a skill's figures."""
+
+    skill: StoredSkill
+    figures: Figures
+    held_out: Sequence[HeldOut]
+    inside: Vector  # (L,) shares of the samples inside the regions of LEVELS, calibrated without them

@@ -1,0 +1,34 @@
+"""Storage of what was learned: the skill, with the bytes of its file."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from service.learning.demonstration import fingerprint
+from service.learning.judgement import Judgement
+from service.learning.records import Fitted, Pose
+from service.learning.skill_file import StoredSkill, with_file
+from service.learning.takes import Division, conductor_of
+
+BOX_MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions by this distance
+
+
+def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement: Judgement) -> StoredSkill:
+    """The skill of a model and pose with its figures."""
+    positions = np.concatenate([take.position for take in division.takes])
+    skill = StoredSkill(
+        name=name,
+        model=fitted.model,
+        orientation=pose.orientation,
+        turn=pose.turn,
+        gripper=pose.gripper,
+        workspace=np.stack([positions.min(axis=0) - BOX_MARGIN_M, positions.max(axis=0) + BOX_MARGIN_M]),
+        threshold=fitted.gate.threshold,
+        learned_from=fingerprint(take.demonstration for take in division.takes),
+        components=division.options.components or 0,
+        figures=msgspec.json.encode(judgement.figures).decode(),
+        conductor=conductor_of(division, fitted),
+        regions=judgement.regions,
+    )
+    return with_file(skill)

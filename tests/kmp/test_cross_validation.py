@@ -1,0 +1,48 @@
+"""Held-out groups in closed form are predicted as by regression on the other points."""
+
+import numpy as np
+import pytest
+
+from kmp.cross_validation import held_out_covariances, held_out_residuals, mahalanobis, preferred, squared_distances
+
+RANDOM = np.random.default_rng(0)
+POINTS, TARGETS = RANDOM.normal(size=(20, 2)), RANDOM.normal(size=(20, 3))
+GROUP = RANDOM.integers(0, 4, 20)
+KERNEL = np.exp(-0.5 * ((POINTS[:, None] - POINTS) ** 2).sum(axis=2))
+RATIOS = np.array([0.01, 0.3])
+
+
+def test_residuals_are_those_without_the_group():
+    assert squared_distances(POINTS) == pytest.approx(((POINTS[:, None] - POINTS) ** 2).sum(axis=2), abs=1e-12)
+    shifted = {number: TARGETS - number for number in range(4)}
+    found = held_out_residuals(KERNEL, RATIOS, GROUP, shifted.__getitem__)
+    for ratio, residuals in zip(RATIOS, found, strict=True):
+        for number in range(4):
+            rest = number != GROUP
+            mine = ~rest
+            noisy = KERNEL[np.ix_(rest, rest)] + ratio * np.eye(rest.sum())
+            mean = KERNEL[np.ix_(mine, rest)] @ np.linalg.solve(noisy, shifted[number][rest])
+            np.testing.assert_allclose(residuals[mine], shifted[number][mine] - mean, atol=1e-9)
+
+
+def test_covariances_are_those_without_the_group_and_without_a_points_own_noise():
+    roots = 0.3 * RANDOM.normal(size=(20, 3, 3)) + np.eye(3)
+    scatter = roots @ roots.transpose(0, 2, 1)
+    found = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)
+    for ratio, covariances in zip(RATIOS, found, strict=True):
+        for i in range(20):
+            own_group = GROUP[i]
+            rest = own_group != GROUP
+            noisy = np.kron(KERNEL[np.ix_(rest, rest)], np.eye(3))
+            for j, own in enumerate(scatter[rest]):
+                noisy[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] += ratio * own
+            across = np.kron(KERNEL[i, rest][None], np.eye(3))
+            expected = np.eye(3) - across @ np.linalg.solve(noisy, across.T)
+            np.testing.assert_allclose(covariances[i], expected, atol=1e-9)
+
+
+def test_the_first_candidate_that_is_good_enough_is_preferred():
+    assert preferred("abc", [3.0, 1.1, 1.0], 1.2) == "b"
+    with pytest.raises(ValueError, match="at least the least score, 1"):
+        preferred("abc", [3.0, 1.1, 1.0], 0.9)
+    assert mahalanobis(np.array([[2.0, 0.0]]), np.diag([4.0, 1.0])[None]) == pytest.approx([1.0])
