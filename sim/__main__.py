@@ -23,9 +23,9 @@ from service.files.shipped import ARMS, cell_of
 from service.process import interrupt
 from service.settings.arm_description import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
-from sim.script import Clock, HandScript, Pause
+from sim.script import Clock, HandScript, ScriptPause
 
-EXAMPLE = """example:
+SIM_EXAMPLE = """example:
   thirdhand serve &
   thirdhand sim --once --output report.json
 """
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         prog="thirdhand sim",
         description="The simulated bench: publishes hands and joint state, follows joint commands, and plays the "
         "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
-        epilog=EXAMPLE,
+        epilog=SIM_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
@@ -192,7 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
         stop.set()
 
     try:
-        Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
+        Clock(pauses=[ScriptPause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
         p.error(f"--pause, --turn: {error}")
     dropout = (
@@ -225,8 +225,8 @@ def main(arguments: list[str] | None = None) -> int:
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
             pauses=[
-                *(Pause(at, lasts) for at, lasts in args.pause),
-                *(Pause(at, lasts, depth=2.0) for at, lasts in args.turn),
+                *(ScriptPause(at, lasts) for at, lasts in args.pause),
+                *(ScriptPause(at, lasts, depth=2.0) for at, lasts in args.turn),
             ],
             offset_std=args.offset_mm / 1000,
             tremor_rms=args.tremor_mm / 1000,

@@ -18,6 +18,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from service.arms.playback import REJOIN_AFTER_S
+from service.client import BRAKE_AFTER_S
 from service.contract.messages import BASE, SceneObject
 from service.settings.config import Settings
 from sim.engines import world_of
@@ -25,11 +27,9 @@ from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
-SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
-STILL_S = 0.25  # of rest is settled
-BRAKE_AFTER_S = 0.020  # without a command
-REJOIN_AFTER_S = 0.1  # without a command; then the next one must begin where the arm stands
-REJOIN_RAD, REJOIN_RADPS = 0.02, 0.05  # how nearly
+SETTLE_RANGE_S = (0.5, 2.5)  # at least and at most, before the script begins
+SETTLED_STILL_S = 0.25  # of rest is settled
+STAND_RAD, STAND_RADPS = 0.02, 0.05  # how nearly
 HOLDS = 0.5  # closed so far the fingers hold what is between them
 TAIL_S = 0.5  # watched after the script's end
 CATCH_UP_RADPS = 0.25  # beside the commanded speed, at most, by the joint that is farthest behind
@@ -190,7 +190,7 @@ class Bench:
 
     def settled(self, waited_s: float) -> bool:
         """Whether the arm, given so long, has come to rest where the hands want it."""
-        return waited_s >= SETTLE_S[1] or (waited_s >= SETTLE_S[0] and self.still_s >= STILL_S)
+        return waited_s >= SETTLE_RANGE_S[1] or (waited_s >= SETTLE_RANGE_S[0] and self.still_s >= SETTLED_STILL_S)
 
     def observe(self) -> Observation:
         """What the last step left."""
@@ -224,7 +224,7 @@ class Bench:
         throw the arm along a way that is long past.
         """
         off = max(abs(told - is_at) for told, is_at in zip(position, self._observation.joints, strict=True))
-        return off <= REJOIN_RAD and max(map(abs, velocity or (0.0,))) <= REJOIN_RADPS
+        return off <= STAND_RAD and max(map(abs, velocity or (0.0,))) <= STAND_RADPS
 
     def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
         alone = self._since_command * self.period_s >= REJOIN_AFTER_S

@@ -25,7 +25,7 @@ from service.daemon.launch import Launched, launched
 from service.settings.config import Settings
 from sim.bench import Bench
 from sim.network import Bridge, Live
-from sim.parts import Link, Part, as_usual_afterwards, before_others
+from sim.parts import CELL, CellPart, Link, as_usual_afterwards, before_others
 from sim.scene import Scene
 from sim.script import HandScript
 
@@ -33,8 +33,7 @@ FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it 
 WATCHED_S = 1.0  # after a fault, before it is mended
 STEADY_S = 1.5  # it has followed before a fault strikes
 RESUMES_WITHIN_S = 60.0
-SWING_S = 5.0  # longer than the hands take to and fro
-CELL = "thirdhand"
+SWING_TIMEOUT_S = 5.0  # longer than the hands take to and fro
 
 
 Network = Literal["relays", "router", "link"]
@@ -45,7 +44,7 @@ class FaultError(RuntimeError):
     """A cell that did not do what a row of the table needs; the message says what."""
 
 
-class Event(NamedTuple):
+class FaultTimes(NamedTuple):
     """When a fault struck, when it was mended, when the tool moved again and when the watch ended
     (time.monotonic() [s]); the tick at which it struck; ticks counted as lost meanwhile.
     """
@@ -155,8 +154,8 @@ class FaultyCell:
         self._parts.close()
 
     @staticmethod
-    def _part(parts: contextlib.ExitStack, *arguments: str) -> Part:
-        return parts.enter_context(contextlib.closing(Part(*arguments)))
+    def _part(parts: contextlib.ExitStack, *arguments: str) -> CellPart:
+        return parts.enter_context(contextlib.closing(CellPart(*arguments)))
 
     def begin_service(self) -> None:
         """Begins the service, where it was if it has been."""
@@ -208,14 +207,14 @@ class FaultyCell:
         end = time.monotonic() + RESUMES_WITHIN_S
         while time.monotonic() < end:
             with contextlib.suppress(FaultError, UnreachableError):
-                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
+                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_TIMEOUT_S)
             with contextlib.suppress(UnreachableError):
                 if self.client.status().mode == "fault":
                     self.unasked += 1
                     self.client.reset()
         raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
 
-    def suffer(self, name: str, fault: Fault) -> Event:
+    def suffer(self, name: str, fault: Fault) -> FaultTimes:
         """What came of a fault that strikes while the tool is fast, and of mending it."""
         time.sleep(STEADY_S)
         self.until_fast()
@@ -229,7 +228,7 @@ class FaultyCell:
         fault.mend(self)
         moving = self.until_fast(MOVES)
         lost = self.client.status().scribe["lost"] - lost
-        return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
+        return FaultTimes(name, struck, mended, moving, time.monotonic(), tick, lost)
 
     def close(self) -> int:
         """The exit code of the service, asked to end."""

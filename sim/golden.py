@@ -39,8 +39,8 @@ from sim.script import HandScript
 WHOLE_EVERY = 500  # ticks: of all other frames a checksum is kept
 # Resolutions of a tracker and of joint encoders [m, rad, rad/s]: finer noise would fill the file.
 TRACKED, ENCODED, ENCODED_SPEED = 2.0**-15, 2.0**-14, 2.0**-10
-SECONDS = 20.0
-MOVED = Scene(handover=(0.66, -0.22, 0.33))
+SESSION_S = 20.0
+MOVED_SCENE = Scene(handover=(0.66, -0.22, 0.33))
 # What happens when [s].
 TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
     0.5,
@@ -53,14 +53,14 @@ TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
 )
 
 
-class Session:
+class GoldenSession:
     """The golden session: a bench in closed loop with all that happens to it, at its times."""
 
     def __init__(self, bench: Bench, skill: StoredSkill) -> None:
         self._bench = bench
         self._adopted = {
             self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=TOLERANCE_M),
-            self._tick(RETEACH_S): adapted(skill, MOVED.via_points(), tolerance=TOLERANCE_M),
+            self._tick(RETEACH_S): adapted(skill, MOVED_SCENE.via_points(), tolerance=TOLERANCE_M),
         }
         self._orders = {self._tick(HOLD_S[0]): "hold", self._tick(HOLD_S[1]): "resume"}
         self.loop = ClosedLoop(bench, direct=self._direct, spoil=self._spoil)
@@ -71,7 +71,7 @@ class Session:
     def ticks(self) -> Iterator[Tick]:
         """The ticks of the session; now and then deadlines are missed."""
         jump = 0
-        for tick in itertools.islice(self.loop.ticks(), self._tick(SECONDS)):
+        for tick in itertools.islice(self.loop.ticks(), self._tick(SESSION_S)):
             events, k = [_as_measured(event) for event in tick.inbox], tick.index
             if k in self._adopted:
                 events.append(Event("skill", self._adopted[k].file, self._adopted[k].for_loop()))
@@ -163,7 +163,7 @@ def make(path: Path, skill: StoredSkill) -> None:
     """Writes a new golden session."""
     settings, scene = Settings(), Scene()
     with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
-        session = Session(bench, skill)
+        session = GoldenSession(bench, skill)
         record(path, settings, skill, session.ticks(), follow=session.loop.follow)
 
 

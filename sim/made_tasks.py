@@ -21,35 +21,35 @@ from scipy.spatial.transform import Rotation
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.settings.config import Reach
-from sim.people import PROJECT_SEED, SEEDS, Person, person
+from sim.people import GROUP_SEEDS, PROJECT_SEED, Person, person
 from sim.scene import TOOL_ORIENTATION
 from sim.script import Array
 from sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
-KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
+TASK_KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
 TAUGHT = "visits"  # what the tutorial teaches; no experiment counts it
-RATE_HZ = 50
-REST_S, LAST_S = 1.2, 1.6  # before the first motion, after the last
-AHEAD_S = 2.0
+TAKE_HZ = 50
+START_REST_S, END_REST_S = 1.2, 1.6  # before the first motion, after the last
+LEAD_S = 2.0
 MOVED_M = (0.05, 0.10)  # least and most deviation of a scene's places; half as much up and down
 TOLD_M, TOOL_SCATTER_M, TOOL_NOISE_M = 0.004, 0.0025, 0.0005  # 3-D rms; of each axis
 HAND_OFF_M = (0.005, 0.010)  # by which a person's hand always stops off its places
 HAND_SCATTER_M = 0.002  # of that, each axis, each take
-LATE_S = (0.05, 0.35)  # the teacher's reaction
-NOISE_M = (0.001, 0.002)  # of a tracker, each axis; 1.5 mm in the mean
+REACTION_S = (0.05, 0.35)  # the teacher's reaction
+TRACKER_NOISE_M = (0.001, 0.002)  # of a tracker, each axis; 1.5 mm in the mean
 TURNS_RAD = (0.6, 0.15, 0.15)  # deviations of what a hand carries: yaw, pitch, roll
 GRIP_RAD, TURN_NOISE_RAD = 0.03, 0.01
 CARRIED_M = (-0.10, 0.0, 0.12)  # the tool, seen from the hand that it is fixed to or goes beside
 CURVE_M = 0.07  # how far the path that the tool follows sways to either side
 ARC_M = 0.04  # that the tool gains on its way
-SMOOTHED_S = 0.08  # of the teacher's hand
+TEACHER_SMOOTHING_S = 0.08  # of the teacher's hand
 PAUSES, STRAYS = 0.12, 0.15  # how probable a hand does so in a leg
-MARGIN_M = 0.05  # of the tool's places inside the arm's reach
+TOOL_MARGIN_M = 0.05  # of the tool's places inside the arm's reach
 LEAST_WAY_M = 0.10  # of a hand or tool from one place to the next
 HANDS_BOX = np.array([[[0.55, -0.42, 0.07], [0.95, -0.02, 0.25]], [[0.55, 0.02, 0.07], [0.95, 0.42, 0.25]]])
 CARRYING_BOX = np.array([[0.55, -0.30, 0.07], [0.70, 0.05, 0.18]])
 TOOL_BOX = np.array([[0.35, -0.36, 0.15], [0.60, 0.36, 0.40]])
-FARTHEST = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # of a hand
+HAND_BOX = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # of a hand
 RESTS = np.array([[0.52, -0.05, 0.04], [1.00, 0.50, 0.20]])  # of a right hand that has nothing to do
 
 
@@ -94,7 +94,7 @@ def plan(kind: str) -> Plan:
     elif kind == "one_hand":
         names, stages = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
     else:
-        raise ValueError(f"{kind!r}: no kind of made task; there are {', '.join(KINDS)}")
+        raise ValueError(f"{kind!r}: no kind of made task; there are {', '.join(TASK_KINDS)}")
     follow = {"path": [0.0, 1.0, 1.0], "heading": [1.0] * 3}.get(kind, [0.0] * len(names))
     return Plan(
         names,
@@ -103,13 +103,13 @@ def plan(kind: str) -> Plan:
         left_leads=kind in ("path", "heading", "one_hand"),
         carried=kind == "heading",
         curved=1 if kind == "path" else -1,
-        ahead_s=AHEAD_S if kind == "ahead" else 0.0,
+        ahead_s=LEAD_S if kind == "ahead" else 0.0,
         dwells={"long": (4.5, 7.0), TAUGHT: (0.7, 1.1)}.get(kind, (0.7, 1.6)),
         pauses=0.0 if kind == TAUGHT else PAUSES,  # live, a rest ends the take
     )
 
 
-class Scene(NamedTuple):
+class TaskScene(NamedTuple):
     """Where hands and tool are at each stage (N, 3) [m], and how what the left hand carries is
     turned (N, 3): yaw, pitch and roll [rad].
     """
@@ -129,10 +129,10 @@ def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list
     return [Take(who, run(kind, who, number, seed=seed).demonstration()) for who in people for number in range(each)]
 
 
-def run(kind: str, who: int, number: int, *, seed: int = 0, scene: Scene | None = None) -> Run:
+def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | None = None) -> Run:
     """How a person does a task once, in a scene of its own if none is given."""
     task = plan(kind)
-    key = (PROJECT_SEED, SEEDS["made"], (*KINDS, TAUGHT).index(kind), seed, who, number + 1)
+    key = (PROJECT_SEED, GROUP_SEEDS["made"], (*TASK_KINDS, TAUGHT).index(kind), seed, who, number + 1)
     random = np.random.default_rng(key)
     habits = person("made", who)
     habits = habits._replace(tremor=0.4 * habits.tremor, lead_s=task.ahead_s or 0.2 * habits.lead_s)
@@ -151,7 +151,7 @@ class Run:
     """A person's way through a task."""
 
     task: Plan
-    scene: Scene
+    scene: TaskScene
     habits: Person
     number: int
     order: tuple[int, ...]  # of the stages
@@ -161,7 +161,7 @@ class Run:
     @property
     def lasts_s(self) -> float:
         """From begin to end."""
-        return max(legs[-1].begin_s + legs[-1].lasts_s for legs in self.legs) + LAST_S
+        return max(legs[-1].begin_s + legs[-1].lasts_s for legs in self.legs) + END_REST_S
 
     def hands(self, times: Array) -> Array:
         """Both hands (T, 6) [m] as they are."""
@@ -173,11 +173,11 @@ class Run:
         hand carries was turned then (T, 3).
         """
         random = np.random.default_rng([*self.key, 3])
-        late = times - random.uniform(*LATE_S)
+        late = times - random.uniform(*REACTION_S)
         (left, by_left), (_, by_right) = (along(legs, late) for legs in self.legs)
         rate_hz = 1.0 / float(times[1] - times[0])
         progress = by_left if self.task.left_leads else np.minimum(by_left, by_right)
-        progress = gaussian_filter1d(progress, SMOOTHED_S * rate_hz, mode="nearest")
+        progress = gaussian_filter1d(progress, TEACHER_SMOOTHING_S * rate_hz, mode="nearest")
         order = np.array(self.order)
         nodes = np.arange(len(order))
 
@@ -198,9 +198,9 @@ class Run:
         """What a tracker and the arm make of it, with the places as they are perceived."""
         random = np.random.default_rng([*self.key, 4])
         habit = np.random.default_rng([*self.key[:2], self.number])
-        steps = np.arange(int(self.lasts_s * RATE_HZ))
-        times, count = steps / RATE_HZ, len(steps)
-        hands = self.hands(times) + habit.uniform(*NOISE_M) * random.standard_normal((count, 6))
+        steps = np.arange(int(self.lasts_s * TAKE_HZ))
+        times, count = steps / TAKE_HZ, len(steps)
+        hands = self.hands(times) + habit.uniform(*TRACKER_NOISE_M) * random.standard_normal((count, 6))
         tool, late = self.tool(times)
         (_, by_left), _ = (along(legs, times) for legs in self.legs)
         nodes = np.arange(len(self.order))
@@ -212,7 +212,7 @@ class Run:
         usual = Rotation.from_quat(TOOL_ORIENTATION)
         turned = Rotation.from_euler("ZYX", late) * usual if self.task.carried else usual
         return Demonstration(
-            steps * (1_000_000_000 // RATE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
+            steps * (1_000_000_000 // TAKE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
             np.hstack([hands[:, :3], _quaternions(left, count)]),
             np.hstack([hands[:, 3:], _quaternions(right, count)]),
             np.hstack([tool + TOOL_NOISE_M * random.standard_normal(tool.shape), _quaternions(turned, count)]),
@@ -249,7 +249,7 @@ def _within(box: Array, random: np.random.Generator) -> Array:
 def _usual(kind: str, seed: int) -> list[Array]:
     """The usual places of left hand, right hand and tool, and turns of each of the left's."""
     task = plan(kind)
-    random = np.random.default_rng([PROJECT_SEED, SEEDS["made"], KINDS.index(kind), seed])
+    random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS["made"], TASK_KINDS.index(kind), seed])
     boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
     out = []
     for box, column in zip(boxes, task.stages.T, strict=True):
@@ -266,7 +266,7 @@ def _usual(kind: str, seed: int) -> list[Array]:
     return [*out, np.array(TURNS_RAD) * random.standard_normal((len(out[0]), 3))]
 
 
-def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> Scene:
+def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> TaskScene:
     """A scene of the task: each place elsewhere, where arm and hands reach it."""
     sigma = random.uniform(*MOVED_M) * np.array([1.0, 1.0, 0.5])
 
@@ -275,7 +275,7 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
             tried = usual[part][index] + sigma * random.standard_normal(3)
             if before is not None and np.linalg.norm(tried - before) < LEAST_WAY_M:
                 continue
-            low, high = FARTHEST if part < 2 else np.array([[-1.0] * 3, [1.0] * 3])
+            low, high = HAND_BOX if part < 2 else np.array([[-1.0] * 3, [1.0] * 3])
             carries = part == 0 and task.follow.any()
             if (
                 ((tried >= low) & (tried <= high)).all()
@@ -298,16 +298,16 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
     else:
         tool = np.where(task.follow[:, None] > 0, left + CARRIED_M, tool)
-    return Scene(left, right, tool, turns)
+    return TaskScene(left, right, tool, turns)
 
 
 def _reached(tool: Array) -> bool:
     reach = Reach()
     away = float(np.linalg.norm(tool - reach.centre))
     return (
-        reach.inner + MARGIN_M <= away <= reach.outer - MARGIN_M
-        and tool[0] >= reach.min_x + MARGIN_M
-        and tool[2] >= reach.min_z + MARGIN_M
+        reach.inner + TOOL_MARGIN_M <= away <= reach.outer - TOOL_MARGIN_M
+        and tool[0] >= reach.min_x + TOOL_MARGIN_M
+        and tool[2] >= reach.min_z + TOOL_MARGIN_M
     )
 
 
@@ -327,7 +327,7 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
 
 
 def _legs(
-    task: Plan, scene: Scene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
+    task: Plan, scene: TaskScene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
 ) -> tuple[tuple[Leg, ...], tuple[Leg, ...]]:
     """Both hands' legs from stage to stage: each waits for the other but for its lead."""
     random = np.random.default_rng([*key, 5])
@@ -339,7 +339,7 @@ def _legs(
         ends[side] += (off + HAND_SCATTER_M * random.standard_normal(off.shape))[column]
     legs: tuple[list[Leg], list[Leg]] = ([], [])
     free = [0.5, 0.5]  # when each hand is free to go
-    both = REST_S + max(who.lead_s, 0.0)
+    both = START_REST_S + max(who.lead_s, 0.0)
 
     def go(
         side: int, at: float, way: Array, progress: tuple[float, float], bow: Array | None, *, curve: bool = False

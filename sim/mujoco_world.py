@@ -10,18 +10,18 @@ import numpy as np
 
 from service.settings.config import Settings
 from sim.description import simulated
-from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World
+from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # pictures without a screen
 import mujoco
 
-SHAPES = {
+GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-FELT, SEEN = 0, 1  # groups of shapes; MuJoCo puts those of a URDF into these
+FELT_GROUP, SEEN_GROUP = 0, 1  # groups of shapes; MuJoCo puts those of a URDF into these
 MOST_PIXELS = 2048  # each way
 # The arm is stopped by what is solid, and nothing by anything else. No link is without mass there.
 READ_AS = {
@@ -38,11 +38,11 @@ class MujocoWorld(World):
     of its position's error and all of its velocity's within a step, as far as its effort goes.
     """
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         spec = mujoco.MjSpec.from_string(simulated(settings, **READ_AS))
         spec.option.timestep = self._period_s
         for shape in spec.geoms:
-            shape.contype, shape.conaffinity = int(shape.group == FELT), 0
+            shape.contype, shape.conaffinity = int(shape.group == FELT_GROUP), 0
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -71,21 +71,21 @@ class MujocoWorld(World):
         mujoco.mj_step1(model, self._data)
 
     @staticmethod
-    def _add(spec: Any, name: str, body: Body) -> None:
+    def _add(spec: Any, name: str, body: WorldBody) -> None:
         x, y, z = body.look.size
         made = spec.worldbody.add_body(
             name=name, pos=body.at.position, quat=_w_first(body.at.orientation), mocap=not body.solid
         )
         made.add_geom(
             name=name,
-            type=SHAPES[body.look.shape],
+            type=GEOM_TYPES[body.look.shape],
             size=(x / 2, y / 2, z / 2) if body.look.shape == "box" else (x / 2, z / 2, 0),
             pos=body.offset.position,
             quat=_w_first(body.offset.orientation),
             rgba=body.look.colour,
             contype=0,
             conaffinity=int(body.solid),
-            group=SEEN,
+            group=SEEN_GROUP,
         )
 
     def follow(self, position: Floats, velocity: Floats) -> None:
@@ -150,7 +150,7 @@ class MujocoWorld(World):
         lens.lookat[:], lens.distance = target, np.linalg.norm(away)
         lens.azimuth = np.degrees(np.arctan2(away[1], away[0]))
         lens.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
-        shown.geomgroup[FELT] = 0
+        shown.geomgroup[FELT_GROUP] = 0
         with mujoco.Renderer(self._model, size[1], size[0]) as renderer:
             renderer.update_scene(self._data, lens, shown)
             return renderer.render()

@@ -28,10 +28,10 @@ from sim.scene import Scene
 from sim.script import Array
 
 THINGS_HZ = 10
-STOP_S = 0.5  # between the last hands and the end
+FINAL_STOP_S = 0.5  # between the last hands and the end
 QUIET_S = 1.0  # without a command, after which that is said
 MOST_QUEUED = 256  # commands, while the bench is held up
-HEADROOM = 1.25  # of the arm's drives beyond what is commanded: else it could not catch up after that
+DRIVE_HEADROOM = 1.25  # of the arm's drives beyond what is commanded: else it could not catch up after that
 
 
 class BenchError(RuntimeError):
@@ -146,7 +146,7 @@ class Led:
     def __init__(self, bench: Bench, commands: Commands, gripper: Gripper) -> None:
         self._bench, self._commands, self._gripper = bench, commands, gripper
         names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
-        more = {name: tuple(HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
+        more = {name: tuple(DRIVE_HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
         limits = msgspec.structs.replace(bench.limits, **more)
         self._playback = Playback(limits, joints, period_s=bench.period_s)
 
@@ -352,7 +352,7 @@ def _play(
 
 def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> None:
     """Without hands the service stops the arm; one that vanished before that would be a fault."""
-    for _ in range(round(STOP_S / bench.period_s)):
+    for _ in range(round(FINAL_STOP_S / bench.period_s)):
         deadlines.wait()
         bridge.publish_joints(led.step()[0])
 

@@ -16,7 +16,7 @@ from service.core.arm.stage import Arm
 from service.core.geometry import between_segments, place, quaternion_of
 from service.core.separation.body import body_of
 from service.settings.config import Settings, robot_description
-from sim.world import LEVEL, Body, Floats, Pose, World, carried_by
+from sim.world import LEVEL, Floats, Pose, World, WorldBody, carried_by
 
 
 class ObservedWorld(World):
@@ -24,7 +24,7 @@ class ObservedWorld(World):
 
     heard = False  # of the arm
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         self._names = settings.joints.names
         description = robot_description(settings)
         self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies

@@ -37,7 +37,8 @@ from service.process import child
 from sim.scene import Scene
 from sim.script import HandScript
 
-HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
+CELL = "thirdhand"  # the default cell
+PART_HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
 MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
 START_TIMEOUT_S = 60.0
 PRIORITY = 20  # below the service's loop, above what it does beside
@@ -86,8 +87,8 @@ def track(endpoint: str) -> None:
     signal.signal(signal.SIGUSR2, set_the_clock)
     script, sides = HandScript(Scene(), seed=Scene().seed), ("left", "right")
     with open_session(connect=[endpoint]) as session:
-        publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
-        clock, payloads = Deadlines(HANDS_HZ), [b"", b""]
+        publishers = [session.declare_publisher(channels.key(CELL, f"hands/{side}")) for side in sides]
+        clock, payloads = Deadlines(PART_HANDS_HZ), [b"", b""]
         print("begun", flush=True)
         while True:
             clock.wait()
@@ -137,7 +138,7 @@ def route(port: int) -> None:
         signal.pause()
 
 
-class Part:
+class CellPart:
     """One of them, running; `endpoint` where it listens. Raises PartError where it does not begin.
 
     `again` begins it anew at the same endpoint, after its end.

@@ -15,7 +15,7 @@ from sim.scene import RIGHT_FROM_OBJECT, TOOL_FROM_OBJECT
 from sim.script import Array
 
 Group: TypeAlias = Literal["demonstrations", "tuning", "test", "made"]
-SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
+GROUP_SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
 PROJECT_SEED = 2024
 LEAST_DWELL_S, MOST_DWELL_S = 0.9, 1.8
 LONGEST_LEAD_S = 2.0
@@ -51,7 +51,7 @@ class Places(NamedTuple):
         return Places(left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m)
 
 
-class Tracker(NamedTuple):
+class TrackerModel(NamedTuple):
     """What a tracker makes of a hand: rate, noise of each axis, jumps and dropouts a second."""
 
     rate_hz: float = 100.0
@@ -78,7 +78,7 @@ class Person(NamedTuple):
     sway: float  # of a waiting hand, rms of an axis
     strays: float  # how probable it is that a waiting hand does something else in between
     tremor: float
-    tracker: Tracker
+    tracker: TrackerModel
     mistakes: float = 0.25  # how probable one is in a session
     swaps: float = 0.25  # how probable it is that a tracker takes left for right for a moment
     shapes: Sequence[tuple[Array, Array]] = ()  # recorded reaches: shares (M,), deviations (M, 3) a metre, way along x
@@ -86,7 +86,7 @@ class Person(NamedTuple):
 
 def person(group: Group, number: int) -> Person:
     """One of a group's people."""
-    random = np.random.default_rng([PROJECT_SEED, SEEDS[group], number])
+    random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS[group], number])
     rate = (30.0, 60.0, 120.0)[number % 3]
     bow = random.standard_normal((2, 2, 3))
     bow[..., 2] += 0.7
@@ -107,13 +107,13 @@ def person(group: Group, number: int) -> Person:
         sway=float(random.uniform(0.001, 0.004)),
         strays=float(random.uniform(0.0, 0.6)),
         tremor=float(random.uniform(0.0003, 0.0012)),
-        tracker=Tracker(
+        tracker=TrackerModel(
             rate, float(random.uniform(0.001, 0.003)), float(random.uniform(0, 0.4)), float(random.uniform(0, 0.1))
         ),
     )
 
 
-PLAIN = Person(
+PLAIN_PERSON = Person(
     name="plain",
     start=np.zeros((2, 3)),
     reach=np.zeros((3, 3)),
@@ -128,7 +128,7 @@ PLAIN = Person(
     sway=0.0015,
     strays=0.0,
     tremor=0.0005,
-    tracker=Tracker(),
+    tracker=TrackerModel(),
     mistakes=0.0,
     swaps=0.0,
 )

@@ -10,13 +10,13 @@ import numpy as np
 from service.settings.config import Settings
 from sim.description import simulated
 from sim.quiet import pybullet
-from sim.world import POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World, camera
+from sim.world import POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody, camera
 
 
 class PyBulletWorld(World):
     """The bench's world, simulated by PyBullet."""
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         names = settings.joints.names
         self._id: int = pybullet.connect(pybullet.DIRECT)
         pybullet.setTimeStep(self._period_s, physicsClientId=self._id)
@@ -39,7 +39,7 @@ class PyBulletWorld(World):
             pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._id)
         self._bodies = {name: self._body(body) for name, body in bodies.items()}
 
-    def _body(self, body: Body) -> int:
+    def _body(self, body: WorldBody) -> int:
         size, kind = body.look.size, getattr(pybullet, f"GEOM_{body.look.shape.upper()}")
         box = {"halfExtents": tuple(0.5 * edge for edge in size)}
         shown = box if body.look.shape == "box" else {"radius": size[0] / 2, "length": size[2]}

@@ -43,7 +43,7 @@ HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 FAR_OFF = 5.0  # [m] nobody means
 IN_REACH = 0.01  # [m] within its ends
 MOST_MOVED = 0.15  # [m] from the nominal place: beyond it the arm cannot reach every scene
-LOWEST = {  # [m] above the table
+MIN_HEIGHT_M = {  # [m] above the table
     "robot_start": 0.05,
     "handover": 0.05,
     "glass": 0.05,
@@ -79,7 +79,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
     def __post_init__(self) -> None:
-        for name, lowest in LOWEST.items():
+        for name, lowest in MIN_HEIGHT_M.items():
             given: Point = getattr(self, name)
             nominal = _nominal(name)
             moved = math.dist(given, nominal)

@@ -29,7 +29,7 @@ GRIP_AT, GRIP_S = 0.88, 0.25  # of a motion the gripper opens or closes, as the 
 TOOL_ARCS = ((0.0, 0.0, 0.03), (0.03, 0.0, 0.05), (0.0, 0.0, 0.04))
 
 
-class Motion(NamedTuple):
+class PointMotion(NamedTuple):
     """Position [m], velocity [m/s] and acceleration [m/s²] of a point, each (3,)."""
 
     position: Array
@@ -40,11 +40,11 @@ class Motion(NamedTuple):
 class HandMotions(NamedTuple):
     """What both hands do at one time, free of tremor and noise."""
 
-    left: Motion
-    right: Motion
+    left: PointMotion
+    right: PointMotion
 
 
-class Pause(NamedTuple):
+class ScriptPause(NamedTuple):
     """A stop of the script: the hands begin to slow at `at_s` and are at full speed again `lasts_s`
     later (at least 0.6 s).
 
@@ -59,7 +59,7 @@ class Pause(NamedTuple):
 class Clock:
     """Script time against elapsed time: a speed factor, and pauses that begin and end smoothly."""
 
-    def __init__(self, *, speed: float = 1.0, pauses: Sequence[Pause] = ()) -> None:
+    def __init__(self, *, speed: float = 1.0, pauses: Sequence[ScriptPause] = ()) -> None:
         if not 0.05 <= speed <= 20.0:
             raise ValueError(f"speed {speed} given, 0.05 to 20 accepted")
         for pause in pauses:
@@ -112,7 +112,7 @@ class Path:
         self._points = [np.asarray(point, dtype=np.float64) for point in points]
         self._arcs = [np.asarray(arc, dtype=np.float64) for arc in arcs] or [np.zeros(3)] * len(segments)
 
-    def at(self, script_s: float, rate: float = 1.0, rate_change: float = 0.0) -> Motion:
+    def at(self, script_s: float, rate: float = 1.0, rate_change: float = 0.0) -> PointMotion:
         """The point's motion at a script time [s] whose rate and rate of change are given."""
         i = max((k for k, begin in enumerate(self._begins) if script_s >= begin), default=0)
         lasts = self._lasts[i]
@@ -123,7 +123,7 @@ class Path:
         bump, d_bump, dd_bump = 64 * (u * v) ** 3, 192 * (u * v) ** 2 * (v - u), 384 * u * v * ((v - u) ** 2 - u * v)
         d = (d_share * way + d_bump * arc) / lasts
         dd = (dd_share * way + dd_bump * arc) / lasts**2
-        return Motion(start + share * way + bump * arc, d * rate, dd * rate * rate + d * rate_change)
+        return PointMotion(start + share * way + bump * arc, d * rate, dd * rate * rate + d * rate_change)
 
 
 class HandScript:
@@ -140,7 +140,7 @@ class HandScript:
         *,
         seed: int,
         speed: float = 1.0,
-        pauses: Sequence[Pause] = (),
+        pauses: Sequence[ScriptPause] = (),
         offset_std: float = 0.008,
         tremor_rms: float = 0.0005,
         noise_std: float = 0.0005,
@@ -206,7 +206,7 @@ class Teacher:
         self._path = Path(points, scene.segments, arcs=TOOL_ARCS)
         self._opens, self._closes = (begin + GRIP_AT * (end - begin) for begin, end in scene.segments[:2])
 
-    def truth(self, t: float) -> Motion:
+    def truth(self, t: float) -> PointMotion:
         """The tool's motion `t` seconds after the script began."""
         return self._path.at(*self._clock.at(max(t, 0.0)))
 

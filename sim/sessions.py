@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.people import LONGEST_LEAD_S, PLAIN, PROJECT_SEED, SEEDS, Group, Person, Places, person
+from sim.people import GROUP_SEEDS, LONGEST_LEAD_S, PLAIN_PERSON, PROJECT_SEED, Group, Person, Places, person
 from sim.scene import MOST_MOVED, TOOL_FROM_HAND, Scene
 from sim.script import TOOL_ARCS, Array
 
 REST_S, LAST_S = 1.0, 1.6  # before the first motion, after the last
 PHASES_S = (3.0, 3.5, 3.0)  # at a speed of 1
-LOWEST_M = 0.03  # of a hand above the table
+MIN_HAND_HEIGHT_M = 0.03  # of a hand above the table
 SHAPE_STEPS = 200
 TEACHERS_SCATTER_M, TEACHERS_LAG_S = 0.005, 0.1
-EVENTS = ("handover", "glass", "soldering")
+SESSION_EVENTS = ("handover", "glass", "soldering")
 MISTAKES = ("board first", "handover again", "iron again", "solder again", "right to the board")
 BREAKING = (
     "hands stop 24 mm off",
@@ -150,7 +150,7 @@ def session(who: Person, number: int, *, group: Group, sigma_m: float = 0.0, mov
     """A run of a person through a scene whose things lie up to `moved_m` from their usual places,
     and are perceived with an error of `sigma_m` (3-D rms).
     """
-    seed = (PROJECT_SEED, SEEDS[group], int("".join(c for c in who.name if c.isdigit()) or 0), number + 1)
+    seed = (PROJECT_SEED, GROUP_SEEDS[group], int("".join(c for c in who.name if c.isdigit()) or 0), number + 1)
     random = np.random.default_rng(seed)
     scene = Scene()
     usual = (scene.handover, scene.glass, scene.soldering, scene.iron)
@@ -172,7 +172,7 @@ def played(
     at_handover, at_board, at_iron = who.reach
     left = np.array([places.left_start, places.handover + at_handover, places.board + at_board]) + scatter[0]
     right = np.array([places.right_start, places.iron + at_iron, places.right_final + at_iron]) + scatter[1]
-    left[:, 2], right[:, 2] = np.maximum(left[:, 2], LOWEST_M), np.maximum(right[:, 2], LOWEST_M)
+    left[:, 2], right[:, 2] = np.maximum(left[:, 2], MIN_HAND_HEIGHT_M), np.maximum(right[:, 2], MIN_HAND_HEIGHT_M)
     lasts = np.array(PHASES_S) / who.speed * random.uniform(0.85, 1.15, 3)
     dwell = random.uniform(*who.dwells, 2)
     hands: tuple[list[Leg], list[Leg]] = ([], [])
@@ -220,7 +220,7 @@ def played(
     return Session(who, number, places, told, (tuple(hands[0]), tuple(hands[1])), windows, end, seed, swapped, mistake)
 
 
-class Shown(NamedTuple):
+class SessionDemonstration(NamedTuple):
     """A demonstration: times (T,) [s], hands (T, 6) as tracked, tool (T, 3) [m], and the places as
     they were perceived.
     """
@@ -231,7 +231,7 @@ class Shown(NamedTuple):
     places: Places
 
 
-def demonstration(run: Session, *, rate_hz: float = 25.0) -> Shown:
+def demonstration(run: Session, *, rate_hz: float = 25.0) -> SessionDemonstration:
     """What is recorded of a run in which a teacher, who knows the scene, leads the tool: a little
     late, and off by some millimetres.
     """
@@ -239,10 +239,10 @@ def demonstration(run: Session, *, rate_hz: float = 25.0) -> Shown:
     lag, off = TEACHERS_LAG_S * random.random(), TEACHERS_SCATTER_M * random.standard_normal((4, 3))
     times = np.arange(0.2, run.lasts_s - 0.05, 1.0 / rate_hz)
     hands = [np.interp(times, stamps, column) for stamps, seen in run.samples() for column in seen.T]
-    return Shown(times, np.stack(hands, axis=1), run.tool(times - lag, off=off), run.told)
+    return SessionDemonstration(times, np.stack(hands, axis=1), run.tool(times - lag, off=off), run.told)
 
 
-def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[Shown]:
+def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[SessionDemonstration]:
     """Two of each demonstrating person: things in their usual places, and things moved by up to
     10 cm. Who makes a mistake does it again, so there is none.
     """
@@ -260,9 +260,9 @@ def breaking(kind: str, number: int, *, group: Group) -> Session:
     The hands are the bench's: together, straight, evenly fast, a good tracker. The iron that is
     elsewhere is not told of: only hands go there.
     """
-    seed = (PROJECT_SEED, SEEDS[group], 1000 + BREAKING.index(kind), number)
+    seed = (PROJECT_SEED, GROUP_SEEDS[group], 1000 + BREAKING.index(kind), number)
     random = np.random.default_rng(seed)
-    scene, who = Scene(), PLAIN
+    scene, who = Scene(), PLAIN_PERSON
     usual = (scene.handover, scene.glass, scene.soldering)
     handover, glass, board = (_moved(np.array(place), MOST_MOVED, random) for place in usual)
     starts = np.array(scene.left_start), np.array(scene.right_start)
@@ -296,7 +296,7 @@ def _away(place: Array, distance_m: float, random: np.random.Generator) -> Array
     while True:
         way = random.standard_normal(3) * (1.0, 1.0, 0.5)
         there = place + distance_m * way / np.linalg.norm(way)
-        if there[2] >= LOWEST_M:
+        if there[2] >= MIN_HAND_HEIGHT_M:
             return np.asarray(there)
 
 

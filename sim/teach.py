@@ -32,17 +32,20 @@ from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
 from sim.script import Array, Clock, HandScript, Teacher
 
-RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
-EXAMPLE = """example:
+RADIUS_M, MIN_PLACE_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
+TEACH_EXAMPLE = """example:
   python -m sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
-BEFORE_S, AFTER_S = 0.5, 3.0  # of rest
-TRAY, BESIDE = (0.95, -0.15, 0.12), (0.95, 0.35, 0.07)  # [m] where the left hand comes twice; where the right one rests
-VISITED = made_tasks.Scene(
+REST_BEFORE_S, REST_AFTER_S = 0.5, 3.0  # of rest
+TRAY, RIGHT_REST = (
+    (0.95, -0.15, 0.12),
+    (0.95, 0.35, 0.07),
+)  # [m] where the left hand comes twice; where the right one rests
+VISITED = made_tasks.TaskScene(
     np.array([(0.60, -0.30, 0.07), TRAY, (0.70, 0.02, 0.22), TRAY, (0.75, -0.42, 0.25)]),
-    np.array([BESIDE, BESIDE, (0.78, 0.20, 0.20), BESIDE, BESIDE]),
+    np.array([RIGHT_REST, RIGHT_REST, (0.78, 0.20, 0.20), RIGHT_REST, RIGHT_REST]),
     np.array([(0.42, -0.28, 0.35), (0.62, -0.20, 0.30), (0.50, 0.15, 0.25), (0.38, -0.05, 0.40), (0.45, 0.30, 0.22)]),
     np.zeros((5, 3)),
 )
@@ -84,7 +87,7 @@ def by_people(people: int) -> list[Demonstration]:
     return [recorded(one, begin_s=60 * number) for number, one in enumerate(sessions.demonstrations(people))]
 
 
-def recorded(shown: sessions.Shown, *, begin_s: int = 1) -> Demonstration:
+def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demonstration:
     """A demonstration of a session, as the service reads it from a recording."""
     count = len(shown.times)
     still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
@@ -103,7 +106,7 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 
     A place's `std` is of each axis, its error 3-D rms.
     """
-    p, std = places, max(places.std_m / math.sqrt(3.0), LEAST_STD_M)
+    p, std = places, max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
     named = (
         ("start", p.left_start, p.right_start, p.robot_start),
         ("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND),
@@ -133,7 +136,7 @@ def perform(
         return (*script.sample(t), teacher.sample(t))
 
     return publish(
-        poses, script.duration_s, BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
+        poses, script.duration_s, REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
     )
 
 
@@ -147,7 +150,7 @@ def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: flo
         at = ([np.interp(t, times, column) for column in part[:, :3].T] for part in shown[1:4])
         return tuple(np.append(one, part[row, 3:]) for one, part in zip(at, shown[1:4], strict=True))
 
-    return publish(poses, float(times[-1]), BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
+    return publish(poses, float(times[-1]), REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
 
 
 def visits(number: int) -> Demonstration:
@@ -166,8 +169,8 @@ def publish(
     rate_hz: int = 100,
 ) -> bool:
     """Publishes hands and tool in real time, as their tracker would, from when somebody listens to
-    the hands until nobody does: they rest for `before_s` first, and AFTER_S at the end. `poses` are
-    those at a time [s] from the begin, (7,) each.
+    the hands until nobody does: they rest for `before_s` first, and REST_AFTER_S at the end.
+    `poses` are those at a time [s] from the begin, (7,) each.
 
     Whether somebody listened to its end. Raises UnreachableError.
     """
@@ -182,7 +185,7 @@ def publish(
         begin, step = time.monotonic() + before_s, 0
         while _are_heard(of_hands):
             t = time.monotonic() - begin
-            if t > lasts_s + AFTER_S:
+            if t > lasts_s + REST_AFTER_S:
                 return True
             stamp_ns = time.time_ns()
             for publisher, pose in zip(publishers, poses(t), strict=True):
@@ -203,7 +206,7 @@ def main(arguments: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(
         prog="python -m sim.teach",
         description="Demonstrations of the soldering scene: hands and tool at 100 Hz, one MCAP file each, or live.",
-        epilog=EXAMPLE,
+        epilog=TEACH_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(

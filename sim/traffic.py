@@ -28,15 +28,14 @@ import zenoh
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError, in_words
 from service.daemon.launch import launched
-from sim.parts import Part, PartError
+from sim.parts import CELL, CellPart, PartError
 from sim.sockets import CountingRelay
 
-CELL = "thirdhand"
-READY_S, SETTLE_S = 60.0, 2.0
+READY_S, TRAFFIC_SETTLE_S = 60.0, 2.0
 OURS = {"service": "daemon", "bench": "arm and tracker", "observer": "observer of every stream"}
 
 
-class Measured(NamedTuple):
+class Traffic(NamedTuple):
     """Rates [messages/s, bytes/s] by key, [bytes/s] sent to and received from the router by each
     of OURS, and the share of a core that the router took.
     """
@@ -48,11 +47,11 @@ class Measured(NamedTuple):
     router_cores: float
 
 
-def measured(seconds: float) -> Measured:
+def measured(seconds: float) -> Traffic:
     """One cell's traffic over so many seconds. Raises ExplainedError and PartError."""
     with contextlib.ExitStack() as closing:
         folder = Path(closing.enter_context(tempfile.TemporaryDirectory()))
-        router = closing.enter_context(contextlib.closing(Part("router", "0")))
+        router = closing.enter_context(contextlib.closing(CellPart("router", "0")))
         relays = {who: closing.enter_context(CountingRelay(router.endpoint)) for who in OURS}
         network = f'[network]\nlisten = []\nconnect = ["{relays["service"].endpoint}"]\n'
         closing.enter_context(launched(folder, network=network))
@@ -66,7 +65,7 @@ def measured(seconds: float) -> Measured:
         session = closing.enter_context(open_session(connect=[relays["observer"].endpoint]))
         client = Client(session, CELL)
         _until_following(client)
-        time.sleep(SETTLE_S)
+        time.sleep(TRAFFIC_SETTLE_S)
         messages, payload, lock = Counter[str](), Counter[str](), threading.Lock()
 
         def count(sample: zenoh.Sample) -> None:
@@ -88,7 +87,7 @@ def measured(seconds: float) -> Measured:
         if (now := client.status()).mode == "fault":
             raise ExplainedError(f"the service is at fault ({now.reason}): try again while less else runs")
         with lock:
-            return Measured(
+            return Traffic(
                 {key: count / lasted for key, count in sorted(messages.items())},
                 {key: size / lasted for key, size in sorted(payload.items())},
                 {who: rate[0] for who, rate in rates.items()},
@@ -105,7 +104,7 @@ def _until_following(client: Client) -> None:
         time.sleep(0.1)
 
 
-def text(one: Measured, cells: int) -> str:
+def text(one: Traffic, cells: int) -> str:
     """The figures for people to read, and what so many cells would need."""
     lines = [f"{'':<28}{'messages/s':>12}{'payload kB/s':>14}"]
     for key in one.messages:

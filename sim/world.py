@@ -26,8 +26,8 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 POSITION_GAIN = 0.3  # this much of a position error is made up in one step
 TABLE_THICKNESS = 0.04  # [m]
 UNLIMITED = 1e6  # [N m] of a motor of which the description does not say it
-FIELD_OF_VIEW, NEAR, FAR = 45.0, 0.1, 5.0  # of pictures: upright [degrees], and from where to where [m]
-GREEN, STEEL, WOOD, SKIN, BLUE = (
+FIELD_OF_VIEW, NEAR_PLANE_M, FAR_PLANE_M = 45.0, 0.1, 5.0  # of pictures: upright [degrees], and from where to where [m]
+BOARD_RGBA, STEEL_RGBA, WOOD_RGBA, SKIN_RGBA, IRON_RGBA = (
     (0.1, 0.5, 0.2, 1.0),
     (0.7, 0.7, 0.75, 1.0),
     (0.75, 0.6, 0.4, 1.0),
@@ -57,7 +57,7 @@ class Look(NamedTuple):
     colour: Floats
 
 
-class Body(NamedTuple):
+class WorldBody(NamedTuple):
     """What stands around the arm: how it looks, from where in its own frame, and where it is at
     first. The arm is stopped by what is `solid`; how far it is from what is `measured`, one asks.
     """
@@ -89,7 +89,7 @@ class World(abc.ABC):
         self.put(self.board, Pose(self.tool()[0].position, LEVEL))
 
     @abc.abstractmethod
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         """Make the arm, at a posture [rad], and all bodies."""
 
     @abc.abstractmethod
@@ -162,34 +162,37 @@ def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any
     view[:3, 3] = view[:3, :3] @ np.negative(eye)
     scale = 1 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     projection[:2, :2] = np.diag((scale * size[1] / size[0], scale))
-    projection[2, 2:] = (FAR + NEAR) / (NEAR - FAR), 2 * FAR * NEAR / (NEAR - FAR)
+    projection[2, 2:] = (
+        (FAR_PLANE_M + NEAR_PLANE_M) / (NEAR_PLANE_M - FAR_PLANE_M),
+        2 * FAR_PLANE_M * NEAR_PLANE_M / (NEAR_PLANE_M - FAR_PLANE_M),
+    )
     projection[3, 2] = -1.0
     return projection, view
 
 
-def furniture(scene: Scene, settings: Settings) -> dict[str, Body]:
+def furniture(scene: Scene, settings: Settings) -> dict[str, WorldBody]:
     """All that is around the arm, by name."""
     people, (x, y, top) = settings.people, settings.table.centre
     width, depth = settings.table.half_size
-    slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD)
-    bodies = {"table": Body(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
+    slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD_RGBA)
+    bodies = {"table": WorldBody(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
     for name in ("soldering", "glass", "iron"):  # what things rest on
         at = getattr(scene, name)
-        stand = Look("box", (0.06, 0.06, at[2]), WOOD)
-        bodies[f"stand of {name}"] = Body(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
+        stand = Look("box", (0.06, 0.06, at[2]), WOOD_RGBA)
+        bodies[f"stand of {name}"] = WorldBody(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
     for name, shape, size, colour, at in (
-        (World.board, "box", (0.08, 0.05, 0.002), GREEN, (0.0, 0.0, 0.0)),
-        (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL, scene.glass),
-        (World.iron, "cylinder", (0.016, 0.016, 0.18), BLUE, scene.iron),
-        (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL, scene.solder),
+        (World.board, "box", (0.08, 0.05, 0.002), BOARD_RGBA, (0.0, 0.0, 0.0)),
+        (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL_RGBA, scene.glass),
+        (World.iron, "cylinder", (0.016, 0.016, 0.18), IRON_RGBA, scene.iron),
+        (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL_RGBA, scene.solder),
     ):
-        bodies[name] = Body(Look(shape, size, colour), Pose(at, LEVEL))
+        bodies[name] = WorldBody(Look(shape, size, colour), Pose(at, LEVEL))
     # A hand is a capsule from the palm back along the forearm; its shape is there to measure
     # distances, and pushes nothing.
-    hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN)
+    hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN_RGBA)
     back = Pose((-people.length / 2, 0.0, 0.0), ALONG_X)
     for name, start in ((World.left, scene.left_start), (World.right, scene.right_start)):
-        bodies[name] = Body(hand, Pose(start, HAND_ORIENTATION), back, measured=True)
+        bodies[name] = WorldBody(hand, Pose(start, HAND_ORIENTATION), back, measured=True)
     return bodies
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from service.arms.arm_picture import draw
-from service.arms.first_cell import JERK_RATE, PLACES, RISE_S, TORQUE_SHARE, Proposal, proposed, written
+from service.arms.first_cell import DEMO_TOOL_M, Proposal, proposed, written
+from service.arms.rates import JERK_RATE, RISE_S, TORQUE_SHARE
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.settings.arm_description import SettingsError, description
@@ -135,7 +136,7 @@ def text(proposal: Proposal, path: Path) -> str:
             f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 leaves it at the origin"
         )
     if proposal.unmet:
-        far = ", ".join(f"{name} at {math.dist(PLACES[name], shell.centre):.2f} m" for name in proposal.unmet)
+        far = ", ".join(f"{name} at {math.dist(DEMO_TOOL_M[name], shell.centre):.2f} m" for name in proposal.unmet)
         lines.append(
             f"  demo      its scene is out of reach: the tool is needed for {far}. The demo moves a place by 15 cm at\n"
             "            most; teach tasks of this arm's own size (docs/tutorial.md)"

@@ -16,15 +16,19 @@ from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
-from service.daemon.machine import LATE_MS, MISSED_SHARE
+from service.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
 from service.files.shipped import cell_of
 from service.process.child import python
 from service.process.progress import say
 
-START_TIMEOUT_S = 60.0
-AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
-PLACES = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # via-points of the events
-EVENTS = {"handover": "board handed over", "grasp": "magnifying glass fetched", "carry": "glass held over the board"}
+SCENE_TIMEOUT_S = 60.0
+CAUSE_AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
+VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # via-points of the events
+EVENT_TITLES = {
+    "handover": "board handed over",
+    "grasp": "magnifying glass fetched",
+    "carry": "glass held over the board",
+}
 
 
 class DemoError(ExplainedError):
@@ -107,7 +111,7 @@ def too_busy(report: dict[str, Any]) -> str:
     found = []
     if skipped > MISSED_SHARE * periods:
         found.append(f"the bench missed {skipped} of its {periods} periods")
-    if pause_ms > LATE_MS:
+    if pause_ms > LATE_LOOP_MS:
         found.append(f"the bench stood still for {pause_ms:.0f} ms")
     return ", ".join(found)
 
@@ -118,8 +122,8 @@ def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
 
     names = list(events)
     before = [events[one]["time_s"] for one in names[: names.index(name)]]
-    until_s = events[name]["time_s"] + AFTER_S
-    return why_missed(found, PLACES[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
+    until_s = events[name]["time_s"] + CAUSE_AFTER_S
+    return why_missed(found, VIA_POINT_OF_EVENT[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
 
 
 def _percentiles(values: Any) -> dict[str, float]:
@@ -131,7 +135,7 @@ def _percentiles(values: Any) -> dict[str, float]:
 def text(report: dict[str, Any]) -> str:
     """The report for people to read: each cause of a failure once."""
     lines, causes = list[str](), list[str]()
-    for name, what in EVENTS.items():
+    for name, what in EVENT_TITLES.items():
         event = report["events"][name]
         outcome = "reached" if event["reached"] else "MISSED"
         lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
@@ -171,7 +175,7 @@ def _shown(path: str) -> str:
 def _output(module: str, *arguments: str, say: Callable[[str], None]) -> str:
     command, environment = python("-m", module, *arguments)
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False, env=environment
+        command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False, env=environment
     )
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")

@@ -14,8 +14,8 @@ from service.contract.records import SIDES
 from service.process.progress import say
 
 STILL_S, STILL_M = 1.0, 0.015  # still: no more motion than STILL_M over STILL_S
-OLDEST_MS = 200.0  # of a hand
-TIMEOUT_S, POLL_S = 30.0, 0.05
+MAX_HAND_AGE_MS = 200.0  # of a hand
+HERE_TIMEOUT_S, HERE_POLL_S = 30.0, 0.05
 
 
 class NotHereError(ExplainedError, RuntimeError):
@@ -27,13 +27,13 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
     do not give, once they hold still.
 
     The tool's is measured where the arm publishes its joints, else commanded. Raises NotHereError
-    where hands or tool are not seen, or move, for TIMEOUT_S.
+    where hands or tool are not seen, or move, for HERE_TIMEOUT_S.
     """
     said: set[str] = set()
     seen: list[tuple[float, dict[str, list[float]]]] = []
-    with reached(args, TIMEOUT_S) as session:
+    with reached(args, HERE_TIMEOUT_S) as session:
         client = Client(session, args.cell)
-        client.wait_until_ready(timeout_s=TIMEOUT_S)
+        client.wait_until_ready(timeout_s=HERE_TIMEOUT_S)
         hands = client.status().hands
         going = [name for name in (*SIDES, "tool") if name not in SIDES or hands in ("both", name)]
         wanted = [name for name in going if not getattr(args, name)]
@@ -54,11 +54,11 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
                     seen.pop(0)
                 if at_s - seen[0][0] >= STILL_S:
                     return seen[-1][1]
-            if at_s - begun_s > TIMEOUT_S:
+            if at_s - begun_s > HERE_TIMEOUT_S:
                 raise NotHereError(
                     f"nothing taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
                 )
-            time.sleep(POLL_S)
+            time.sleep(HERE_POLL_S)
 
 
 def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
@@ -66,7 +66,7 @@ def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
     found = {}
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
-        if age_ms is None or age_ms > OLDEST_MS:
+        if age_ms is None or age_ms > MAX_HAND_AGE_MS:
             ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
             found[side] = f"the {side} hand {ago}; --{side} X Y Z says where it would be"
     return found | ({"tool": "where the tool is is not known before the first tick"} if status["tick"] < 0 else {})

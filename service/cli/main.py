@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import record_options
-from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
+from service.cli.usage import ARM_HELP, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
@@ -87,7 +87,7 @@ def parser() -> argparse.ArgumentParser:
     option(
         c, "--scene", "FILE", "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
     )
-    option(c, "--arm", "ARM", ARM, "wam")
+    option(c, "--arm", "ARM", ARM_HELP, "wam")
     c.add_argument(
         "--engine",
         choices=("pybullet", "mujoco"),
@@ -102,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
     c.add_argument("arm", metavar="ARM", help="the arm to drive: franka, or simulated, an ideal arm to try a cell with")
-    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM}")
+    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM_HELP}")
     option(c, "--robot", "ADDRESS", "the host name or IP address of a Franka's control box", "172.16.0.2")
     option(c, "--wait", "S", "wait this long for the daemon, and as long again for its first command", 60.0)
     _reach(c)
@@ -115,7 +115,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    option(c, "--arm", "ARM", ARM, "wam")
+    option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
     other = c.add_mutually_exclusive_group()
     other.add_argument(
@@ -130,7 +130,7 @@ def parser() -> argparse.ArgumentParser:
         "Runs the daemon of a cell: it receives hand poses and publishes joint commands.",
         "thirdhand serve --record recordings --joints state",
     )
-    option(c, "--config", "CELL", f"the cell: {ARM}; the options below override its settings")
+    option(c, "--config", "CELL", f"the cell: {ARM_HELP}; the options below override its settings")
     option(c, "--cell", "NAME", "the prefix of all keys on the network (default: thirdhand)")
     listen = f"listen on this Zenoh endpoint; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
@@ -170,7 +170,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "a recording of what is decided now, to be reported, viewed or compared")
 
-    c = command("record", record_options.ABOUT, record_options.EXAMPLE)
+    c = command("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
     _reach(c)
 
@@ -208,7 +208,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--output", "FILE", "write the skill to this .npz file", required=True)
     option(c, "--plot", "FILE", "draw the held-out errors to this .png file")
     c.add_argument("--name", help="the name of the skill (default: the name of the file)")
-    option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM}")
+    option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM_HELP}")
     places = (
         "the named places of the task, as `via-points add --file` reads them, for demonstrations that do not hold "
         "them; the skill is then learned between these places and follows them when they move"

@@ -20,7 +20,7 @@ from service.contract.printable import printable_lines
 from service.contract.requests import Status
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.mcap_file import ends_early
-from service.files.pose_streams import SIDES, PoseTopic
+from service.files.pose_streams import TRACK_NAMES, PoseTopic
 from service.files.recording import Recording
 from service.files.replay import replay as replayed
 from service.files.shipped import cell_of
@@ -99,7 +99,7 @@ def learn(args: argparse.Namespace) -> int:
     if args.demonstrations[0].exists():  # else its reader says that it does not
         check_count([path.stem for path in args.demonstrations], args.components)
     settings = cell_of(str(args.config)) if args.config else None
-    topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
+    topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):

@@ -75,7 +75,7 @@ def endpoint(given: str) -> str:
     return given
 
 
-KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
+TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
@@ -83,11 +83,11 @@ KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for
     "EP": endpoint,
 }
 
-ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
+ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 
-FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
-    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILES),
+FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
+COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
+    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILE_COMPLETION),
     "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
 }
 
@@ -98,10 +98,10 @@ def option(
     """Adds an option or argument that takes a value; its help tells its default."""
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
-    more = {"type": KINDS.get(metavar, str), **more}
+    more = {"type": TYPE_OF_METAVAR.get(metavar, str), **more}
     added = c.add_argument(name, metavar=metavar, help=about, default=default, **more)
-    if metavar in COMPLETED:
-        added.complete = COMPLETED[metavar]  # type: ignore[attr-defined]  # as shtab reads it
+    if metavar in COMPLETION_OF_METAVAR:
+        added.complete = COMPLETION_OF_METAVAR[metavar]  # type: ignore[attr-defined]  # as shtab reads it
 
 
 def check_writable(path: Path, suffix: str = "") -> None:

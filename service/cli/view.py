@@ -30,7 +30,7 @@ from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.daemon.launch import free_port
-from service.files.recording import OBJECTS, Recording
+from service.files.recording import OBJECTS_NOTE, Recording
 from service.files.steps import Gap
 from service.process.progress import progress, say
 from service.settings import palette
@@ -41,8 +41,8 @@ from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
 TITLE_BAR = 30  # pixels that a window's bar has at least
-MARGIN, LETTERS = 14, 15  # of what is said of a picture at its top [pixels]
-TINT = 40  # difference of colour channels in a grey bar
+CAPTION_MARGIN_PX, CAPTION_PX = 14, 15  # of what is said of a picture at its top [pixels]
+BAR_TINT = 40  # difference of colour channels in a grey bar
 NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
 FRESH_S = 1.0  # age of a live view's picture above which the age is printed
 FRESH_TIMEOUT_S = 10.0
@@ -178,7 +178,7 @@ def convert(
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
         if viewer.arm_remark:
             say(viewer.arm_remark)
-        notes = recording.notes("requests", "log", OBJECTS)
+        notes = recording.notes("requests", "log", OBJECTS_NOTE)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
@@ -294,14 +294,14 @@ def _picture(client: Any) -> Image.Image:
     """A picture of the viewer, without the empty bar at its top."""
     with Image.open(io.BytesIO(client.take_screenshot())) as image:
         pixels = np.asarray(image.convert("RGB"))
-    bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
+    bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > BAR_TINT)) + TITLE_BAR - 8
     return Image.fromarray(pixels[bar if bar < 2 * TITLE_BAR else 0 :])
 
 
 def _save(picture: Image.Image, png: Path, said: str) -> None:
     """Saves a picture, with what is said of it at its top."""
-    at, font = (picture.width - MARGIN, MARGIN), ImageFont.load_default(LETTERS)
-    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM, anchor="rm", font=font)
+    at, font = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX), ImageFont.load_default(CAPTION_PX)
+    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM_BODY, anchor="rm", font=font)
     picture.save(png)
 
 

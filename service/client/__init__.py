@@ -1,5 +1,5 @@
-"""For clients of the daemon: sessions, requests as calls, hands in and commands out, and the cells
-on a network.
+"""The library for clients of the daemon: sessions, requests as calls, trackers, followers, and the
+cells on a network.
 """
 
 from service.client.calls import Client

@@ -21,7 +21,7 @@ from service.settings import palette
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
 LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
-MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
+MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.BY_MODE.items()}
 WIDE = 0.011  # of the width of a plot has a letter
 POINTS = 1500  # of a curve at most, the least and the greatest of each stretch
 LEAST_US, LEAST_MM = 10.0, 0.1  # less is not shown

@@ -29,7 +29,7 @@ def line(mode: int, reason: int) -> str:
 @functools.cache
 def banner(mode: int, reason: int) -> NDArray[np.uint8]:
     """The picture (HEIGHT, WIDTH, 3) that shows mode and reason."""
-    image = Image.new("RGB", (WIDTH, HEIGHT), palette.MODES[Mode(mode)])
+    image = Image.new("RGB", (WIDTH, HEIGHT), palette.BY_MODE[Mode(mode)])
     draw, text, size = ImageDraw.Draw(image), title(mode, reason), LETTERS
     while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:
         size -= 1

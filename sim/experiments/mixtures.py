@@ -15,7 +15,7 @@ from sim.experiments.seeds import BY_EXPERIMENT
 from sim.experiments.trials import Predicted
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 
 LEAST_STD_M, SEED = 0.001, BY_EXPERIMENT["people"].method
 UNUSUAL = 0.001  # share of the demonstrations' samples that are less usual than the threshold
@@ -35,12 +35,12 @@ def frames(places: Places) -> Array:
     )
 
 
-def joined(shown: Shown) -> Array:
+def joined(shown: SessionDemonstration) -> Array:
     """Hands and tool (T, 9) [m]."""
     return np.hstack([shown.hands, shown.tool])
 
 
-def way_gone(shown: Shown) -> Array:
+def way_gone(shown: SessionDemonstration) -> Array:
     """The share (T,) of the way that hands and tool have gone; rest is none."""
     window = np.ones(13) / 13  # half a second
     x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
@@ -55,7 +55,7 @@ class MixtureRegression:
 
     components: int = 10
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedMixture:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedMixture:
         """The mixture, by EM."""
         samples = np.concatenate([joined(one) for one in demonstrations])
         mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
@@ -123,7 +123,7 @@ class TaskParameterised:
     regularization_m: float = 0.02
     iterations: int = 40
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedFrames:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedFrames:
         """The mixture, by EM from equal spans of the way; the frames share responsibilities."""
         local = np.concatenate([joined(one)[:, None] - frames(one.places) for one in demonstrations])  # (M, 4, 9)
         phase = 0.999 * np.concatenate([way_gone(one) for one in demonstrations])
@@ -183,7 +183,7 @@ class InteractionProMP:
     cells: int = 100
     sharpness: float = 0.1  # of one observation of the hands: they come faster than they tell anything new
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedInteraction:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedInteraction:
         """The distribution of the weights."""
         weights, residuals, at = [], [], []
         for one in demonstrations:
@@ -209,7 +209,7 @@ class InteractionProMP:
         rows = np.exp(-0.5 * ((phase[:, None] - centres) / width) ** 2)
         return np.asarray(rows / rows.sum(axis=1, keepdims=True))
 
-    def phase(self, one: Shown) -> Array:
+    def phase(self, one: SessionDemonstration) -> Array:
         """The phase (T,) of a demonstration's samples."""
         if not self.by_length:
             return np.linspace(0.0, 1.0, len(one.times))

@@ -37,7 +37,7 @@ from sim.experiments.trials import (
 )
 from sim.experiments.workers import shared_out
 from sim.people import Group, person
-from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
+from sim.sessions import BREAKING, SessionDemonstration, breaking, demonstrations, session
 
 SEEDS = BY_EXPERIMENT["people"]
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
@@ -106,7 +106,7 @@ class Task(NamedTuple):
 
 
 @functools.cache
-def _taught() -> list[Shown]:
+def _taught() -> list[SessionDemonstration]:
     return demonstrations(DEMONSTRATORS)
 
 

@@ -16,9 +16,9 @@ from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, demonstrated
 from sim.experiments.results import OTHER, REFERENCE, SERIES, TOOL, Array, Options, Results, pyplot, rgb
 from sim.experiments.seeds import BY_EXPERIMENT
 from sim.scene import Scene
-from sim.script import PAUSE_RAMP_S, HandScript, Pause
+from sim.script import PAUSE_RAMP_S, HandScript, ScriptPause
 
-STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
+STOP, BACK = ScriptPause(1.6, 2.0), ScriptPause(8.0, 3.2, depth=2.0)
 SEED, RATE_HZ = BY_EXPERIMENT["phase"].evaluation["hands"].seed, 500
 STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # of the hands, in the pause
 SETTLED_S = 0.3  # after the hands have stopped

@@ -14,7 +14,7 @@ from scipy.signal import butter, sosfiltfilt
 from service.contract.explain import in_words
 from sim.experiments.moving_hands import CAMERA_AXES, CUT_HZ, NOISY_CUT_HZ, NOISY_HZ
 from sim.experiments.results import Array, ExperimentError
-from sim.people import Person, Tracker, person
+from sim.people import Person, TrackerModel, person
 from sim.sessions import SHAPE_STEPS
 
 SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach is what lies between slow moments, and as long as this
@@ -46,7 +46,7 @@ def _of_file(path: Path, number: int) -> Person | None:
     reaches = [one for side in (0, 3) for one in _reaches(smooth[:, side : side + 3], rate)]
     if not reaches:
         return None
-    tracker = Tracker(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
+    tracker = TrackerModel(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
     return person("tuning", number)._replace(name=f"recorded {number}", tracker=tracker, shapes=reaches)
 
 

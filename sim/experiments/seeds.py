@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from sim.made_tasks import KINDS
-from sim.people import SEEDS as PERSON_SEEDS
+from sim.made_tasks import TASK_KINDS
+from sim.people import GROUP_SEEDS as PERSON_SEEDS
 from sim.scene import Scene
 
 DRAWING = 0  # of the scatter of dots in a figure, and of resampling for an interval
@@ -92,9 +92,9 @@ BY_EXPERIMENT: dict[str, Seeds] = {
         learned={"people": Stream("person", PERSON_SEEDS["demonstrations"], range(6))},
     ),
     "partners": Seeds(
-        {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in KINDS},
-        tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in KINDS},
-        learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in KINDS},
+        {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in TASK_KINDS},
+        tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in TASK_KINDS},
+        learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in TASK_KINDS},
     ),
     "motion": Seeds(
         {

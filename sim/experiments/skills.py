@@ -25,7 +25,7 @@ from service.learning.via_points import adapted
 from sim.experiments.results import Array
 from sim.experiments.trials import Predicted
 from sim.people import Places
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 from sim.teach import places_of, recorded
 
 COVARIANCE_EVERY = 4  # ticks: as often as a slow tracker speaks
@@ -41,7 +41,7 @@ def via_points(places: Places, *, start: bool = False) -> tuple[ViaPoint, ...]:
 class Service:
     """Ours: `service.learning`, told the places, as the service uses it."""
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """The skill that the service learns by default."""
         return LearnedByService(learn([recorded(one) for one in demonstrations]), start=True)
 
@@ -55,7 +55,7 @@ class ServiceAsPaper:
     spread_m: float = 0.01
     components: int = 10
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """The skill with these parameters."""
         taken = [recorded(one) for one in demonstrations]
         return LearnedByService(
@@ -85,7 +85,7 @@ class NoDemonstrations:
     ell: float = 5.0  # [1/m²] of exp(-ell |s - s'|²)
     deviation_m: float = 0.2  # where no place is near
 
-    def learn(self, demonstrations: Sequence[Shown]) -> NoDemonstrations:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> NoDemonstrations:
         """Nothing is learned."""
         return self
 
@@ -103,7 +103,7 @@ class LookUp:
     power: float = 4.0
     deviation_m: float = 0.03
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LookUp:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LookUp:
         """Nothing is learned."""
         return self
 
@@ -168,7 +168,7 @@ class GaussianProcess:
     own_m: float = 0.0  # least deviation of a demonstration's own function
     gate: float = 1.5  # times the largest deviation along a demonstration that is left out: far
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedProcess:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedProcess:
         """The process with its kernels."""
         rows = [np.linspace(0, len(one.times) - 1, self.each).astype(int) for one in demonstrations]
         inputs = np.concatenate([one.hands[some] for one, some in zip(demonstrations, rows, strict=True)])

@@ -26,7 +26,7 @@ from sim.experiments.open_loop import Said, along_hands, controller, frames, riv
 from sim.experiments.results import Array
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
-from sim.sessions import Session, Shown
+from sim.sessions import Session, SessionDemonstration
 from sim.teach import places_of
 
 RATE_HZ = 125
@@ -74,7 +74,7 @@ class Model(Protocol):
 class Method(Protocol):
     """A way to learn, with its parameters."""
 
-    def learn(self, demonstrations: Sequence[Shown]) -> Model:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> Model:
         """The model of demonstrations."""
 
 

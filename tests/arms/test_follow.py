@@ -192,7 +192,7 @@ def refused(*arguments: str) -> str:
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     assert "no arm 'frankia'; franka and simulated are shipped" in refused("frankia")
-    assert "is a daemon running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
+    assert "is a daemon or a router running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
     six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
     with serving(tmp_path) as daemon:
@@ -210,7 +210,7 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
         running.until("waiting, up to 60 s: ")
         time.sleep(3.0)  # longer than a connection or a request is tried
         with serving(tmp_path, network=f'[network]\nlisten = ["{at}"]\n') as daemon, Tracker(daemon.session):
-            running.until("commands come, the arm follows")
+            running.until("commands arrive, the arm follows")
             assert running.ended() == 0
 
 

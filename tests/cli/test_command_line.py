@@ -100,15 +100,15 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
     ("code", "words", "arguments"),
     [
         (1, "nowhere does not exist: a folder of takes needed", ("record", "--list", "--folder", "nowhere")),
-        (1, "is a daemon running", ("status", *NOBODY)),
+        (1, "is a daemon or a router running", ("status", *NOBODY)),
         (1, "", ("doctor", *NOBODY)),
         (1, "", ("cells", *NOBODY)),
-        (1, "is a daemon running", ("hold", *NOBODY)),
+        (1, "is a daemon or a router running", ("hold", *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
         (1, "at least 2 needed", ("learn", str(RECORDINGS / "demonstration-1.mcap"), "--output", "nowhere.npz")),
-        (1, "no such user's folder", ("status", "--certificate", "~nobody-of-this-name/x")),
+        (1, "no user of this name", ("status", "--certificate", "~nobody-of-this-name/x")),
         (2, "--cell: '", ("status", "--cell", "*")),
         (2, "command line: cell: '*' given", ("serve", "--cell", "*")),
         (2, "--cell: '", ("hold", "--cell", "")),
@@ -172,7 +172,7 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
 def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
     done = thirdhand("status", *NOBODY)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("thirdhand status: nobody listens at tcp/127.0.0.1:1: is a daemon")
+    assert done.stderr.startswith("thirdhand status: nothing listens at tcp/127.0.0.1:1: is a daemon")
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = thirdhand("status", "--connect", f"tcp/127.0.0.1:{silent.getsockname()[1]}")
     assert done.returncode == 1

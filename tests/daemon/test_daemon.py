@@ -252,7 +252,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
     shared_daemon.until(lambda s: not any(age < 300 for age in s["hand_age_ms"].values()))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+        patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
     said = capsys.readouterr().err
     assert re.search(r"nothing taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
@@ -261,7 +261,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
         assert main(add) == 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
             assert main(add) == 1
     assert "nothing taught: hands or tool did not hold still" in capsys.readouterr().err
     (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
@@ -284,7 +284,7 @@ def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
         add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
         daemon.until(lambda s: s["tick"] > 0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.TIMEOUT_S", 2.0)
+            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 2.0)
             assert main([*add, "--here"]) == 1
         said = capsys.readouterr().err
         assert "waiting until right, tool are seen" in said

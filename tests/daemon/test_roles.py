@@ -24,7 +24,7 @@ from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.launch import launched
-from service.daemon.single_instance import BOUNDS
+from service.daemon.single_instance import NETWORK_BOUNDS
 from support.cell import LEFT, Tracker, thirdhand, told
 
 CELL = "bench"
@@ -62,7 +62,7 @@ class Guarded:
         self.session = open_session(
             listen=["tls/127.0.0.1:0"],
             certificate=secrets / "daemon",
-            more=BOUNDS | access_control(CELL, revoked, DOMAIN),
+            more=NETWORK_BOUNDS | access_control(CELL, revoked, DOMAIN),
         )
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
@@ -279,7 +279,7 @@ def test_a_certificate_out_of_its_time_is_told_in_words(
     today = datetime.datetime.now(datetime.UTC)
     for days, name, words in (
         (-30, "tracker-5", r"certificate\.pem expired on 20.* UTC: a new certificate needed"),
-        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, and the clock here says"),
+        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, but the clock here shows"),
     ):
         made = today + datetime.timedelta(days=days)
         monkeypatch.setattr("service.cli.certificates.now", lambda made=made: made)

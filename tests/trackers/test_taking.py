@@ -28,9 +28,18 @@ from service.files.demonstration_files import demonstration_paths, summary, tabl
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.dwells import REST_M
 from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseTopic, Recorded
+from service.files.pose_streams import PoseRecording, PoseTopic
 from service.settings.config import HandSettings, Settings, ToolSettings, robot_description
-from service.trackers.capture import JOINT_STATES, KEPT_S, MOVED, REST_RAD, Capture, CaptureError, Sample, capture
+from service.trackers.capture import (
+    JOINT_STATES,
+    MOVED_RATIO,
+    REST_RAD,
+    RETAINED_REST_S,
+    Capture,
+    CaptureError,
+    Sample,
+    capture,
+)
 from sim.scene import Scene
 from sim.teach import perform
 from support.paths import ROOT
@@ -87,7 +96,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
-    assert Recorded(path).settings == SETTINGS
+    assert PoseRecording(path).settings == SETTINGS
     longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
     of_joints = {"tool": PoseTopic("bench/joints/state")}
     np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
@@ -176,7 +185,8 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     assert [line.split(":")[0] for line in found.remarks if "of motion" in line] == ["hands", "tool"]
     told(("base", 1e3))
     words = (
-        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is in metres, whatever \[hands\] unit says"
+        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is always in metres, "
+        r"and \[hands\] unit is ignored"
     )
     with pytest.raises(CaptureError, match=f"tool/pose is {words}"):
         taken.check()
@@ -232,10 +242,10 @@ def test_what_rest_is_is_told_as_it_is() -> None:
     add_options(parser)
     options = " ".join(parser.format_help().split())
     assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
-    assert f"{KEPT_S:g} s are then retained" in options
+    assert f"{RETAINED_REST_S:g} s are then retained" in options
     tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
     assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
-    assert MOVED == 5, "the tutorial says five times"
+    assert MOVED_RATIO == 5, "the tutorial says five times"
 
 
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
@@ -271,7 +281,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
         trim(path, 20, 30)
     assert summary(path).lasts_s == found.lasts_s
-    assert trim(path, 0, 20).startswith("nothing is cut: ")
+    assert trim(path, 0, 20).startswith("nothing was cut: ")
     whole = path.read_bytes()
     assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
     assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
@@ -287,7 +297,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         read_demonstration(path.parent)
     assert summary(path).demonstration.places == Scene().via_points()
     assert summary(path).demonstration.person == "Ada"
-    assert Recorded(path).settings == Settings()
+    assert PoseRecording(path).settings == Settings()
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
     assert main(["record", "--list", *folder]) == 1
@@ -362,7 +372,7 @@ def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     taken.write(tmp_path / "a.mcap")
     got = read_demonstration(tmp_path / "a.mcap")
     assert got.conducts == who
-    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(Recorded(tmp_path / "a.mcap").topics)
+    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(PoseRecording(tmp_path / "a.mcap").topics)
     np.testing.assert_array_equal(got.left, got.right)
     lines = table(summary(tmp_path / "a.mcap")).splitlines()
     assert any(f"the {who} hand conducts alone" in line for line in lines)

@@ -17,7 +17,7 @@ from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.core.separation.tuning import CAPSULE_EXCESS_M, CAPSULE_FITS, LEAST_TOOL_M, OWN_CLEARANCE_M, UNMOVED_M
 from service.settings.config import Settings
-from service.settings.urdf import Joint, Shape, Urdf
+from service.settings.urdf import Shape, Urdf, UrdfJoint
 
 
 def own_clearance(settings: Settings) -> float:
@@ -125,7 +125,7 @@ def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
     )
 
 
-def _origin(joint: Joint) -> Vector:
+def _origin(joint: UrdfJoint) -> Vector:
     """Pose (3, 4) of a joint in its parent link."""
     return np.column_stack((rotation(joint.rotation), joint.translation))
 
