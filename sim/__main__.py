@@ -1,4 +1,4 @@
-"""`thirdhand sim`: the bench as a process, on Zenoh, in real time."""
+"""`thirdhand sim`: the bench as a process in real time, connected through Zenoh."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="thirdhand sim",
-        description="The simulated bench: publishes hands and joint state, follows joint commands, and plays the "
-        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
+        description="The simulated bench publishes hands and joint states, follows joint commands, and plays the "
+        "soldering scene again and again, or once with --once. It prints progress on standard error, and writes "
+        "reports to --output.",
         epilog=SIM_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -55,12 +56,12 @@ def parser() -> argparse.ArgumentParser:
         "--scene",
         metavar="FILE",
         type=Path,
-        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+        help="a TOML file with places [x, y, z] in metres (default: the nominal scene)",
     )
     p.add_argument(
         "--via-points",
         action="store_true",
-        help="only print the request that teaches the scene's places, for `thirdhand via-points add --file -`",
+        help="only print the request that teaches the scene's via-points, for `thirdhand via-points add --file -`",
     )
     p.add_argument(
         "--arm", default="wam", help=f"{', '.join(ARMS)} or a cell's settings, FILE.toml (default: %(default)s)"
@@ -69,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--hands-only",
         action="store_true",
-        help="publish hands and things only, and score an arm that is elsewhere by its joint states",
+        help="publish hands and things only, and evaluate a real or other arm by its joint states",
     )
     p.add_argument(
         "--seed", type=int, help="the seed for scatter, tremor and noise of the hands (default: the scene's)"
@@ -82,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--output", metavar="FILE", help="write reports to this file, one JSON object per line; - is standard output"
     )
-    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
+    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # an option of earlier versions, like --duration
     p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
     p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     p.add_argument(
@@ -116,7 +117,7 @@ def parser() -> argparse.ArgumentParser:
         nargs=2,
         action="append",
         default=[],
-        help="likewise, but the hands move back and return; may be repeated",
+        help="like --pause, but the hands move back and return; may be repeated",
     )
     p.add_argument(
         "--offset-mm",
@@ -156,7 +157,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Run the bench; exit code 0, 1 on failure, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
     if not 30 <= args.hands_rate <= 500:
@@ -233,7 +234,7 @@ def main(arguments: list[str] | None = None) -> int:
             noise_std=args.noise_mm / 1000,
         )
         if target and target != "-":
-            Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
+            Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
         own = open_session(connect=args.connect, listen=args.listen) if args.listen else None
         session = own or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -246,8 +247,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     if not args.once:
-        kept = f"their reports are in {target}" if target else "no report was kept (--output)"
-        print(f"ended: the bench of cell {reach.cell}, after {runs} whole runs; {kept}", file=sys.stderr)
+        kept = f"their reports are in {target}" if target else "without --output no report was written"
+        print(f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {kept}", file=sys.stderr)
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

@@ -1,7 +1,7 @@
 """`python -m sim.film`: the demo as a short moving picture, for the README.
 
-The closed loop runs in process, so that each run gives the same picture however busy the machine
-is. The bench draws it without a screen, twice as large as it is shown: that smooths the edges.
+The closed loop runs in one process, so that each run gives the same picture on any machine. The
+bench draws it without a screen at twice its size, which smooths the edges.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ PICTURE_PX, FINER, FRAME_HZ, PLAYBACK_SPEED = (
     15,
     2,
 )  # pixels shown; drawn per pixel; a second; times as fast
-PATH_S, LAST_FRAME_S = 1.2, 1.5  # of the ways that are shown, and of the last frame
+PATH_S, LAST_FRAME_S = 1.2, 1.5  # duration of the drawn paths, and of the last frame
 FILM_TOLERANCE_M = 0.001
-QUALITY = 80  # per cent, of WebP
+QUALITY = 80  # [%] quality of WebP
 PATH_COLOURS = (palette.LEFT, palette.RIGHT, palette.TOOL)
 SKY_ABOVE, SKY_BELOW = np.array((236, 240, 245)), np.array((206, 214, 224))
 CAPTIONS = (
@@ -49,7 +49,7 @@ CAPTIONS = (
 
 
 class Film:
-    """The pictures of a run, taken as the bench goes."""
+    """The pictures of a run, taken while the bench runs."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
@@ -57,7 +57,7 @@ class Film:
         self.pictures: list[Image.Image] = []
 
     def look(self, _: Tick, frame: Frame) -> None:
-        """Takes a picture if it is time."""
+        """Take a picture if it is due."""
         bench = self._bench
         if bench.time_s * FRAME_HZ / PLAYBACK_SPEED > len(self.pictures):
             seen = bench.observe()
@@ -80,7 +80,7 @@ class Film:
         return image.resize(PICTURE_PX, Image.Resampling.LANCZOS)
 
     def _write(self, draw: ImageDraw.ImageDraw, mode: Mode) -> None:
-        """Writes what happens, and the mode on its colour."""
+        """Write the caption, and the mode on its colour."""
         height, margin = FINER * 34, FINER * 12
         ends = [end for _, end in self._bench.scene.dwells]
         caption = CAPTIONS[min(int(np.searchsorted(ends, self._bench.time_s)), len(CAPTIONS) - 1)]
@@ -94,7 +94,7 @@ class Film:
 
 
 def filmed(scene: Scene) -> list[Image.Image]:
-    """The pictures of one run of the scene, with its places taught."""
+    """The pictures of one run of the scene, with its via-points taught."""
     settings = Settings()
     with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
         film, loop = Film(bench), ClosedLoop(bench)
@@ -105,7 +105,7 @@ def filmed(scene: Scene) -> list[Image.Image]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code 0 once the picture is written."""
+    """Write the moving picture; exit code 0."""
     p = argparse.ArgumentParser(prog="python -m sim.film", description="The demo as a moving picture (WebP).")
     p.add_argument("--output", metavar="FILE", type=Path, default=Path("docs/demo.webp"), help="default: %(default)s")
     args = p.parse_args(arguments)

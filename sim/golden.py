@@ -1,8 +1,8 @@
-"""`python -m sim.golden`: the golden session, about 20 s in process with everything in it that the
-core has to cope with.
+"""`python -m sim.golden`: the golden session, 20 s in one process with everything that the core
+must handle.
 
-Made anew it is a new session; with `--refresh` its ticks are kept and only the frames are computed
-again, for a change of behaviour that is meant.
+Without options it makes a new session. With `--refresh` it keeps the ticks and computes the frames
+again, after an intended change of behaviour.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript
 
-WHOLE_EVERY = 500  # ticks: of all other frames a checksum is kept
-# Resolutions of a tracker and of joint encoders [m, rad, rad/s]: finer noise would fill the file.
+WHOLE_EVERY = 500  # [ticks] interval of whole frames; the others have a checksum
+# Resolutions of tracker [m] and joint encoders [rad, rad/s]: finer noise would enlarge the file.
 TRACKED, ENCODED, ENCODED_SPEED = 2.0**-15, 2.0**-14, 2.0**-10
 SESSION_S = 20.0
 MOVED_SCENE = Scene(handover=(0.66, -0.22, 0.33))
-# What happens when [s].
+# Times of the session's events [s].
 TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
     0.5,
     2.0,
@@ -54,7 +54,7 @@ TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
 
 
 class GoldenSession:
-    """The golden session: a bench in closed loop with all that happens to it, at its times."""
+    """The golden session: a bench in closed loop, with events at fixed times."""
 
     def __init__(self, bench: Bench, skill: StoredSkill) -> None:
         self._bench = bench
@@ -69,7 +69,7 @@ class GoldenSession:
         return round(t / self._bench.period_s)
 
     def ticks(self) -> Iterator[Tick]:
-        """The ticks of the session; now and then deadlines are missed."""
+        """The ticks of the session, with some missed deadlines."""
         jump = 0
         for tick in itertools.islice(self.loop.ticks(), self._tick(SESSION_S)):
             events, k = [_as_measured(event) for event in tick.inbox], tick.index
@@ -88,7 +88,7 @@ class GoldenSession:
             bench.turn_back()
 
     def _spoil(self, event: Event) -> tuple[Event, ...]:
-        """The left hand is missing, spoilt or far away in parts of the session."""
+        """Remove, spoil or displace samples of the left hand in parts of the session."""
         pose, t = event.value, self._bench.tick * self._bench.period_s
         if event.kind != "hands/left":
             return (event,)
@@ -110,7 +110,7 @@ class GoldenSession:
 
 
 def _as_measured(event: Event) -> Event:
-    """A sample to the resolution of what measures it."""
+    """A sample, rounded to the resolution of its sensor."""
     was = event.value
     if event.kind == "joints/state":
         position, velocity = _rounded(was.position, ENCODED), _rounded(was.velocity, ENCODED_SPEED)
@@ -131,8 +131,8 @@ def record(
     *,
     follow: Tap = lambda tick, frame: None,
 ) -> list[Frame]:
-    """The frames of the core run on ticks, which are shown to `follow` and recorded with a checksum
-    of each frame and command, and with every 500th frame as a whole.
+    """Run the core on ticks, record them with checksums of frames and commands and every 500th
+    frame as a whole, and return the frames. `follow` is called with each tick and frame.
     """
     steps: list[tuple[Tick, Frame]] = []
     checksums: dict[int, int] = {}
@@ -160,7 +160,7 @@ def _time_ns(tick: Tick, settings: Settings) -> int:
 
 
 def make(path: Path, skill: StoredSkill) -> None:
-    """Writes a new golden session."""
+    """Write a new golden session."""
     settings, scene = Settings(), Scene()
     with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
         session = GoldenSession(bench, skill)
@@ -168,13 +168,13 @@ def make(path: Path, skill: StoredSkill) -> None:
 
 
 def refresh(path: Path) -> dict[str, float]:
-    """Computes the frames of a golden session anew from its ticks; in how many ticks something
-    changed, and the largest change in each field of the frames that are kept as a whole.
+    """Compute the frames of a golden session again from its ticks. Returns the number of changed
+    ticks, and the largest change in each field of the frames that are recorded as a whole.
     """
     old = Recording.open(path)
     try:
         before = [step.frame for step in old.steps(whole=False) if step.frame is not None]
-    except RecordingError:  # frames or states had another layout then: there is nothing to compare with
+    except RecordingError:  # frames or states had another layout, and cannot be compared
         before = []
     beside = path.with_suffix(".new")
     frames = record(beside, old.settings, decoded(old.skill, origin=str(path), recorded=True), ticks(old))
@@ -190,10 +190,10 @@ def refresh(path: Path) -> dict[str, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Make or refresh the golden session; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.golden",
-        description="The golden session: what every later version must decide alike.",
+        description="The golden session: every later version must decide the same in it.",
         epilog="example:\n  python -m sim.golden --output recordings/golden.mcap --skill recordings/soldering.npz\n"
         "  python -m sim.golden --refresh",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -215,7 +215,7 @@ def main(arguments: list[str] | None = None) -> int:
     p.add_argument(
         "--refresh",
         action="store_true",
-        help="keep the ticks, compute the frames anew, print how many and the largest change per field",
+        help="keep the ticks, compute the frames again, print the number of changed ticks and the largest changes",
     )
     args = p.parse_args(arguments)
     try:

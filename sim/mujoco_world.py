@@ -13,7 +13,7 @@ from sim.description import simulated
 from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # pictures without a screen
+    os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen
 import mujoco
 
 GEOM_TYPES = {
@@ -21,9 +21,9 @@ GEOM_TYPES = {
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-FELT_GROUP, SEEN_GROUP = 0, 1  # groups of shapes; MuJoCo puts those of a URDF into these
-MOST_PIXELS = 2048  # each way
-# The arm is stopped by what is solid, and nothing by anything else. No link is without mass there.
+FELT_GROUP, SEEN_GROUP = 0, 1  # groups of MuJoCo for collision and visual shapes of a URDF
+MOST_PIXELS = 2048  # largest width and height of a picture
+# MuJoCo needs a mass for each link. Visual shapes are kept, and links are not merged.
 READ_AS = {
     "discardvisual": "false",
     "fusestatic": "false",
@@ -34,8 +34,8 @@ READ_AS = {
 
 
 class MujocoWorld(World):
-    """The bench's world, simulated by MuJoCo. The motors are those of PyBullet: each makes up part
-    of its position's error and all of its velocity's within a step, as far as its effort goes.
+    """The bench's world, simulated by MuJoCo. The motors are modelled as in PyBullet: within a step
+    each corrects a part of its position error and its whole velocity error, within its effort.
     """
 
     def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
@@ -89,7 +89,7 @@ class MujocoWorld(World):
         )
 
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Set where the motors go: [rad] with [rad/s] fed forward."""
+        """Set the motors' target positions [rad] and velocities [rad/s]."""
         self._position, self._velocity = np.array(position), np.array(velocity)
 
     def step(self) -> None:
@@ -100,7 +100,9 @@ class MujocoWorld(World):
         mujoco.mj_step1(self._model, data)
 
     def _effort(self) -> Any:
-        """Of each motor [N m], so that all that are strong enough reach their velocities."""
+        """Torques of the motors [N m]. Motors that do not reach their limit reach their
+        velocity.
+        """
         data, motors = self._data, self._motors
         wanted = self._velocity + POSITION_GAIN / self._period_s * (self._position - data.qpos[self._joints])
         acceleration = (wanted - data.qvel[motors]) / self._period_s
@@ -109,7 +111,7 @@ class MujocoWorld(World):
         others = (data.qfrc_bias - data.qfrc_passive - data.qfrc_constraint)[motors]
         effort, weak = inertia @ acceleration + others, np.zeros(len(motors), bool)
         while (share := np.where(weak, 0.0, np.abs(effort) / self._efforts)).max() > 1.0:
-            weak[np.argmax(share)] = True  # it does all it can, and the others hold against that
+            weak[np.argmax(share)] = True  # its torque is at the limit; the others compensate
             effort[weak] = np.clip(effort[weak], -self._efforts[weak], self._efforts[weak])
             left = effort[weak] - others[weak] - inertia[np.ix_(weak, ~weak)] @ acceleration[~weak]
             acceleration[weak] = np.linalg.solve(inertia[np.ix_(weak, weak)], left)
@@ -121,7 +123,7 @@ class MujocoWorld(World):
         return tuple(self._data.qpos[self._joints].tolist()), tuple(self._data.qvel[self._motors].tolist())
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
         w, *turn = self._data.xquat[self._tool].tolist()
         speed = np.empty(6)
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0)
@@ -134,10 +136,8 @@ class MujocoWorld(World):
         self._data.mocap_quat[number] = _w_first(pose.orientation)
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
-        more.
-        """
-        mujoco.mj_kinematics(self._model, self._data)  # bodies may have been put elsewhere
+        """Smallest distance between the arm and a measured body [m], but at most `within`."""
+        mujoco.mj_kinematics(self._model, self._data)  # bodies may have moved
         other = self._model.geom(body).id
         return min(
             float(mujoco.mj_geomDistance(self._model, self._data, one, other, within, None)) for one in self._felt

@@ -75,7 +75,7 @@ class PyBulletWorld(World):
         return made
 
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Set where the motors go: [rad] with [rad/s] fed forward."""
+        """Set the motors' target positions [rad] and velocities [rad/s]."""
         pybullet.setJointMotorControlArray(
             self._arm,
             self._joints,
@@ -98,7 +98,7 @@ class PyBulletWorld(World):
         return tuple(state[0] for state in states), tuple(state[1] for state in states)
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
         state = pybullet.getLinkState(
             self._arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
         )
@@ -110,9 +110,7 @@ class PyBulletWorld(World):
         )
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
-        more.
-        """
+        """Smallest distance between the arm and a measured body [m], but at most `within`."""
         near = pybullet.getClosestPoints(self._arm, self._bodies[body], within, physicsClientId=self._id)
         return min((float(point[8]) for point in near), default=within)
 

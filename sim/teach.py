@@ -1,5 +1,5 @@
-"""`python -m sim.teach`: demonstrations of the soldering scene, as MCAP files (the same bytes for
-the same seed), or published live for `thirdhand record`.
+"""`python -m sim.teach`: demonstrations of the soldering scene, as MCAP files with equal bytes for
+equal seeds, or published live for `thirdhand record`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
 from sim.script import Array, Clock, HandScript, Teacher
 
-RADIUS_M, MIN_PLACE_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
+RADIUS_M, MIN_PLACE_STD_M = 0.03, 0.001  # radius and least standard deviation of via-points
 TEACH_EXAMPLE = """example:
   python -m sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
-REST_BEFORE_S, REST_AFTER_S = 0.5, 3.0  # of rest
+REST_BEFORE_S, REST_AFTER_S = 0.5, 3.0  # rests before and after a published demonstration
 TRAY, RIGHT_REST = (
     (0.95, -0.15, 0.12),
     (0.95, 0.35, 0.07),
@@ -54,8 +54,8 @@ VISITED = made_tasks.TaskScene(
 def demonstrate(
     scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0, gripper: bool = False
 ) -> Demonstration:
-    """One demonstration of a scene, sampled at `rate_hz`: hands as a tracker sees them, the tool as
-    the arm measures it, and what the gripper does, if wanted.
+    """One demonstration of a scene at `rate_hz`: tracked hands, the measured tool, and if `gripper`
+    the closure of the gripper.
     """
     script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
     steps = np.arange(round(scene.duration_s * rate_hz) + 1)
@@ -71,9 +71,7 @@ def demonstrate(
 
 
 def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False) -> list[Demonstration]:
-    """Several demonstrations of a scene, one a minute; the first ones do not depend on how many
-    there are.
-    """
+    """`count` demonstrations of a scene, one a minute; each is independent of `count`."""
     return [
         demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number, gripper=gripper)
         for number in range(1, count + 1)
@@ -81,14 +79,14 @@ def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False
 
 
 def by_people(people: int) -> list[Demonstration]:
-    """Two demonstrations of each of so many modelled people, things in their usual places and
-    moved, which name the task's places.
+    """Two demonstrations of each modelled person, with things in their nominal places and moved,
+    and with via-points.
     """
     return [recorded(one, begin_s=60 * number) for number, one in enumerate(sessions.demonstrations(people))]
 
 
 def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demonstration:
-    """A demonstration of a session, as the service reads it from a recording."""
+    """A demonstration of a session in the service's format."""
     count = len(shown.times)
     still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
     return Demonstration(
@@ -101,10 +99,8 @@ def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demon
 
 
 def places_of(places: Places) -> tuple[ViaPoint, ...]:
-    """The named places of the task, as the bench teaches them, in the order in which the tool comes
-    to them, with how sure they are.
-
-    A place's `std` is of each axis, its error 3-D rms.
+    """The via-points of the task in the order of the tool's motion, with their standard deviations
+    per axis: the error of the places (3-D rms) / sqrt(3).
     """
     p, std = places, max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
     named = (
@@ -129,7 +125,7 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 def perform(
     scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
 ) -> bool:
-    """Publishes one demonstration of the soldering scene, see `publish`."""
+    """Publish one demonstration of the soldering scene, see `publish`."""
     script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
 
     def poses(t: float) -> tuple[Array, ...]:
@@ -141,7 +137,7 @@ def perform(
 
 
 def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float) -> bool:
-    """Publishes how a person does the task that visits a place twice, see `publish`."""
+    """Publish a person's run of the task that visits a place twice, see `publish`."""
     shown = visits(number)
     times = shown.period_s * np.arange(len(shown.tool)) / speed
 
@@ -154,7 +150,7 @@ def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: flo
 
 
 def visits(number: int) -> Demonstration:
-    """The demonstration of that task of this number, from 1; each is another person's."""
+    """A demonstration of that task; each number, from 1 on, is another person."""
     return made_tasks.run(made_tasks.TAUGHT, number - 1, 0, scene=VISITED).demonstration()
 
 
@@ -172,7 +168,7 @@ def publish(
     the hands until nobody does: they rest for `before_s` first, and REST_AFTER_S at the end.
     `poses` are those at a time [s] from the begin, (7,) each.
 
-    Whether somebody listened to its end. Raises UnreachableError.
+    Returns True if both hands had a subscriber until the end. Raises UnreachableError.
     """
     with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
@@ -197,15 +193,15 @@ def publish(
 
 
 def _are_heard(publishers: list[zenoh.Publisher]) -> bool:
-    """Whether somebody listens to each."""
+    """True if each publisher has a subscriber."""
     return all(publisher.matching_status.matching for publisher in publishers)  # type: ignore[attr-defined]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Make or publish demonstrations; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.teach",
-        description="Demonstrations of the soldering scene: hands and tool at 100 Hz, one MCAP file each, or live.",
+        description="Demonstrations of the soldering scene with hands and tool at 100 Hz, as MCAP files or live.",
         epilog=TEACH_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -216,27 +212,29 @@ def main(arguments: list[str] | None = None) -> int:
         help="folder for demonstration-1.mcap and so on; made if missing",
     )
     p.add_argument(
-        "--live", action="store_true", help="publish them instead, each from when somebody listens to the hands"
+        "--live", action="store_true", help="publish them instead, each from the first subscriber of the hands on"
     )
     p.add_argument(
         "--connect", metavar="EP", action="append", help=f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
     )
-    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="times as fast (default: %(default)s)")
     p.add_argument(
-        "--wait", metavar="S", type=float, default=60.0, help="for somebody who listens (default: %(default)s)"
+        "--speed", metavar="X", type=float, default=1.0, help="the relative speed of the motions (default: %(default)s)"
     )
-    p.add_argument("--count", type=int, default=6, help="how many (default: %(default)s)")
-    p.add_argument("--seed", type=int, help="of their scatter (default: the scene's)")
+    p.add_argument(
+        "--wait", metavar="S", type=float, default=60.0, help="wait this long for a subscriber (default: %(default)s)"
+    )
+    p.add_argument("--count", type=int, default=6, help="the number of demonstrations (default: %(default)s)")
+    p.add_argument("--seed", type=int, help="the seed of their scatter (default: the scene's)")
     p.add_argument(
         "--scene",
         metavar="FILE",
         type=Path,
-        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
+        help="a TOML file with places [x, y, z] in metres (default: the nominal scene)",
     )
     p.add_argument(
         "--people",
         action="store_true",
-        help="by modelled people, two of each, with things moved and named: what is learned between places",
+        help="two demonstrations each by modelled people, with moved things and via-points",
     )
     p.add_argument(
         "--visits",
@@ -244,21 +242,21 @@ def main(arguments: list[str] | None = None) -> int:
         help="another task, between five named via-points, with one place visited twice; with --live or --places",
     )
     p.add_argument(
-        "--places", metavar="FILE", type=Path, help="with --visits: write where they are, as `record --places` takes it"
+        "--places", metavar="FILE", type=Path, help="with --visits: write its via-points for `record --places`"
     )
     p.add_argument("--cell", help="prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
-    p.add_argument("--gripper", action="store_true", help="tell what the gripper does, too")
+    p.add_argument("--gripper", action="store_true", help="include the closure of the gripper")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
     if [args.live, args.output is not None, args.places is not None].count(True) != 1:
-        p.error("--output DIR, --live or --places FILE needed, and one of them")
+        p.error("exactly one of --output DIR, --live and --places FILE needed")
     if args.visits == (args.output is not None) and (args.visits or args.places):
-        p.error("--visits goes with --live or --places, and --places with --visits")
+        p.error("--visits needs --live or --places, and --places needs --visits")
     if args.live and args.people:
-        p.error("--people goes with --output: people show nothing live")
+        p.error("--people needs --output, not --live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
     try:
@@ -290,15 +288,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) -> int:
-    """The exit code: 1 where nobody listened to the end of each."""
+    """Publish all demonstrations; exit code 1 if one had no subscriber until its end."""
     seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
         to = {"connect": reach.connect, "cell": reach.cell, "speed": args.speed, "wait_s": args.wait}
         heard = perform_visits(number, **to) if args.visits else perform(scene, seed=1000 * seed + number, **to)
         if not heard:
-            print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)
+            print(f"python -m sim.teach: demonstration {number} had no subscriber until its end", file=sys.stderr)
             return 1
-        print(f"demonstration {number} of {args.count} shown", file=sys.stderr, flush=True)
+        print(f"demonstration {number} of {args.count} published", file=sys.stderr, flush=True)
     return 0
 
 

@@ -1,5 +1,5 @@
-"""The soldering scenario, closed loop: bench, service and scribe as separate processes, via-points
-taught over Zenoh as any client would.
+"""The soldering scenario in closed loop: bench, service and scribe as separate processes, with
+via-points taught over Zenoh.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from service.process.child import python
 from service.process.progress import say
 
 SCENE_TIMEOUT_S = 60.0
-CAUSE_AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
-VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # via-points of the events
+CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
+VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
     "handover": "board handed over",
     "grasp": "magnifying glass fetched",
@@ -32,11 +32,11 @@ EVENT_TITLES = {
 
 
 class DemoError(ExplainedError):
-    """The demo could not be run; the message says what failed."""
+    """The demo could not be run; the message has the cause."""
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Exit code 0 only if the task succeeded and the recording lacks nothing."""
+    """Run the demo; exit code 0 if the task succeeded and the recording is complete, else 1."""
     report = run(args.output, scene=args.scene, arm=args.arm, engine=args.engine, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
@@ -45,7 +45,7 @@ def demo(args: argparse.Namespace) -> int:
 def run(
     out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
+    """Run the scenario once and return its report. Raises DemoError, SettingsError."""
     engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
     if reason := no_room_to_brake(settings.period_s):
         raise DemoError(reason)
@@ -78,7 +78,7 @@ def run(
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
-    from service.report.report import reported  # heavy, as below: first it says what it does
+    from service.report.report import reported  # its import is slow: the first messages must come before
 
     recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
@@ -106,18 +106,18 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 
 
 def too_busy(report: dict[str, Any]) -> str:
-    """Sentence on a machine that was too busy for the bench; empty if it was not."""
+    """A message on a machine that was too busy for the bench; empty if it was not."""
     periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
     found = []
     if skipped > MISSED_SHARE * periods:
         found.append(f"the bench missed {skipped} of its {periods} periods")
     if pause_ms > LATE_LOOP_MS:
-        found.append(f"the bench stood still for {pause_ms:.0f} ms")
+        found.append(f"the bench paused for {pause_ms:.0f} ms")
     return ", ".join(found)
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
-    """Why an event was missed, by the recording from the event before it on."""
+    """The cause of a missed event, from the recording after the event before it."""
     from service.report.report import why_missed
 
     names = list(events)
@@ -133,7 +133,7 @@ def _percentiles(values: Any) -> dict[str, float]:
 
 
 def text(report: dict[str, Any]) -> str:
-    """The report for people to read: each cause of a failure once."""
+    """The report in text, with each cause of a failure once."""
     lines, causes = list[str](), list[str]()
     for name, what in EVENT_TITLES.items():
         event = report["events"][name]

@@ -166,7 +166,7 @@ def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_
     with serving(tmp_path, network=PATIENT) as daemon:
         at = ("--connect", daemon.endpoint)
         with following("simulated", *at, "--config", str(tmp_path / "arm.toml")) as running:
-            running.until("is driven")
+            running.until("driving simulated")
             Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
             done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
             assert done.returncode == 0, done.stderr
@@ -200,7 +200,7 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
         assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
         assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
         assert "here 6 were configured" in line
-        assert "give --config, the daemon's own settings" in line
+        assert "give the daemon's settings by --config" in line
         assert "give --config with its own URDF" in refused("franka", *at)
 
 

@@ -97,7 +97,7 @@ def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
         (["nowhere.mcap"], 1, "no recording nowhere.mcap"),
         ([str(RECORDINGS / "demonstration-1.mcap")], 1, "not a recording of thirdhand"),
         ([str(GOLDEN), "--html", "no/such/folder.html"], 2, "there is no folder no/such"),
-        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file, a folder needed"),
+        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file; a folder needed"),
         ([str(GOLDEN)], 1, f"has checksums instead of frames: thirdhand replay {GOLDEN} --output whole.mcap"),
     ],
 )

@@ -322,7 +322,7 @@ def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> Non
     assert set(status.hand_age_ms) == {"left", "right"}
     assert status.rejected.get("not_finite", 0) == 0
     assert "of the left hand" in played.stderr
-    assert "came to the daemon's loop" in played.stderr
+    assert "the daemon's loop received" in played.stderr
 
 
 def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: 
     play = ["play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "50", "--connect", lab.endpoint]
     assert main([*play, "--cell", NAMES[1]]) == 0
     assert "of the left hand, " in (said := capsys.readouterr().err)
-    assert "came to the daemon's loop" in said
+    assert "the daemon's loop received" in said
     client = Client(lab.session, NAMES[1])
     assert client.status().received["hands/left"] > 3
     stuck = requests.encode_json(client.status())

@@ -227,8 +227,8 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     ("arguments", "code", "words"),
     [
         (("--role", "tracker", "--name", "left-camera"), 2, "tracker with a number needed, tracker-2 to tracker-99"),
-        (("--name", "tracker-2"), 2, "the --role that it is to have needed too"),
-        (("--role", "tracker", "--name", "tracker"), 1, "a name that was not given before needed"),
+        (("--name", "tracker-2"), 2, "--role needed with it"),
+        (("--role", "tracker", "--name", "tracker"), 1, "a new name needed"),
         (("--role", "nobody"), 2, "invalid choice"),
         (("--role", "tracker", "--host", "not plain \u00fc"), 2, "a name in plain letters, or an address, needed"),
         (("--role", "daemon", "--days", "0"), 2, "accepted"),
@@ -314,7 +314,7 @@ def test_what_the_command_makes_is_private_and_not_written_over(secrets: Path) -
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
     again = told("certificates", str(secrets))
     assert again.returncode == 1
-    assert "not written over" in again.stderr
+    assert "not overwritten" in again.stderr
 
 
 def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path) -> None:

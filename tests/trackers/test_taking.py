@@ -111,7 +111,7 @@ def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session
         capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
     empty = Capture(sessions[0], "bench", SETTINGS)
     empty.close()
-    with pytest.raises(CaptureError, match=r"nothing of hands/left, .* came in this time"):
+    with pytest.raises(CaptureError, match=r"no messages on hands/left, .* arrived in time"):
         empty.write(tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
 
@@ -133,7 +133,7 @@ def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]],
             {"bench/hands/left": (980.0, -320.0, 60.0), "bench/hands/right": (0, 0, 1), "bench/tool/pose": (0, 0, 1)},
             20.0,
             r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at most 5 m from the "
-            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing is recorded",
+            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing was recorded",
         ),
         (
             {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
@@ -208,7 +208,7 @@ def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begin
         pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
         taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
         if refused:
-            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing is recorded"
+            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing was recorded"
             with pytest.raises(CaptureError, match=words):
                 taken.check()
         else:
@@ -314,14 +314,14 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        ([], 2, "a take's name needed, or --list"),
-        (["a", "--list"], 2, "a take's name needed, or --list"),
+        ([], 2, "either the name of a take or --list needed"),
+        (["a", "--list"], 2, "either the name of a take or --list needed"),
         (["--list", "--folder", "nofolder"], 1, "nofolder does not exist: a folder of takes needed (--folder)"),
         (["../a", "--show"], 2, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
-        (["there"], 1, "is there already: another name needed, or --delete it first"),
-        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
-        (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
+        (["there"], 1, "exists already: give another name, or --delete it first"),
+        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed, like a.png"),
+        (["a", "--trim", "3", "1"], 2, "needed, the first below the second"),
         (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
         (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),

@@ -446,13 +446,13 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["a.rrd", "--screenshot", "."], "is a folder, the name of a file needed"),
+        (["a.rrd", "--screenshot", "."], "is a folder; the name of a file needed"),
         (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
-        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
-        (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
+        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
+        (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
         (["a.rrd", "--web"], "thirdhand view live --web"),
-        (["live", "a.rrd"], "live beside 1 files; either live alone or files needed"),
+        (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
         (["press.npz", "a.rrd"], "press.npz is neither"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
