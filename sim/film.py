@@ -29,18 +29,19 @@ from sim.scene import Scene
 from sim.script import HandScript
 from sim.world import Floats, pixels
 
-CAMERA_M, LOOK_AT_M = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31)
-PICTURE_PX, FINER, FRAME_HZ, PLAYBACK_SPEED = (
-    (640, 420),
-    2,
-    15,
-    2,
-)  # pixels shown; drawn per pixel; a second; times as fast
-PATH_S, LAST_FRAME_S = 1.2, 1.5  # duration of the drawn paths, and of the last frame
+CAMERA_M = (1.66, -0.78, 0.80)
+LOOK_AT_M = (0.53, -0.02, 0.31)
+PICTURE_PX = (640, 420)  # width and height
+FINER = 2  # drawn pixels per shown pixel
+FRAME_HZ = 15
+PLAYBACK_SPEED = 2  # the film is twice as fast as the bench
+PATH_S = 1.2  # paths are drawn over this time
+LAST_FRAME_S = 1.5  # duration of the last frame
 FILM_TOLERANCE_M = 0.001
 QUALITY = 80  # [%] quality of WebP
 PATH_COLOURS = (palette.LEFT, palette.RIGHT, palette.TOOL)
-SKY_ABOVE, SKY_BELOW = np.array((236, 240, 245)), np.array((206, 214, 224))
+SKY_ABOVE = np.array((236, 240, 245))
+SKY_BELOW = np.array((206, 214, 224))
 CAPTIONS = (
     "The left hand comes: the robot hands the board over",
     "The hands go on: it fetches the magnifying glass",

@@ -38,19 +38,19 @@ from sim.script import HandScript
 
 WHOLE_EVERY = 500  # [ticks] interval of whole frames; the others have a checksum
 # Resolutions of tracker [m] and joint encoders [rad, rad/s]: finer noise would enlarge the file.
-TRACKED, ENCODED, ENCODED_SPEED = 2.0**-15, 2.0**-14, 2.0**-10
+TRACKED = 2.0**-15
+ENCODED = 2.0**-14
+ENCODED_SPEED = 2.0**-10
 SESSION_S = 20.0
 MOVED_SCENE = Scene(handover=(0.66, -0.22, 0.33))
-# Times of the session's events [s].
-TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
-    0.5,
-    2.0,
-    (6.5, 7.0),
-    (9.0, 9.6),
-    (10.0, 10.5),
-    (13.2, 13.8),
-    14.5,
-)
+# Times of the session's events, or their begins and ends.
+TEACH_S = 0.5  # the via-points of the scene are taught
+BEGIN_S = 2.0  # the script begins
+DROPOUT_S = (6.5, 7.0)  # the left hand is out of sight
+HOLD_S = (9.0, 9.6)  # the operator holds and resumes
+BAD_S = (10.0, 10.5)  # each sample of the left hand follows an invalid one
+AWAY_S = (13.2, 13.8)  # the left hand is far away from the demonstrations
+RETEACH_S = 14.5  # a moved handover is taught
 
 
 class GoldenSession:

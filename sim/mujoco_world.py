@@ -21,7 +21,8 @@ GEOM_TYPES = {
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-FELT_GROUP, SEEN_GROUP = 0, 1  # groups of MuJoCo for collision and visual shapes of a URDF
+FELT_GROUP = 0  # group into which MuJoCo puts collision shapes of a URDF
+SEEN_GROUP = 1  # group into which MuJoCo puts visual shapes of a URDF
 MOST_PIXELS = 2048  # largest width and height of a picture
 # MuJoCo needs a mass for each link. Visual shapes are kept, and links are not merged.
 READ_AS = {

@@ -38,8 +38,10 @@ from sim.scene import Scene
 from sim.script import HandScript
 
 CELL = "thirdhand"  # the default cell
-PART_HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
-MIDDLE_S, SWING_S = 5.15, 1.2  # script time at which the tool is fastest, and amplitude of the swing about it
+PART_HANDS_HZ = 100
+HOUR_NS = 3_600_000_000_000
+MIDDLE_S = 5.15  # script time at which the tool is fastest
+SWING_S = 1.2  # amplitude of the swing about that time
 FASTEST = 1.7  # rate of the script in the middle of the swing
 START_TIMEOUT_S = 60.0
 PRIORITY = 20  # below the service's loop, above its other threads

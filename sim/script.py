@@ -22,7 +22,8 @@ Array = npt.NDArray[np.float64]
 PAUSE_RAMP_S = 0.3  # duration of stopping in a pause, and of accelerating after it
 TREMOR_HZ = (8.0, 10.0)  # physiological tremor of a resting hand
 TREMOR_WAVES = 6
-GRIP_AT, GRIP_S = 0.88, 0.25  # the gripper moves from this share of a motion on, for this time [s]
+GRIP_AT = 0.88  # the gripper begins to move at this share of a motion, as the hands arrive
+GRIP_S = 0.25  # duration of opening or closing
 # [m] Deviation of the tool in the middle of each motion: over the hand, the bench, and the board.
 TOOL_ARCS = ((0.0, 0.0, 0.03), (0.03, 0.0, 0.05), (0.0, 0.0, 0.04))
 

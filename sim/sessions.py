@@ -14,11 +14,13 @@ from sim.people import GROUP_SEEDS, LONGEST_LEAD_S, PLAIN_PERSON, PROJECT_SEED, 
 from sim.scene import MOST_MOVED, TOOL_FROM_HAND, Scene
 from sim.script import TOOL_ARCS, Array
 
-REST_S, LAST_S = 1.0, 1.6  # rests before the first and after the last motion
+REST_S = 1.0  # rest before the first motion
+LAST_S = 1.6  # rest after the last motion
 PHASES_S = (3.0, 3.5, 3.0)  # durations of the motions at a speed of 1
 MIN_HAND_HEIGHT_M = 0.03  # least height above the table
 SHAPE_STEPS = 200  # length of the table of a path's shape
-TEACHERS_SCATTER_M, TEACHERS_LAG_S = 0.005, 0.1  # standard deviation per axis, and longest delay
+TEACHERS_SCATTER_M = 0.005  # standard deviation of the teacher's places per axis
+TEACHERS_LAG_S = 0.1  # longest delay of the teacher
 SESSION_EVENTS = ("handover", "glass", "soldering")
 MISTAKES = ("board first", "handover again", "iron again", "solder again", "right to the board")
 BREAKING = (

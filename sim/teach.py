@@ -32,17 +32,17 @@ from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
 from sim.script import Array, Clock, HandScript, Teacher
 
-RADIUS_M, MIN_PLACE_STD_M = 0.03, 0.001  # radius and least standard deviation of via-points
+RADIUS_M = 0.03  # radius of via-points
+MIN_PLACE_STD_M = 0.001  # least standard deviation of via-points
 TEACH_EXAMPLE = """example:
   python -m sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
-REST_BEFORE_S, REST_AFTER_S = 0.5, 3.0  # rests before and after a published demonstration
-TRAY, RIGHT_REST = (
-    (0.95, -0.15, 0.12),
-    (0.95, 0.35, 0.07),
-)  # [m] where the left hand comes twice; where the right one rests
+REST_BEFORE_S = 0.5  # rest before a published demonstration
+REST_AFTER_S = 3.0  # rest after a published demonstration
+TRAY = (0.95, -0.15, 0.12)  # [m] the left hand visits this place twice
+RIGHT_REST = (0.95, 0.35, 0.07)  # [m] the right hand rests here
 VISITED = made_tasks.TaskScene(
     np.array([(0.60, -0.30, 0.07), TRAY, (0.70, 0.02, 0.22), TRAY, (0.75, -0.42, 0.25)]),
     np.array([RIGHT_REST, RIGHT_REST, (0.78, 0.20, 0.20), RIGHT_REST, RIGHT_REST]),
@@ -164,7 +164,7 @@ def publish(
     wait_s: float,
     rate_hz: int = 100,
 ) -> bool:
-    """Publishes hands and tool in real time, as their tracker would, from when somebody listens to
+    """Publish hands and tool in real time, as their tracker would, from when somebody listens to
     the hands until nobody does: they rest for `before_s` first, and REST_AFTER_S at the end.
     `poses` are those at a time [s] from the begin, (7,) each.
 

@@ -25,14 +25,13 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 POSITION_GAIN = 0.3  # a motor corrects this share of its position error in one step
 TABLE_THICKNESS = 0.04  # [m]
 UNLIMITED = 1e6  # [N m] effort of a motor without a limit in the description
-FIELD_OF_VIEW, NEAR_PLANE_M, FAR_PLANE_M = 45.0, 0.1, 5.0  # of pictures: upright [degrees], and from where to where [m]
-BOARD_RGBA, STEEL_RGBA, WOOD_RGBA, SKIN_RGBA, IRON_RGBA = (
-    (0.1, 0.5, 0.2, 1.0),
-    (0.7, 0.7, 0.75, 1.0),
-    (0.75, 0.6, 0.4, 1.0),
-    (0.9, 0.7, 0.6, 1.0),
-    (0.2, 0.4, 0.8, 1.0),
-)
+FIELD_OF_VIEW = 45.0  # [degrees] vertical field of view of pictures
+NEAR_PLANE_M, FAR_PLANE_M = 0.1, 5.0  # distances between which a camera draws
+BOARD_RGBA = (0.1, 0.5, 0.2, 1.0)
+STEEL_RGBA = (0.7, 0.7, 0.75, 1.0)
+WOOD_RGBA = (0.75, 0.6, 0.4, 1.0)
+SKIN_RGBA = (0.9, 0.7, 0.6, 1.0)
+IRON_RGBA = (0.2, 0.4, 0.8, 1.0)
 
 
 class Pose(NamedTuple):

@@ -32,7 +32,8 @@ DEMO_TOOL_M = {  # [m] tool positions of the demo in frame base: the begin of th
     "soldering": (0.62, 0.0, 0.26),
 }
 REACH_MARGIN_M = 0.011  # a position counts as reached if it is this far inside the shell
-STAND_STEP_M, STAND_STEPS = 0.05, 6  # tried positions of the base are multiples of 5 cm, up to 30 cm along x
+STAND_STEP_M = 0.05  # tried positions of the base on the x axis are multiples of this
+STAND_STEPS = 6  # tried multiples to either side
 
 
 class Proposal(NamedTuple):

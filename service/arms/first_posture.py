@@ -25,7 +25,8 @@ MIDDLE_WEIGHT = 0.2  # cost of a joint at its limit, proportional to its distanc
 END_WEIGHT = 10.0  # cost per half range, within the last fifth before a limit
 POSTURE_MARGIN_RAD = 0.001  # the posture keeps this distance from the limits, because of rounding
 MAX_POSTURE_ERROR_M, MAX_POSTURE_ERROR_RAD = 0.02, 0.2  # a posture with a larger error is not a solution
-ENOUGH_MARGIN, ENOUGH_M = 0.3, 0.08  # larger margins to limits (share of half a range) and obstacles score no more
+ENOUGH_MARGIN = 0.3  # a larger margin to the limits, as a share of half a range, scores no more
+ENOUGH_M = 0.08  # a larger distance from table and arm scores no more
 
 
 def middle_of_range(joint: UrdfJoint) -> float:

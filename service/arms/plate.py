@@ -64,7 +64,7 @@ def turn_of_tool(chain: Sequence[UrdfJoint]) -> tuple[float, float, float, float
         if joint.kind != "fixed":
             turns, axis = turn, np.array(joint.axis)
             points.append(at)
-    axis = turn.inv().apply(turns.apply(axis))  # in the plate's frame
+    axis = turn.inv().apply(turns.apply(axis))  # the last axis in the plate's frame
     away = turn.inv().apply(at - points[max(len(points) - 2, 0)])
     along = float(axis @ away)
     if abs(along) < LEAST_ALONG * float(np.linalg.norm(away)):

@@ -15,7 +15,8 @@ from service.settings.urdf import UrdfJoint
 UNKNOWN_VELOCITY = 1.5  # [rad/s, m/s] for joints without a velocity in the URDF
 RISE_S = 0.25  # acceleration = velocity / 0.25 s
 MAX_ACCELERATION = 15.0  # [rad/s²]
-JERK_RATE, MAX_JERK = 40.0, 500.0  # jerk = min(40 / s * acceleration, 500 rad/s³)
+JERK_RATE = 40.0  # jerk = 40 / s * acceleration
+MAX_JERK = 500.0  # [rad/s³]
 TORQUE_SHARE = 0.5  # gravity and acceleration of the arm may take this share of a joint's effort
 LEAST_SCALE = 0.2  # small efforts reduce the acceleration to this share at most: they may be wrong
 

@@ -13,9 +13,11 @@ from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 from service.process.progress import say
 
-STILL_S, STILL_M = 1.0, 0.015  # hands and tool hold still if they move less than 15 mm within 1 s
+STILL_S = 1.0  # hands and tool hold still if they move less than STILL_M within this time
+STILL_M = 0.015  # trackers are noisy, and hands tremble
 MAX_HAND_AGE_MS = 200.0  # an older position of a hand is not used
-HERE_TIMEOUT_S, HERE_POLL_S = 30.0, 0.05
+HERE_TIMEOUT_S = 30.0  # hands and tool must hold still within this time
+HERE_POLL_S = 0.05
 
 
 class NotHereError(ExplainedError, RuntimeError):

@@ -75,7 +75,7 @@ def endpoint(given: str) -> str:
     return given
 
 
-TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
+TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
@@ -86,7 +86,7 @@ TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # by the word that 
 ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 
 FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
+COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # the functions with which a shell completes a value
     **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILE_COMPLETION),
     "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
 }

@@ -41,7 +41,8 @@ from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
 TITLE_BAR = 30  # [pixels] minimum height of a window's title bar
-CAPTION_MARGIN_PX, CAPTION_PX = 14, 15  # margin and size of the caption at the top of a picture
+CAPTION_MARGIN_PX = 14  # distance of the caption from the corner of a picture
+CAPTION_PX = 15  # height of its letters
 BAR_TINT = 40  # maximum difference of colour channels in the grey title bar
 NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
 FRESH_S = 1.0  # the age of a live view's picture is printed if it is larger

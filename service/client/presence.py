@@ -80,7 +80,7 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     @property
     def keys(self) -> list[str]:
-        """The keys collected so far, sorted."""
+        """The collected keys, sorted."""
         return sorted(self._keys.copy())
 
     def close(self) -> None:

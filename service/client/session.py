@@ -21,7 +21,8 @@ from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, 
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # files in the folder of a role
 ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
-ATTEMPT_S, RETRY_S = 1.0, 0.05  # timeout of one attempt, and the pause before the next
+ATTEMPT_S = 1.0  # timeout of one attempt
+RETRY_S = 0.05  # pause before the next attempt
 Attempted = TypeVar("Attempted")
 
 

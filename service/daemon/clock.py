@@ -24,7 +24,8 @@ STEP_NS = 20_000_000  # a larger difference from the system clock shows that the
 DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
 CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
 _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
-FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10  # of the loop, and of threads that may hold the interpreter lock
+FIFO_PRIORITY = 80  # priority of the loop
+BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
 
 
 class Deadlines:

@@ -313,7 +313,7 @@ class Queryables:
         if is_loaded and found.is_refused:
             raise RequestError(found.text)
         self._keep(skill.file)
-        draft = self._saved.draft(skill)  # before the loop: via-points that cannot be saved are not adopted
+        draft = self._saved.draft(skill)  # written first, because via-points that cannot be saved are not adopted
         try:
             tick = self._through_the_loop(Event("skill", skill.file, skill.for_loop()))
             draft.replace(self._saved.path(skill))
@@ -325,7 +325,7 @@ class Queryables:
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
         files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
-        found = {path.stem: path for path in files}  # without links to files elsewhere
+        found = {path.stem: path for path in files}  # links to files elsewhere are ignored
         path = found.get(name.removesuffix(".npz"))
         if path is None:
             names = ", ".join(found) or "none"

@@ -24,7 +24,8 @@ from service.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descripto
 from service.settings.config import Settings
 
 log = logging.getLogger("thirdhand")
-REPORT_EVERY_S, LOG_EVERY_S = 1.0, 20.0  # intervals of the report on a terminal and in the log
+REPORT_EVERY_S = 1.0  # interval of reports on a terminal
+LOG_EVERY_S = 20.0  # interval of reports in the log
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 

@@ -25,7 +25,8 @@ from service.settings.config import Settings
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # after this time without a sample the daemon holds for a stale hand
 GAP_RATIO = 5.0  # nothing was seen in a gap longer than GAP_S and 5 usual gaps
-EDGE_S, EDGE_SPEED_MPS = 0.3, 0.1  # a take begins or ends in motion if its first or last 0.3 s are faster than 0.1 m/s
+EDGE_S = 0.3  # a take begins or ends in motion if this first or last time is faster than EDGE_SPEED_MPS
+EDGE_SPEED_MPS = 0.1
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLOT_COLUMNS = 60  # characters in a line of the speed plot
 TRACK_COLOURS = {

@@ -256,7 +256,7 @@ def _in_order(path: str | Path, track: Track) -> Track:
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
     """True if the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
-    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as in the daemon
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # the daemon has the same rule
     return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in tracker_frames)
 
 

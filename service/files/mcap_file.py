@@ -79,7 +79,7 @@ class _WholeWrites:
         return self._size
 
     def flush(self) -> None:
-        """Does nothing: all data is written already."""
+        """Do nothing: all data is written already."""
 
     def close(self) -> None:
         if not self.closed:
@@ -123,7 +123,7 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes written so far."""
+        """Number of written bytes."""
         return self._stream.tell()
 
     def put(self, topic: str, kind: str, data: bytes, time_ns: int, sequence: int, *, qos: str = "") -> None:

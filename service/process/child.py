@@ -155,7 +155,7 @@ class _ForkServer:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
-        self._modules: dict[str, None] = {}  # in the order of their first request
+        self._modules: dict[str, None] = {}  # ordered by their first request
 
     def request(self, module: str, *more: str, descriptors: Iterable[int] = ()) -> subprocess.Popen[bytes]:
         """Have the server import a module and, with a descriptor, fork a child that runs it."""

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from service.contract.printable import CLEAR, printable_lines
 from service.contract.requests import STARTING
 
-SHOWN_AFTER_S, LINE_EVERY_S = 2.0, 10.0
+SHOWN_AFTER_S = 2.0  # shorter steps show no progress
+LINE_EVERY_S = 10.0  # interval of lines without a terminal
 
 
 def say(line: str) -> None:

@@ -24,7 +24,8 @@ from service.settings.config import Settings
 
 REOPEN_S = 1.0  # interval of attempts to begin a recording
 SAMPLE_S = 5.0  # interval at which sizes of files are noted
-GROWTH_S, MIN_GROWTH_S = 600.0, 10.0  # longest and shortest time over which growth is measured
+GROWTH_S = 600.0  # growth is measured over at most this time
+MIN_GROWTH_S = 10.0  # growth is unknown before this time
 MIN_FREE_BYTES = 1_000_000  # a full disk is used again once it has space for some seconds of ticks
 PRUNE_S = 5.0  # interval at which old recordings are deleted
 

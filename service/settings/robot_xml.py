@@ -79,7 +79,7 @@ def element_of(text: str | bytes) -> Element:
 
 def readable(data: bytes) -> str:
     """The text of a file in a form that every XML reader accepts. A file with undeclared prefixes,
-    or in an encoding other than UTF-8, is written anew. Raises ValueError.
+    or in an encoding other than UTF-8, is rewritten. Raises ValueError.
     """
     robot = element_of(data)
     try:

@@ -25,7 +25,8 @@ from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "service")
-BENCH_S, SOAK_S = 24.0, 1800.0  # default durations
+BENCH_S = 24.0  # default duration
+SOAK_S = 1800.0  # default duration of --soak
 DURATION_PARTS = 6  # the duration is divided into two parts each for the empty loop, the core and the whole
 MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (

@@ -36,10 +36,12 @@ from service.settings.config import Settings, robot_description
 PERCENTS = (50.0, 99.0, 99.9, 100.0)
 EDGES_US = np.geomspace(1.0, 1e5, 101)  # edges of the histograms' bins
 TRACKER_HZ = 487.3  # it is no multiple of a loop's rate
-SWAY_M, SWAY_HZ = 0.03, 0.3  # amplitude and frequency of the hands' motion
+SWAY_M = 0.03  # amplitude of the hands' motion
+SWAY_HZ = 0.3  # frequency of the hands' motion
 HANDS_EVERY_S = 0.01
 PING_EVERY = 20  # every 20th sample measures the round trip
-FLOATS, CALLS = 200, 20  # additions in Python and calls of NumPy in the fixed piece of work
+FLOATS = 200  # additions in Python in the fixed piece of work
+CALLS = 20  # calls of NumPy in the fixed piece of work
 UNCOUNTED_S = 1.0  # the first second is not counted
 
 

@@ -31,7 +31,8 @@ from service.files.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLA
 from service.files.tool_poses import tool_poses
 from service.settings.config import Settings, robot_description
 
-HAND_KEYS, TOOL_KEY = ("hands/left", "hands/right"), ENDINGS["tool"]
+HAND_KEYS = ("hands/left", "hands/right")
+TOOL_KEY = ENDINGS["tool"]
 CAPTURED_KEYS = (*HAND_KEYS, TOOL_KEY, JOINT_STATES, GRIPPER_STATE)
 OTHER_CELLS = ("**/hands/*", "**/tool/pose")  # these find streams of other cells, and misspelt keys
 MAX_OTHER_KEYS = 8  # an error message lists at most this many of them
@@ -40,7 +41,8 @@ MIN_COVERED_SHARE = 0.7  # samples must cover this share of a rest
 MOVED_RATIO = 5.0  # a rest ends a capture only after a motion of 5 times the motion at rest
 RETAINED_REST_S = 0.3  # this time of the rest before and after the motion is retained
 CAPTURE_SILENCE_S = 2.0  # a capture ends after this time without a message
-CAPTURE_POLL_S, PROGRESS_S = 0.02, 0.1
+CAPTURE_POLL_S = 0.02
+PROGRESS_S = 0.1  # interval of progress reports
 Until = Literal["key", "rest"]
 
 
