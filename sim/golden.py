@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.cli.usage import option
 from service.contract import cdr
 from service.contract.explain import in_words
 from service.contract.requests import TOLERANCE_M
@@ -198,25 +199,10 @@ def main(arguments: list[str] | None = None) -> int:
         "  python -m sim.golden --refresh",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "--output",
-        metavar="FILE",
-        type=Path,
-        default=Path("recordings/golden.mcap"),
-        help="the recording (default: %(default)s)",
-    )
-    p.add_argument(
-        "--skill",
-        metavar="FILE",
-        type=Path,
-        default=Path("recordings/soldering.npz"),
-        help="the skill (default: %(default)s)",
-    )
-    p.add_argument(
-        "--refresh",
-        action="store_true",
-        help="keep the ticks, compute the frames again, print the number of changed ticks and the largest changes",
-    )
+    option(p, "--output", "FILE", "the recording", Path("recordings/golden.mcap"))
+    option(p, "--skill", "FILE", "the skill", Path("recordings/soldering.npz"))
+    about = "keep the ticks, compute the frames again, print the number of changed ticks and the largest changes"
+    p.add_argument("--refresh", action="store_true", help=about)
     args = p.parse_args(arguments)
     try:
         if args.refresh:

@@ -69,11 +69,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     solder: Point = (0.88, 0.22, 0.015)
     left_start: Point = (0.98, -0.32, 0.06)
     right_start: Point = (0.98, 0.32, 0.06)
-    phases_s: tuple[Duration, Duration, Duration] = (
-        3.0,
-        3.5,
-        3.0,
-    )  # board to the left hand; glass; work over the board
+    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)  # handover; fetch the glass; work over the board
     dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)  # the hands rest after each phase
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
@@ -193,21 +189,17 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the request that teaches a scene's via-points; exit code 0, 1 on failure, 2 on bad
     usage.
     """
+    from service.cli.usage import option  # its import is slow, and most users of this module do not need it
+
     p = argparse.ArgumentParser(
         prog="python -m sim.scene",
         description="Prints the via-points of a scene as a `via_points` request.",
         epilog="example:\n  python -m sim.scene my-scene.toml | thirdhand via-points add --file -",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "scene",
-        metavar="FILE",
-        nargs="?",
-        type=Path,
-        help="a TOML file with places [x, y, z] in metres (default: the nominal scene)",
-    )
-    about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml; places are moved into its reach (default: wam)"
-    p.add_argument("--arm", default="wam", help=about)
+    option(p, "scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)", nargs="?")
+    about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml; places are moved into its reach"
+    option(p, "--arm", "ARM", about, "wam")
     p.add_argument("--gripper", action="store_true", help="include the state of the gripper")
     args = p.parse_args(arguments)
     try:

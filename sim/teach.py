@@ -12,12 +12,12 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import zenoh
 
+from service.cli.usage import option
 from service.client import ClientSettings, client_settings
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
@@ -205,46 +205,22 @@ def main(arguments: list[str] | None = None) -> int:
         epilog=TEACH_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "--output",
-        metavar="DIR",
-        type=Path,
-        help="folder for demonstration-1.mcap and so on; made if missing",
-    )
-    p.add_argument(
-        "--live", action="store_true", help="publish them instead, each from the first subscriber of the hands on"
-    )
-    p.add_argument(
-        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
-    )
-    p.add_argument(
-        "--speed", metavar="X", type=float, default=1.0, help="the relative speed of the motions (default: %(default)s)"
-    )
-    p.add_argument(
-        "--wait", metavar="S", type=float, default=60.0, help="wait this long for a subscriber (default: %(default)s)"
-    )
-    p.add_argument("--count", type=int, default=6, help="the number of demonstrations (default: %(default)s)")
-    p.add_argument("--seed", type=int, help="the seed of their scatter (default: the scene's)")
-    p.add_argument(
-        "--scene",
-        metavar="FILE",
-        type=Path,
-        help="a TOML file with places [x, y, z] in metres (default: the nominal scene)",
-    )
-    p.add_argument(
-        "--people",
-        action="store_true",
-        help="two demonstrations each by modelled people, with moved things and via-points",
-    )
-    p.add_argument(
-        "--visits",
-        action="store_true",
-        help="another task, between five named via-points, with one place visited twice; with --live or --places",
-    )
-    p.add_argument(
-        "--places", metavar="FILE", type=Path, help="with --visits: write its via-points for `record --places`"
-    )
-    p.add_argument("--cell", help="prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
+    option(p, "--output", "DIR", "folder for demonstration-1.mcap and so on; made if missing")
+    live = "publish them instead, each from the first subscriber of the hands on"
+    p.add_argument("--live", action="store_true", help=live)
+    connect = f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
+    option(p, "--connect", "EP", connect, action="append", type=str)
+    option(p, "--speed", "X", "the relative speed of the motions", 1.0, type=float)
+    option(p, "--wait", "S", "wait this long for a subscriber", 60.0)
+    option(p, "--count", None, "the number of demonstrations", 6, type=int)
+    option(p, "--seed", None, "the seed of their scatter (default: the scene's)", type=int)
+    option(p, "--scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)")
+    people = "two demonstrations each by modelled people, with moved things and via-points"
+    p.add_argument("--people", action="store_true", help=people)
+    visit = "another task, between five named via-points, with one place visited twice; with --live or --places"
+    p.add_argument("--visits", action="store_true", help=visit)
+    option(p, "--places", "FILE", "with --visits: write its via-points for `record --places`")
+    option(p, "--cell", "NAME", "prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument("--gripper", action="store_true", help="include the closure of the gripper")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:

@@ -77,22 +77,13 @@ def parser() -> argparse.ArgumentParser:
         "the task went.",
         "thirdhand demo --scene my-scene.toml",
     )
-    option(
-        c,
-        "--output",
-        "DIR",
-        "write the recording, the drawing and the service's log to this folder",
-        Path("thirdhand-demo"),
-    )
-    option(
-        c, "--scene", "FILE", "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
-    )
+    output = "write the recording, the drawing and the service's log to this folder"
+    option(c, "--output", "DIR", output, Path("thirdhand-demo"))
+    scene = "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
+    option(c, "--scene", "FILE", scene)
     option(c, "--arm", "ARM", ARM_HELP, "wam")
-    c.add_argument(
-        "--engine",
-        choices=("pybullet", "mujoco"),
-        help="the physics engine of the bench (default: the first that is installed)",
-    )
+    engine = "the physics engine of the bench (default: the first that is installed)"
+    c.add_argument("--engine", choices=("pybullet", "mujoco"), help=engine)
     option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
@@ -118,12 +109,10 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
     other = c.add_mutually_exclusive_group()
-    other.add_argument(
-        "--loads", action="store_true", help="measure under each kind of load beside the loop, --seconds for each"
-    )
-    other.add_argument(
-        "--soak", action="store_true", help="measure memory and open files over time, with a sample every 5 s or less"
-    )
+    loads = "measure under each kind of load beside the loop, --seconds for each"
+    other.add_argument("--loads", action="store_true", help=loads)
+    soak = "measure memory and open files over time, with a sample every 5 s or less"
+    other.add_argument("--soak", action="store_true", help=soak)
 
     c = command(
         "serve",
@@ -138,9 +127,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
     option(c, "--rate", "HZ", RATE)
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
-    joints = (
-        "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, which is state)"
-    )
+    joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
     c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
@@ -164,9 +151,8 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand replay recordings/golden.mcap --exact",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
-    c.add_argument(
-        "--exact", action="store_true", help="fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
-    )
+    exact = "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
+    c.add_argument("--exact", action="store_true", help=exact)
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
 
@@ -216,13 +202,8 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--places", "FILE", places)
     count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
     option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
-    option(
-        c,
-        "--ell",
-        "L",
-        "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)",
-        type=positive,
-    )
+    ell = "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)"
+    option(c, "--ell", "L", ell, type=positive)
     components = "take the reference from a mixture of K Gaussians, as in the paper (default: from the demonstrations)"
     option(c, "--components", "K", components, type=count)
     option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)

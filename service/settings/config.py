@@ -118,20 +118,10 @@ class ArmSettings(Section, frozen=True):
     """
 
     urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
-    packages: tuple[
-        str, ...
-    ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
+    packages: tuple[str, ...] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
     source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
-    posture: PerJoint = (
-        0.1761,
-        0.8604,
-        -0.5,
-        2.5414,
-        -0.4273,
-        -1.0823,
-        0.0,
-    )  # [rad] preferred posture, and the start with `assumed`
+    posture: PerJoint = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] preferred; start if assumed
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
     fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
     silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm is at fault after this silence
