@@ -358,14 +358,7 @@ def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> N
 
 
 def _report(
-    bench: Bench,
-    commands: Commands,
-    *,
-    hands: int,
-    periods: int,
-    skipped: int,
-    longest_pause_ms: float,
-    begun_ns: int,
+    bench: Bench, commands: Commands, *, hands: int, periods: int, skipped: int, longest_pause_ms: float, begun_ns: int
 ) -> RunReport:
     events = bench.events()
     latencies = list(commands.latencies_ms)

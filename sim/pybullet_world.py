@@ -56,11 +56,7 @@ class PyBulletWorld(World):
         shape = -1
         if body.solid or body.measured:
             shape = pybullet.createCollisionShape(
-                kind,
-                collisionFramePosition=position,
-                collisionFrameOrientation=turn,
-                physicsClientId=self._id,
-                **felt,
+                kind, collisionFramePosition=position, collisionFrameOrientation=turn, physicsClientId=self._id, **felt
             )
         made: int = pybullet.createMultiBody(
             baseMass=0.0,

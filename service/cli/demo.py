@@ -62,13 +62,7 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            bench = [
-                "--engine",
-                engine,
-                "--arm",
-                str(service.config),
-                *(["--scene", str(scene)] if scene else []),
-            ]
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
             report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()

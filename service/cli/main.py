@@ -99,9 +99,7 @@ def parser() -> argparse.ArgumentParser:
     _reach(c)
 
     c = command(
-        "bench",
-        "Measures the timing of the control loop on this machine.",
-        "thirdhand bench --rate 1000 --seconds 60",
+        "bench", "Measures the timing of the control loop on this machine.", "thirdhand bench --rate 1000 --seconds 60"
     )
     option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)

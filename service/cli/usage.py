@@ -122,10 +122,7 @@ def check_writable(path: Path, suffix: str = "") -> None:
 def reaching(args: argparse.Namespace) -> ClientSettings:
     """The client settings in a command line. Raises SettingsError."""
     return client_settings(
-        connect=args.connect,
-        cell=vars(args).get("cell"),
-        certificate=args.certificate,
-        zenoh_config=args.zenoh_config,
+        connect=args.connect, cell=vars(args).get("cell"), certificate=args.certificate, zenoh_config=args.zenoh_config
     )
 
 

@@ -16,15 +16,7 @@ from service.client.session import (
     endpoints,
     open_session,
 )
-from service.client.streams import (
-    BRAKE_AFTER_S,
-    ENCODINGS,
-    Command,
-    Follower,
-    Tracker,
-    no_room_to_brake,
-    publisher,
-)
+from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, no_room_to_brake, publisher
 
 __all__ = [
     "AUTHORITY",

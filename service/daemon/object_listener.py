@@ -21,12 +21,7 @@ class ObjectListener:
     """
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        cell: str,
-        *,
-        note: Callable[[str, str, int], None],
-        say: Callable[[str], None],
+        self, session: zenoh.Session, cell: str, *, note: Callable[[str, str, int], None], say: Callable[[str], None]
     ) -> None:
         self._key, self._error = channels.key(cell, OBJECTS_KEY), ""
         self._subscriber = session.declare_subscriber(self._key, RingChannel(1))

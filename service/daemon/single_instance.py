@@ -35,12 +35,7 @@ NETWORK_BOUNDS: dict[str, Any] = {
     "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE_BYTES,
     # A reply takes this from its query: it is dropped if the client does not read.
     "qos/network": [
-        {
-            "messages": ["query"],
-            "key_exprs": ["**"],
-            "flows": ["ingress"],
-            "overwrite": {"congestion_control": "drop"},
-        }
+        {"messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
     ],
 }
 MAX_HOLDER_BYTES = 4096  # limit of what is read from a lock file

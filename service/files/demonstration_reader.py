@@ -123,16 +123,7 @@ def read_demonstration(
         say(f"{path}: {line}")
     seen.stamps_ns.setflags(write=False)
     return Demonstration(
-        seen.stamps_ns,
-        left,
-        right,
-        tool,
-        BASE,
-        recorded.places,
-        closure,
-        seen.conducts,
-        recorded.person,
-        seen.begins,
+        seen.stamps_ns, left, right, tool, BASE, recorded.places, closure, seen.conducts, recorded.person, seen.begins
     )
 
 

@@ -21,8 +21,7 @@ Domain = Annotated[
 Topic = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z",
-        extra={"accepted": "a topic's full name, /like/this,"},
+        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z", extra={"accepted": "a topic's full name, /like/this,"}
     ),
 ]
 

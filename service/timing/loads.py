@@ -216,12 +216,7 @@ def run(
 
 
 def _row(
-    load: Load,
-    rate_hz: int,
-    seconds: float,
-    skills: Path,
-    settings: Settings | None,
-    say: Callable[[str], None],
+    load: Load, rate_hz: int, seconds: float, skills: Path, settings: Settings | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()

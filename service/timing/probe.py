@@ -88,12 +88,7 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
         else:
             late_us.append(late_ns / 1e3)
             work_us.append(took / 1e3)
-    return {
-        "realtime": realtime,
-        "ticks": index - first,
-        "missed": clock.missed - missed,
-        **figures(late_us, work_us),
-    }
+    return {"realtime": realtime, "ticks": index - first, "missed": clock.missed - missed, **figures(late_us, work_us)}
 
 
 @functools.cache
