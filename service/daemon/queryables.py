@@ -293,23 +293,13 @@ class Queryables:
             time.sleep(TICK_POLL_S)
         return tick
 
-    def _adopt(
-        self, skill: StoredSkill, added: Sequence[ViaPoint] = (), *, is_loaded: bool = False, remark: str = ""
-    ) -> Reply:
+    def _adopt(self, skill: StoredSkill, *, is_loaded: bool = False, remark: str = "") -> Reply:
         """Have the loop adopt a skill, and save its via-points.
 
-        Raises RequestError for `added` via-points out of reach, and for a loaded skill of which the
-        arm does not reach most tool positions.
+        Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
         """
-        positions = np.vstack((np.reshape([point.tool for point in added], (-1, 3)), skill.tool_positions))
-        distances_m = self._skill_worker.beyond_m(self._settings, positions)
-        for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=False)):
-            if distance_m > 0.0:
-                raise RequestError(
-                    f"$.points[{i}].tool: {list(point.tool)} out of the arm's reach by {distance_m:.3f} m: "
-                    f"{accepted(self._settings)}"
-                )
-        found = out_of_reach(skill, distances_m[len(added) :], self._settings)
+        distances_m = self._skill_worker.beyond_m(self._settings, skill.tool_positions)
+        found = out_of_reach(skill, distances_m, self._settings)
         if is_loaded and found.is_refused:
             raise RequestError(found.text)
         self._keep(skill.file)
@@ -332,13 +322,13 @@ class Queryables:
             raise RequestError(f"$.name: no skill {name!r} in the skill folder; its skills: {names}")
         skill, remark = self._skill_worker.load(path), ""
         if saved := self._saved.read(skill):
-            skill = self._skill_worker.adapt(skill, saved.points, tolerance=saved.tolerance)
-            remark = saved.remark
+            points, tolerance = saved
+            skill, remark = self._skill_worker.adapt(skill, points, tolerance=tolerance), self._saved.remark
         return self._adopt(skill, is_loaded=True, remark=remark)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:
         points = {point.name: point for point in self._skill.via_points}
-        tolerance, added = self._skill.tolerance, tuple[ViaPoint, ...]()
+        tolerance = self._skill.tolerance
         match request:
             case Clear():
                 points = {}
@@ -353,7 +343,7 @@ class Queryables:
             case Add(added, tolerance):
                 self._check(added)
                 points |= {point.name: point for point in added}
-        return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance), added)
+        return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
 
     def _check(self, added: Sequence[ViaPoint]) -> None:
         """Raise RequestError for too many via-points, and for those outside the skill's
@@ -367,9 +357,11 @@ class Queryables:
                 f"{MAX_TAUGHT_POINTS} accepted"
             )
         low, high = self._skill.workspace
-        for i, point in enumerate(added):
+        distances_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
+        for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
+            given = f"$.points[{i}].tool: {list(point.tool)}"
             if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
-                raise RequestError(
-                    f"$.points[{i}].tool: {list(point.tool)} outside the skill's workspace, {corners} m accepted"
-                )
+                raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")
+            if distance_m > 0.0:
+                raise RequestError(f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")

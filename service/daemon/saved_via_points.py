@@ -9,7 +9,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -44,16 +44,6 @@ def _identity(settings: Settings) -> str:
     return "; ".join(" ".join([one.name, *(f"{round(v, 2) + 0.0:.2f}" for v in one.translation)]) for one in chain)
 
 
-class TaughtBefore(NamedTuple):
-    """The via-points that were taught to a skill before and that the arm reaches, their tolerance
-    [m], and a remark on those that it does not reach.
-    """
-
-    points: tuple[ViaPoint, ...]
-    tolerance: float
-    remark: str = ""
-
-
 class SavedViaPoints:
     """The via-points taught to each skill of an arm, in files that are written atomically.
 
@@ -63,6 +53,7 @@ class SavedViaPoints:
     def __init__(self, settings: Settings, distances_m: Callable[[Settings, Vector], Vector] = beyond_m) -> None:
         self._folder, self._settings, self._distances_m = state_folder(settings), settings, distances_m
         self._arm, self._shipped_arm = _identity(settings), _identity(Settings())
+        self.remark = ""  # message on via-points that were set aside by the last reading
 
     def path(self, skill: Skill) -> Path:
         """The file for this skill and arm, named by a hash of the skill's demonstrations."""
@@ -70,8 +61,10 @@ class SavedViaPoints:
         digest = hashlib.blake2b((skill.learned_from + arm).encode(), digest_size=6).hexdigest()
         return self._folder / f"places-{digest}.json"
 
-    def read(self, skill: Skill) -> TaughtBefore | None:
-        """The via-points taught to this skill of this arm; None if there are none."""
+    def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
+        """The via-points and the tolerance taught to this skill of this arm; None if there are
+        none. `remark` names those that the arm does not reach.
+        """
         found = restored(self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT)
         return found and self._reached(skill, *found)
 
@@ -82,18 +75,21 @@ class SavedViaPoints:
 
         def made(content: bytes) -> Made:
             found = self._decoded(content, skill)
-            return otherwise if found is None else make(*self._reached(skill, *found)[:2])
+            return otherwise if found is None else make(*self._reached(skill, *found))
 
         return restored(self.path(skill), made, otherwise, what=WHAT)
 
-    def _reached(self, skill: Skill, points: tuple[ViaPoint, ...], tolerance: float) -> TaughtBefore:
+    def _reached(
+        self, skill: Skill, points: tuple[ViaPoint, ...], tolerance: float
+    ) -> tuple[tuple[ViaPoint, ...], float]:
         """The via-points whose tool positions the arm reaches. The others are written to a file for
         `thirdhand via-points add --file`, which log and remark name.
         """
         distances_m = self._distances_m(self._settings, np.reshape([point.tool for point in points], (-1, 3)))
         beyond_m = {point.name: m for point, m in zip(points, distances_m.tolist(), strict=True) if m > 0.0}
+        self.remark = ""
         if not beyond_m:
-            return TaughtBefore(points, tolerance)
+            return points, tolerance
         content = encode_json(Add(tuple(point for point in points if point.name in beyond_m), tolerance))
         digest = hashlib.blake2b(self.path(skill).name.encode() + content, digest_size=6).hexdigest()
         aside = self._folder / f"out-of-reach-{digest}.json"
@@ -105,9 +101,9 @@ class SavedViaPoints:
                 f"are not in force, and the next teaching deletes them: they cannot be set aside ({in_words(error)})"
             )
         names = ", ".join(f"{name!r} by {m:.3f} m" for name, m in beyond_m.items())
-        remark = f"via-points of skill {skill.name!r} are out of the arm's reach, {names}; they {where}"
-        log.warning("%s", remark)
-        return TaughtBefore(tuple(point for point in points if point.name not in beyond_m), tolerance, remark)
+        self.remark = f"via-points of skill {skill.name!r} are out of the arm's reach, {names}; they {where}"
+        log.warning("%s", self.remark)
+        return tuple(point for point in points if point.name not in beyond_m), tolerance
 
     def _decoded(self, content: bytes, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """The via-points and the tolerance in a file; None if they are of another skill or arm."""

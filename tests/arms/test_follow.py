@@ -199,7 +199,7 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
         at = ("--connect", daemon.endpoint)
         assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
         assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
-        assert "here 6 were configured" in line
+        assert "the settings here have 6" in line
         assert "give the daemon's settings by --config" in line
         assert "give --config with its own URDF" in refused("franka", *at)
 
@@ -220,7 +220,7 @@ def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program:
         done = thirdhand(program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(
-        "50 Hz is too slow: commands would come every 20 ms, and an arm brakes 20 ms after its last command; "
+        "50 Hz is too slow: commands would arrive every 20 ms, and an arm brakes 20 ms after its last command; "
         "67 Hz or more needed"
     )
 

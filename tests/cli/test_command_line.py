@@ -128,7 +128,7 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "--web shows a running daemon, not files", ("view", "a.rrd", "--web")),
         (2, "--tab chooses the tab of a picture", ("view", "live", "--web", "--tab", "timing")),
         *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
-        (1, "50 Hz is too slow: commands would come every 20 ms", ("demo", "--rate", "50")),
+        (1, "50 Hz is too slow: commands would arrive every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
         (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
     ],
@@ -200,7 +200,7 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
                 assert time.monotonic() < end
             process.send_signal(number)
             assert process.wait(30) == code
-            ended = "ended: the bench of cell thirdhand, after 0 whole runs; no report was kept (--output)"
+            ended = "ended: the bench of cell thirdhand, after 0 complete runs; without --output no report was written"
             assert process.stderr.read().splitlines()[-1] == ended
 
 

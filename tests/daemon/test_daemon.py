@@ -236,7 +236,10 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
     again = told("via-points", "add", "my place", *place, *at)
-    assert (again.returncode, again.stdout.endswith("replaced, as there was one of this name: my place\n")) == (0, True)
+    assert (again.returncode, again.stdout.endswith("replaced, because a via-point had the same name: my place\n")) == (
+        0,
+        True,
+    )
     assert "1 via-point in force" in told("via-points", "list", *at).stdout
     refused = told("via-points", "remove", "other", *at)
     assert refused.returncode == 1

@@ -122,7 +122,7 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: 
         lab.session.declare_subscriber("stuck/hands/*", lambda sample: None),
     ):
         assert main([*play, "--cell", "stuck"]) == 1
-    assert "the daemon counted 0 of " in capsys.readouterr().err
+    assert "the daemon received 0 of " in capsys.readouterr().err
 
 
 @contextlib.contextmanager

@@ -130,7 +130,7 @@ def test_a_file_that_somebody_edited_is_set_aside(
 ) -> None:
     saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
     whole = saved.path(skill).read_text()
-    for text, why in ((whole.replace("0.03", "0.04"), "changed since"), (whole.replace("checksum", "sum"), "checksum")):
+    for text, why in ((whole.replace("0.03", "0.04"), "was edited"), (whole.replace("checksum", "sum"), "checksum")):
         saved.path(skill).write_text(text)
         assert saved.read(skill) is None
         assert why in caplog.text

@@ -160,7 +160,7 @@ def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkey
     monkeypatch.setattr(launch, "STUCK_S", 8.0)
     before = "import time\nfrom service.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
     said: list[str] = []
-    stuck = r"no further for 8 s.*last: loading compiled functions, \d+ of \d+ functions"
+    stuck = r"no progress for 8 s.*last report: loading compiled functions, \d+ of \d+ functions"
     with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
         raise AssertionError("it was ready")
     assert said[0].startswith("  starting: importing")

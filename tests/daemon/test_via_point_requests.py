@@ -121,11 +121,11 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         ({"op": "add"}, "$: field `points` is missing"),
         (
             {"op": "remove", "names": ["nothing"]},
-            "$.names[0]: no via-point 'nothing'. There are: handover, glass, soldering",
+            "$.names[0]: no via-point 'nothing'; in force: handover, glass, soldering",
         ),
         (
             {"op": "remove", "names": ["glass", "nothing"]},
-            "$.names[1]: no via-point 'nothing'. There are: handover, glass, soldering",
+            "$.names[1]: no via-point 'nothing'; in force: handover, glass, soldering",
         ),
         ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
         ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),

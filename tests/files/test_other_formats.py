@@ -198,7 +198,11 @@ def lerobot(path: Path) -> None:
         ("c.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not a CSV file that can be read"),
         ("a.c3d", lambda path: path.write_bytes(b"nothing"), "is not a C3D file that can be read"),
         ("a.mcap.zst", lambda path: path.write_bytes(b"x"), "is not read: decompress it first, or give the folder"),
-        ("a.parquet", lambda path: path.write_bytes(b"x"), r"is not read: Arrays of any origin .*docs/arrays\.md"),
+        (
+            "a.parquet",
+            lambda path: path.write_bytes(b"x"),
+            r"has a format that is not read: A few lines of Python .*docs/arrays\.md",
+        ),
     ],
 )
 def test_what_is_not_read_is_refused_with_what_to_do(

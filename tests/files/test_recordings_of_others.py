@@ -106,7 +106,7 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
         (
             {"left": PoseTopic("/nowhere")},
-            r"--left /nowhere: no topic there; its topics: .*of these hold poses: /mocap",
+            r"--left /nowhere: no topic there; its topics: .*topics with poses: /mocap",
         ),
         ({}, r"no topic ending in hands/left .*; --left TOPIC\[:PART\] names another"),
     ):
@@ -137,7 +137,7 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
     with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
         read_demonstration(path)
     other = msgspec.structs.replace(hands, frame="optitrack")
-    with pytest.raises(RecordingError, match=r"'mocap': 'base', or 'optitrack' as \[hands\] frame says, needed"):
+    with pytest.raises(RecordingError, match=r"'mocap': 'base', or 'optitrack' of \[hands\] frame, needed"):
         read_demonstration(path, settings=Settings(hands=other))
     with pytest.raises(RecordingError, match=r"tool.*; /arm/tcp, /hand/gripper could be it"):
         read_demonstration(bag(tmp_path / "two", {"/tf": frames, "/arm/tcp": tool, "/hand/gripper": tool}))

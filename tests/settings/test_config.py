@@ -307,7 +307,9 @@ def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_pat
     assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
-    with pytest.raises(SettingsError, match=r"\[joints\] velocity: missing; a URDF does not say it, 6 numbers needed"):
+    with pytest.raises(
+        SettingsError, match=r"\[joints\] velocity: missing; the URDF does not define it, 6 numbers needed"
+    ):
         load(tmp_path / "cell.toml")
 
 

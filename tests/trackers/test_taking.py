@@ -106,7 +106,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
 
 def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
     with pytest.raises(
-        CaptureError, match=r"not heard: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
+        CaptureError, match=r"not received: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
     ):
         capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
     empty = Capture(sessions[0], "bench", SETTINGS)
@@ -138,7 +138,7 @@ def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]],
         (
             {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
             1.0,
-            r"not heard: hands/left, tool.*; heard instead: bench7/hands/left, thirdhand/hands/Left\. Are",
+            r"not received: hands/left, tool.*; received instead: bench7/hands/left, thirdhand/hands/Left\. Are",
         ),
     ],
 )
@@ -278,7 +278,9 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert np.linalg.norm(tool[0] - Scene().robot_start) < 0.05
     assert np.linalg.norm(tool[-1] - Scene().carry) < 0.05
 
-    with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
+    with pytest.raises(
+        Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left to learn from, so it was not trimmed"
+    ):
         trim(path, 20, 30)
     assert summary(path).lasts_s == found.lasts_s
     assert trim(path, 0, 20).startswith("nothing was cut: ")
@@ -324,7 +326,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         (["a", "--trim", "3", "1"], 2, "needed, the first below the second"),
         (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
-        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),
+        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
     ],
 )
 def test_what_cannot_be_meant_is_said(
