@@ -1,3 +1,3 @@
-"""The soldering bench in simulation: scene, scripted hands, a teacher and its demonstrations, and
-the physics around the arm.
+"""The simulated soldering bench: scene, scripted hands, a teacher and its demonstrations, and the
+physics around the arm.
 """

@@ -1,4 +1,4 @@
-"""`thirdhand sim`: the bench as a process, on Zenoh, in real time."""
+"""`thirdhand sim`: the bench as a process in real time, connected through Zenoh."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 
+from service.cli.usage import option
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
@@ -23,9 +24,9 @@ from service.files.shipped import ARMS, cell_of
 from service.process import interrupt
 from service.settings.arm_description import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
-from sim.script import Clock, HandScript, Pause
+from sim.script import Clock, HandScript, ScriptPause
 
-EXAMPLE = """example:
+SIM_EXAMPLE = """example:
   thirdhand serve &
   thirdhand sim --once --output report.json
 """
@@ -35,128 +36,50 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="thirdhand sim",
-        description="The simulated bench: publishes hands and joint state, follows joint commands, and plays the "
-        "soldering scene over and over (with --once: once). Progress goes to standard error, reports to --output.",
-        epilog=EXAMPLE,
+        description="The simulated bench publishes hands and joint states, follows joint commands, and plays the "
+        "soldering scene again and again, or once with --once. It prints progress on standard error, and writes "
+        "reports to --output.",
+        epilog=SIM_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "--connect",
-        metavar="EP",
-        action="append",
-        default=[],
-        help=f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})",
-    )
-    p.add_argument(
-        "--listen", metavar="EP", action="append", default=[], help="Zenoh endpoint to listen on; may be repeated"
-    )
-    p.add_argument("--cell", help="prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    p.add_argument(
-        "--scene",
-        metavar="FILE",
-        type=Path,
-        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
-    )
-    p.add_argument(
-        "--via-points",
-        action="store_true",
-        help="only print the request that teaches the scene's places, for `thirdhand via-points add --file -`",
-    )
-    p.add_argument(
-        "--arm", default="wam", help=f"{', '.join(ARMS)} or a cell's settings, FILE.toml (default: %(default)s)"
-    )
+    connect = f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})"
+    option(p, "--connect", "EP", connect, action="append", type=str)
+    option(p, "--listen", "EP", "Zenoh endpoint to listen on; may be repeated", action="append", type=str)
+    option(p, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
+    option(p, "--scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)")
+    via_points = "only print the request that teaches the scene's via-points, for `thirdhand via-points add --file -`"
+    p.add_argument("--via-points", action="store_true", help=via_points)
+    option(p, "--arm", "ARM", f"{', '.join(ARMS)} or a cell's settings, FILE.toml", "wam")
     p.add_argument("--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)")
-    p.add_argument(
-        "--hands-only",
-        action="store_true",
-        help="publish hands and things only, and score an arm that is elsewhere by its joint states",
-    )
-    p.add_argument(
-        "--seed", type=int, help="the seed for scatter, tremor and noise of the hands (default: the scene's)"
-    )
-    p.add_argument(
-        "--once",
-        action="store_true",
-        help="end after one run; its report goes to standard output unless --output says otherwise",
-    )
-    p.add_argument(
-        "--output", metavar="FILE", help="write reports to this file, one JSON object per line; - is standard output"
-    )
-    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # of earlier versions, as is --duration
+    hands_only = "publish hands and things only, and evaluate a real or other arm by its joint states"
+    p.add_argument("--hands-only", action="store_true", help=hands_only)
+    option(p, "--seed", None, "the seed for scatter, tremor and noise of the hands (default: the scene's)", type=int)
+    once = "end after one run; its report goes to standard output unless --output says otherwise"
+    p.add_argument("--once", action="store_true", help=once)
+    output = "write reports to this file, one JSON object per line; - is standard output"
+    option(p, "--output", "FILE", output, type=str)
+    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # an option of earlier versions, like --duration
     p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
     p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    p.add_argument(
-        "--wait",
-        metavar="S",
-        type=float,
-        default=60.0,
-        help="wait this long for the first command (default: %(default)s)",
-    )
-    p.add_argument(
-        "--hands-rate",
-        metavar="HZ",
-        type=int,
-        default=100,
-        help="the rate of the hand poses, 30 to 500 (default: %(default)s)",
-    )
-    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="the speed of the hands; 1 is as demonstrated")
-    p.add_argument(
-        "--pause",
-        metavar=("AT", "LASTS"),
-        type=float,
-        nargs=2,
-        action="append",
-        default=[],
-        help="stop the hands AT seconds after the beginning for LASTS seconds, at least 0.6; may be repeated",
-    )
-    p.add_argument(
-        "--turn",
-        metavar=("AT", "LASTS"),
-        type=float,
-        nargs=2,
-        action="append",
-        default=[],
-        help="likewise, but the hands move back and return; may be repeated",
-    )
-    p.add_argument(
-        "--offset-mm",
-        metavar="MM",
-        type=float,
-        default=8.0,
-        help="the scatter of the places, standard deviation per axis (default: %(default)s)",
-    )
-    p.add_argument(
-        "--tremor-mm",
-        metavar="MM",
-        type=float,
-        default=0.5,
-        help="the tremor of the hands, rms per axis (default: %(default)s)",
-    )
-    p.add_argument(
-        "--noise-mm",
-        metavar="MM",
-        type=float,
-        default=0.5,
-        help="the noise of the tracker, standard deviation per axis (default: %(default)s)",
-    )
-    p.add_argument(
-        "--dropout",
-        metavar=("START", "DURATION"),
-        type=float,
-        nargs=2,
-        help="hide one hand from START of the script for DURATION seconds",
-    )
-    p.add_argument(
-        "--dropout-hand",
-        choices=("left", "right"),
-        default="left",
-        help="the hand that --dropout hides (default: %(default)s)",
-    )
+    option(p, "--wait", "S", "wait this long for the first command", 60.0)
+    option(p, "--hands-rate", "HZ", "the rate of the hand poses, 30 to 500", 100, type=int)
+    option(p, "--speed", "X", "the speed of the hands; 1 is as demonstrated", 1.0, type=float)
+    for name, about in (
+        ("--pause", "stop the hands AT seconds after the beginning for LASTS seconds, at least 0.6; may be repeated"),
+        ("--turn", "like --pause, but the hands move back and return; may be repeated"),
+    ):
+        p.add_argument(name, metavar=("AT", "LASTS"), type=float, nargs=2, action="append", default=[], help=about)
+    option(p, "--offset-mm", "MM", "the scatter of the places, standard deviation per axis", 8.0, type=float)
+    option(p, "--tremor-mm", "MM", "the tremor of the hands, rms per axis", 0.5, type=float)
+    option(p, "--noise-mm", "MM", "the noise of the tracker, standard deviation per axis", 0.5, type=float)
+    dropout = "hide one hand from START of the script for DURATION seconds"
+    p.add_argument("--dropout", metavar=("START", "DURATION"), type=float, nargs=2, help=dropout)
+    option(p, "--dropout-hand", None, "the hand that --dropout hides", "left", choices=("left", "right"))
     return p
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Run the bench; exit code 0, 1 on failure, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
     if not 30 <= args.hands_rate <= 500:
@@ -192,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
         stop.set()
 
     try:
-        Clock(pauses=[Pause(*pause) for pause in args.pause + args.turn])
+        Clock(pauses=[ScriptPause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
         p.error(f"--pause, --turn: {error}")
     dropout = (
@@ -225,16 +148,16 @@ def main(arguments: list[str] | None = None) -> int:
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
             pauses=[
-                *(Pause(at, lasts) for at, lasts in args.pause),
-                *(Pause(at, lasts, depth=2.0) for at, lasts in args.turn),
+                *(ScriptPause(at, lasts) for at, lasts in args.pause),
+                *(ScriptPause(at, lasts, depth=2.0) for at, lasts in args.turn),
             ],
             offset_std=args.offset_mm / 1000,
             tremor_rms=args.tremor_mm / 1000,
             noise_std=args.noise_mm / 1000,
         )
         if target and target != "-":
-            Path(target).write_text("", encoding="utf-8")  # told now, not after a run, when it cannot be written
-        own = open_session(connect=args.connect, listen=args.listen) if args.listen else None
+            Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
+        own = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
         session = own or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
@@ -246,8 +169,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     if not args.once:
-        kept = f"their reports are in {target}" if target else "no report was kept (--output)"
-        print(f"ended: the bench of cell {reach.cell}, after {runs} whole runs; {kept}", file=sys.stderr)
+        kept = f"their reports are in {target}" if target else "without --output no report was written"
+        print(f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {kept}", file=sys.stderr)
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

@@ -1,6 +1,6 @@
-"""The bench: arm, hands and things in step with a script, and whether the task succeeds.
+"""The bench: arm, hands and things that move by a script, and the success of the task.
 
-No network, no clock: `step` is one period.
+It has no network and no clock: `step` is one period.
 
 bench = Bench(HandScript(Scene(), seed=1))
 bench.begin()
@@ -18,6 +18,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from service.arms.playback import REJOIN_AFTER_S
+from service.client import BRAKE_AFTER_S
 from service.contract.messages import BASE, SceneObject
 from service.settings.config import Settings
 from sim.engines import world_of
@@ -25,20 +27,18 @@ from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
 from sim.script import GRIP_S, HandMotions, HandScript
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
-SETTLE_S = (0.5, 2.5)  # at least and at most, before the script begins
-STILL_S = 0.25  # of rest is settled
-BRAKE_AFTER_S = 0.020  # without a command
-REJOIN_AFTER_S = 0.1  # without a command; then the next one must begin where the arm stands
-REJOIN_RAD, REJOIN_RADPS = 0.02, 0.05  # how nearly
-HOLDS = 0.5  # closed so far the fingers hold what is between them
-TAIL_S = 0.5  # watched after the script's end
-CATCH_UP_RADPS = 0.25  # beside the commanded speed, at most, by the joint that is farthest behind
-STILL_WITHIN = 0.005  # [m] a tool that a trembling hand leads is never quite at rest
+SETTLE_RANGE_S = (0.5, 2.5)  # shortest and longest time for the arm to settle before the script begins
+SETTLED_STILL_S = 0.25  # the arm has settled after resting for this time
+STAND_RAD, STAND_RADPS = 0.02, 0.05  # after a silence, a command must be within this of the standing arm
+HOLDS = 0.5  # fingers that are closed this far hold a thing between them
+TAIL_S = 0.5  # the task is observed until this time after the script's end
+CATCH_UP_RADPS = 0.25  # the joint that is farthest behind exceeds its commanded speed by at most this
+STILL_WITHIN = 0.005  # [m] a resting tool moves by up to this, because the hand that leads it trembles
 
 
 class TaskEvent(msgspec.Struct, frozen=True):
-    """How one event went: whether the tool was there, its smallest distance [mm], and when: first
-    near enough, or nearest [s of the script].
+    """The result of one event: True if the tool reached it, the smallest distance [mm], and the
+    time of the script [s] at which the tool first reached it or was nearest.
     """
 
     reached: bool
@@ -55,13 +55,13 @@ class TaskEvents(msgspec.Struct, frozen=True):
 
     @property
     def success(self) -> bool:
-        """Whether the board was taken, the glass grasped, and held over the board."""
+        """True if the board was taken, the glass was grasped, and it was held over the board."""
         return self.handover.reached and self.grasp.reached and self.carry.reached
 
 
 class Observation(NamedTuple):
-    """The bench after a step: steps done, seconds since the script began (0 before), joints [rad,
-    rad/s], tool [m, m/s], hands, gripper.
+    """The bench after a step: number of steps, time since the script began [s] (0 before), joints
+    [rad, rad/s], tool [m, m/s], hands, gripper.
     """
 
     tick: int
@@ -71,7 +71,7 @@ class Observation(NamedTuple):
     tool: Pose
     tool_velocity: Floats
     hands: HandMotions
-    gripper: float  # how far it is closed, 0 to 1
+    gripper: float  # closure, 0 open to 1 closed
 
 
 class _Watch:
@@ -81,7 +81,7 @@ class _Watch:
         self.nearest, self.nearest_s, self.reached_s = math.inf, 0.0, math.nan
 
     def see(self, distance: float, time_s: float, *, counts: bool = True) -> bool:
-        """Take one distance [m]; true at the first one that is near enough."""
+        """Note a distance [m]; True at the first one within GRASP_DISTANCE that `counts`."""
         if distance < self.nearest:
             self.nearest, self.nearest_s = distance, time_s
         first = counts and distance <= GRASP_DISTANCE and math.isnan(self.reached_s)
@@ -97,8 +97,8 @@ class _Watch:
 
 
 class Bench:
-    """The arm at its posture with the board in its tool, the hands at the script's start, waiting
-    for `begin`.
+    """The bench, which waits for `begin` with the arm at its posture, the board in the tool, and
+    the hands at the script's start.
     """
 
     def __init__(
@@ -109,8 +109,8 @@ class Bench:
         posture: Floats | None = None,
         world: type[World] | None = None,
     ) -> None:
-        """`settings` name the arm and the rate (or else the shipped cell's). The arm begins at its
-        posture unless another is given. `world` is the physics, or else the first installed.
+        """`settings` has the arm and the rate (default: the shipped cell). The arm begins at its
+        posture unless another is given. `world` is the physics (default: the first installed).
         """
         self.script = script
         self.scene = script.scene
@@ -122,11 +122,11 @@ class Bench:
         self.world = (world or world_of())(self.scene, settings, posture=posture)
         self.tick = 0
         self._ticks_since_begin = 0
-        self._direction = 0  # of script time: 0 waiting, 1 forth, -1 back
+        self._direction = 0  # direction of script time: 0 waiting, 1 forward, -1 backward
         self._since_command = 0
-        self.refused = 0  # commands that did not begin where the arm stood, after a silence
+        self.refused = 0  # commands that after a silence did not begin at the standing arm
         self._still = 0
-        self._gripper: float | None = None  # as commanded; None: never, and what is near is grasped
+        self._gripper: float | None = None  # newest command; None without commands: near things are then grasped
         self._lay_out()
         self._observation = self._observe()
         self._still_at = self._observation.tool.position
@@ -141,66 +141,67 @@ class Bench:
         self.close()
 
     def _lay_out(self) -> None:
-        """Everything back to where a run begins."""
+        """Put everything at its place at the begin of a run."""
         scene, world = self.scene, self.world
         self._watches = (_Watch(), _Watch(), _Watch())
-        self.closed = 0  # events whose window is over
+        self.closed = 0  # number of events whose window is over
         world.put(world.glass, Pose(scene.glass, LEVEL))
         world.put(world.iron, Pose(scene.iron, LEVEL))
-        self._closure, self._closing = 1.0, 0  # of the fingers; 1 when they closed in this step, -1 when they opened
-        # What is held: by which holder, and how it lies in its hand.
+        self._closure, self._closing = (
+            1.0,
+            0,
+        )  # closure of the fingers; 1 if they closed in this step, -1 if they opened
+        # The held things, each with its holder and its pose in the holder's frame.
         self._held: dict[str, tuple[str, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
 
     def begin(self) -> None:
-        """Start the script: hands move from the next step on."""
+        """Begin the script: hands move from the next step on."""
         self._lay_out()
         self._ticks_since_begin, self._direction = 0, 1
 
     def turn_back(self) -> None:
-        """Let the hands go back the way they came, which keeps them where the skill knows the way;
-        then `begin` can follow.
-        """
+        """Move the hands back on their path, where the skill is certain, before another `begin`."""
         self._ticks_since_begin = min(self._ticks_since_begin, math.ceil(self.script.duration_s / self.period_s))
         self._direction = -1
 
     @property
     def time_s(self) -> float:
-        """Seconds of the script [s]; 0 before it begins."""
+        """Time of the script [s]; 0 before it begins."""
         return self._ticks_since_begin * self.period_s
 
     @property
     def finished(self) -> bool:
-        """Whether the script and the tail after it are over."""
+        """True once the script and the tail after it are over."""
         return self._direction == 1 and self.time_s >= self.script.duration_s + TAIL_S
 
     @property
     def waiting(self) -> bool:
-        """Whether the script has not begun."""
+        """True before the script begins."""
         return self._direction == 0
 
     @property
     def back(self) -> bool:
-        """Whether the hands have come back to their start."""
+        """True once the hands are back at their start."""
         return self._direction == -1 and self._ticks_since_begin == 0
 
     @property
     def still_s(self) -> float:
-        """For how long the tool has stayed within 5 mm [s]."""
+        """Time for which the tool has remained within 5 mm [s]."""
         return self._still * self.period_s
 
     def settled(self, waited_s: float) -> bool:
-        """Whether the arm, given so long, has come to rest where the hands want it."""
-        return waited_s >= SETTLE_S[1] or (waited_s >= SETTLE_S[0] and self.still_s >= STILL_S)
+        """True if the arm has settled, or has had the longest time to settle, after a time [s]."""
+        return waited_s >= SETTLE_RANGE_S[1] or (waited_s >= SETTLE_RANGE_S[0] and self.still_s >= SETTLED_STILL_S)
 
     def observe(self) -> Observation:
-        """What the last step left."""
+        """The observation of the last step."""
         return self._observation
 
     def step(
         self, position: Floats | None = None, velocity: Floats | None = None, *, gripper: float | None = None
     ) -> Observation:
-        """The bench one period later, after a command of its joints [rad, rad/s] and of its gripper
-        (0 open, 1 closed), or none. Until the first of the latter it grasps what is near.
+        """Advance by one period with a command of the joints [rad, rad/s] and of the gripper (0
+        open, 1 closed), or none. Before the first command of the gripper, it grasps near things.
         """
         self._follow(position, velocity)
         self._grip(gripper)
@@ -218,13 +219,13 @@ class Bench:
         return seen
 
     def _begins_here(self, position: Floats, velocity: Floats | None) -> bool:
-        """Whether a command is one to stand where the arm stands, as whoever takes over sends it.
+        """True for a command at the standing arm, which begins a new sequence.
 
-        What a network held back while it was cut comes all at once when it is mended, and would
-        throw the arm along a way that is long past.
+        After an interruption a network may deliver old commands at once, which would move the arm
+        along a past path.
         """
-        off = max(abs(told - is_at) for told, is_at in zip(position, self._observation.joints, strict=True))
-        return off <= REJOIN_RAD and max(map(abs, velocity or (0.0,))) <= REJOIN_RADPS
+        off = max(abs(aim - is_at) for aim, is_at in zip(position, self._observation.joints, strict=True))
+        return off <= STAND_RAD and max(map(abs, velocity or (0.0,))) <= STAND_RADPS
 
     def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
         alone = self._since_command * self.period_s >= REJOIN_AFTER_S
@@ -235,8 +236,9 @@ class Bench:
             self._command = (position, velocity or (0.0,) * len(position))
             self._since_command = 0
         else:
-            # Two clocks beat: a period without a command is ordinary, and the arm goes on as
-            # commanded until it is too long.
+            # The clocks of bench and daemon differ, so periods without a command are ordinary. The
+            # arm
+            # continues at the commanded velocity until BRAKE_AFTER_S.
             self._since_command += 1
             age_s = self._since_command * self.period_s
             if self._since_command == round(BRAKE_AFTER_S / self.period_s):
@@ -246,21 +248,21 @@ class Bench:
         self.world.follow(self._caught_up(position), self._command[1])
 
     def _caught_up(self, position: Floats) -> Floats:
-        """Where the motors go in this step.
+        """Target positions of the motors in this step.
 
-        A bench that a busy machine held up finds the commands far ahead. The servo of an arm never
-        sleeps: it would not leap after them, and this one does not either.
+        After a pause of a busy machine, the commands are far ahead. A real servo would not leap
+        after them, so the difference is limited.
         """
         at = self._observation.joints
-        behind = max(abs(told - is_at) for told, is_at in zip(position, at, strict=True))
+        behind = max(abs(aim - is_at) for aim, is_at in zip(position, at, strict=True))
         most = CATCH_UP_RADPS * self.period_s / POSITION_GAIN
         if behind <= most:
             return position
-        return tuple(is_at + most / behind * (told - is_at) for told, is_at in zip(position, at, strict=True))
+        return tuple(is_at + most / behind * (aim - is_at) for aim, is_at in zip(position, at, strict=True))
 
-    def _grip(self, told: float | None) -> None:
-        """Moves the fingers on toward the newest command."""
-        self._gripper = self._gripper if told is None else told
+    def _grip(self, command: float | None) -> None:
+        """Move the fingers toward the newest command."""
+        self._gripper = self._gripper if command is None else command
         if self._gripper is None:
             return
         before, most = self._closure, self.period_s / GRIP_S
@@ -274,7 +276,7 @@ class Bench:
         return Observation(self.tick, self.time_s, joints, velocities, tool, speed, hands, self._closure)
 
     def _handle(self, seen: Observation) -> None:
-        """Move the hands, and what anyone holds."""
+        """Move the hands and all held things."""
         world = self.world
         holders = {
             world.arm: seen.tool,
@@ -291,7 +293,7 @@ class Bench:
         self._held[thing] = (holder, seen_from(self._holders[holder], self.world.pose(thing)))
 
     def _watch(self, seen: Observation) -> None:
-        """Let the events happen, by nearness in the rests after the motions."""
+        """Detect the events, by the distances in the rests after the motions."""
         world, scene = self.world, self.scene
         script_s = self.script.clock.at(seen.time_s)[0]
         tool = np.array(seen.tool.position)
@@ -317,8 +319,8 @@ class Bench:
         self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
 
     def things(self) -> tuple[SceneObject, ...]:
-        """What lies on the bench or is held, as viewers draw it: what the arm holds in the frame of
-        its plate, all else in base.
+        """The things on the bench as viewers draw them: those that the arm holds in the frame of
+        its plate, all others in `base`.
         """
         found = []
         for name, look in self.world.things.items():
@@ -334,7 +336,7 @@ class Bench:
         return [thing for thing, (holder, _) in self._held.items() if holder == self.world.arm]
 
     def _let_go(self, seen: Observation, offered: float) -> None:
-        """What the fingers held goes to the hand that it is offered to, or falls on the table."""
+        """Give the held things to the hand that they are offered to, or drop them on the table."""
         world = self.world
         for thing in self._held_by_arm():
             if thing == world.board and self._watches[0].see(offered, seen.time_s):
@@ -345,9 +347,7 @@ class Bench:
                 world.put(thing, Pose((x, y, 0.0), LEVEL))
 
     def events(self) -> TaskEvents:
-        """How the run went, so far as it went: an event that was not watched yet has an infinite
-        distance.
-        """
+        """The results of the events; an event before its window has an infinite distance."""
         return TaskEvents(*(watch.event() for watch in self._watches))
 
     def close(self) -> None:

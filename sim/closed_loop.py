@@ -1,8 +1,8 @@
-"""Bench and core in step, faster than real time: the one source of ticks for the golden session,
-rehearsals and tests.
+"""Bench and core in closed loop, faster than real time, for the golden session, experiments and
+tests.
 
-The core follows what the bench's hands and arm say, the bench follows the core's newest frame, as
-on the network.
+The core gets the samples of the bench's hands and arm, and the bench follows the core's newest
+frame, as over the network.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from service.core.skill.pose import CLOSED, UNKNOWN
 if TYPE_CHECKING:
     from sim.bench import Bench
 
-HANDS_HZ = 100  # also of the joint states
-START_NS = 1_000_000_000_000  # stamps begin there: 0 would mean that there is none
+HANDS_HZ = 100  # rate of hands and joint states
+START_NS = 1_000_000_000_000  # first stamp; 0 would mean no stamp
 
 
 def hand_event(side: str, position: Vector3, stamp_ns: int, orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)) -> Event:
@@ -38,13 +38,13 @@ def joints_event(
 
 
 def begin_when_settled(bench: Bench) -> None:
-    """Lets the script begin once, when the arm has come to rest where the hands want it."""
+    """Begin the script once the arm has settled."""
     if bench.waiting and bench.settled(bench.tick * bench.period_s):
         bench.begin()
 
 
 class ClosedLoop:
-    """A bench whose ticks follow from the frames that `follow` is shown, one for each tick."""
+    """A bench that makes ticks for the core, and gets the frame of each tick by `follow`."""
 
     def __init__(
         self,
@@ -53,18 +53,18 @@ class ClosedLoop:
         direct: Callable[[Bench], None] = begin_when_settled,
         spoil: Callable[[Event], tuple[Event, ...]] = lambda event: (event,),
     ) -> None:
-        """`direct` starts and turns the script before each step, `spoil` says what becomes of each
-        hand's sample.
+        """`direct` is called before each step and starts and turns the script. `spoil` returns the
+        events that replace a sample of a hand.
         """
         self._bench, self._direct, self._spoil = bench, direct, spoil
         self._newest: Frame | None = None
 
     def follow(self, tick: Tick, frame: Frame) -> None:
-        """Has the arm follow a frame with the next step."""
+        """Let the arm follow a frame in the next step."""
         self._newest = frame
 
     def ticks(self) -> Iterator[Tick]:
-        """A tick for each period, until the script is over."""
+        """A tick for each period until the script is over."""
         bench = self._bench
         every = max(1, round(1 / (HANDS_HZ * bench.period_s)))
         while True:

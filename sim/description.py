@@ -1,4 +1,4 @@
-"""The arm's URDF as the engines read it."""
+"""The arm's URDF in a form for the physics engines."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from service.settings.config import Settings, robot_description
 from service.settings.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-UNKNOWN_KG = "1"  # of a link that a joint moves and of which the URDF does not say a mass: engines move none without
+UNKNOWN_KG = "1"  # mass of moving links without one in the URDF, because engines move no link without a mass
 UNKNOWN_INERTIA = {**NO_INERTIA, "ixx": "0.01", "iyy": "0.01", "izz": "0.01"}  # [kg m²]
-SHORTEST = 1e-3  # [m] of a capsule's axis; without one it is a sphere
+SHORTEST = 1e-3  # [m] a capsule with a shorter axis becomes a sphere
 
 
 def simulated(settings: Settings, **compiler: str) -> str:
-    """The arm's URDF, in which what is no joint of the chain is fixed.
+    """The arm's URDF, in which all joints outside the chain are fixed.
 
-    An arm of meshes, whose files no engine would find, is of the capsules by which the service
-    keeps its distances. `compiler` are settings of MuJoCo's.
+    Meshes, whose files the engines would not find, are replaced by the capsules that the service
+    uses for distances. `compiler` has settings of MuJoCo.
     """
     text, names = robot_description(settings), settings.joints.names
     robot, urdf = ElementTree.fromstring(text), Urdf(text)
@@ -33,7 +33,7 @@ def simulated(settings: Settings, **compiler: str) -> str:
         if not _is_massive(link):
             for without in link.findall("inertial"):
                 link.remove(without)
-            inertial = SubElement(link, "inertial")  # without one PyBullet gives 1 kg to mere frames, too
+            inertial = SubElement(link, "inertial")  # without it, PyBullet gives 1 kg also to links without a body
             SubElement(inertial, "mass", value=UNKNOWN_KG if name in driven else "0")
             SubElement(inertial, "inertia", UNKNOWN_INERTIA if name in driven else NO_INERTIA)
     if robot.find(".//mesh") is not None:
@@ -51,13 +51,13 @@ def simulated(settings: Settings, **compiler: str) -> str:
 
 
 def _is_massive(link: Element) -> bool:
-    """True if a link has a mass and moments of inertia."""
+    """True if a link has a mass above 0 and moments of inertia."""
     mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
     return mass is not None and inertia is not None and float(mass.get("value", "0")) > 0.0
 
 
 def _cover(link: Element, ends: list[list[float]], radius: float) -> None:
-    """Gives a link a capsule between two ends [m], to be seen and to touch."""
+    """Give a link a visible and colliding capsule between two ends [m]."""
     start, end = ends
     (x, y, z), middle = (end[i] - start[i] for i in range(3)), [(start[i] + end[i]) / 2 for i in range(3)]
     for use in ("visual", "collision"):

@@ -1,4 +1,4 @@
-"""Which physics the bench runs on: those that are installed, PyBullet before MuJoCo."""
+"""The choice of the bench's physics engine: PyBullet if it is installed, else MuJoCo."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from sim.world import World
 
 
 def world_of(engine: str | None = None) -> type[World]:
-    """The world of an engine, or of the first that is installed. Raises LaunchError."""
+    """The world of an engine, by default of the first installed one. Raises LaunchError."""
     if engine_of(engine) == "pybullet":
         from sim.pybullet_world import PyBulletWorld
 

@@ -1,5 +1,5 @@
-"""A whole cell to be broken: service, scribe, skill worker, tracker and network as processes, the
-bench's arm in real time, and what they did when something of it failed.
+"""A complete cell for fault injection: service, scribe, skill worker, tracker and network as
+processes, the bench's arm in real time, and the times of each fault.
 
 with FaultyCell(folder) as cell:
     event = cell.suffer("tracker killed", Fault(lambda cell: cell.tracker.send(SIGKILL), ...))
@@ -25,29 +25,29 @@ from service.daemon.launch import Launched, launched
 from service.settings.config import Settings
 from sim.bench import Bench
 from sim.network import Bridge, Live
-from sim.parts import Link, Part, as_usual_afterwards, before_others
+from sim.parts import CELL, CellPart, Link, as_usual_afterwards, before_others
 from sim.scene import Scene
 from sim.script import HandScript
 
-FAST, MOVES = 0.5, 0.05  # [m/s] of the tool: when a fault strikes, and when it goes on after one
-WATCHED_S = 1.0  # after a fault, before it is mended
-STEADY_S = 1.5  # it has followed before a fault strikes
+FAST = 0.5  # [m/s] a fault strikes while the tool is faster
+MOVES = 0.05  # [m/s] after a fault the tool moves again from this speed on
+WATCHED_S = 1.0  # default time from a fault to its repair
+STEADY_S = 1.5  # the arm follows for this time before a fault strikes
 RESUMES_WITHIN_S = 60.0
-SWING_S = 5.0  # longer than the hands take to and fro
-CELL = "thirdhand"
+SWING_TIMEOUT_S = 5.0  # longer than a period of the hands' swing
 
 
 Network = Literal["relays", "router", "link"]
-Command = tuple[float, int, bytes]  # when it left the service (time.monotonic() [s]), its tick, its bytes
+Command = tuple[float, int, bytes]  # time of leaving the service (time.monotonic() [s]), tick, bytes
 
 
 class FaultError(RuntimeError):
-    """A cell that did not do what a row of the table needs; the message says what."""
+    """A cell did not reach a required state; the message has the state."""
 
 
-class Event(NamedTuple):
-    """When a fault struck, when it was mended, when the tool moved again and when the watch ended
-    (time.monotonic() [s]); the tick at which it struck; ticks counted as lost meanwhile.
+class FaultTimes(NamedTuple):
+    """The times of a fault, of its repair, of the tool's next motion, and of the end of observation
+    (time.monotonic() [s]), the tick of the fault, and the number of lost ticks.
     """
 
     fault: str
@@ -61,8 +61,8 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Fault:
-    """How something is broken and mended, in a cell over which network; after it the arm `stops`,
-    or else goes on.
+    """A fault: its injection, its repair, True if the arm `stops`, the kind of network, and the
+    time from injection to repair [s].
     """
 
     provoke: Callable[[FaultyCell], None]
@@ -74,7 +74,9 @@ class Fault:
 
 @dataclass
 class _Arm:
-    """The bench's arm on the network: follows commands and tells its joints, on a thread."""
+    """The bench's arm on the network, which follows commands and publishes its joints on a
+    thread.
+    """
 
     endpoint: str
     settings: Settings
@@ -101,11 +103,11 @@ class _Arm:
 
     @property
     def speed(self) -> float:
-        """Of the tool now [m/s]."""
+        """Present speed of the tool [m/s]."""
         return self.steps[-1][4] if self.steps else 0.0
 
     def close(self) -> None:
-        """Ends it."""
+        """End the thread."""
         self._end.set()
         self._thread.join()
 
@@ -113,15 +115,15 @@ class _Arm:
 class FaultyCell:
     """A running cell whose tool swings to and fro, with its files in `folder`.
 
-    Tracker and arm reach the service each over a relay of its own, both over one router, or over a
-    cable that leads to a network namespace. Raises FaultError, LaunchError and PartError.
+    Tracker and arm reach the service each over its own relay, both over one router, or over a
+    virtual cable to a network namespace. Raises FaultError, LaunchError and PartError.
     """
 
     def __init__(self, folder: Path, *, network: Network = "relays", settings: Settings | None = None) -> None:
         self.settings = settings or Settings()
         self.folder, self.records, self.network = folder, folder / "records", network
-        self.commands: list[Command] = []  # of the service's first life
-        self.unasked = 0  # faults that nobody struck: a machine that is busy
+        self.commands: list[Command] = []  # commands of the service before its first restart
+        self.unasked = 0  # number of faults that were not injected, caused by a busy machine
         self._parts = contextlib.ExitStack()
         self._life = contextlib.ExitStack()
         self._lives = 0
@@ -140,7 +142,8 @@ class FaultyCell:
                 to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
             else:
                 to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
-            # the operator is at the service itself, so that what left it is known whatever is cut
+            # The operator connects to the service directly, to observe commands during network
+            # faults.
             with as_usual_afterwards():
                 self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
@@ -155,11 +158,11 @@ class FaultyCell:
         self._parts.close()
 
     @staticmethod
-    def _part(parts: contextlib.ExitStack, *arguments: str) -> Part:
-        return parts.enter_context(contextlib.closing(Part(*arguments)))
+    def _part(parts: contextlib.ExitStack, *arguments: str) -> CellPart:
+        return parts.enter_context(contextlib.closing(CellPart(*arguments)))
 
     def begin_service(self) -> None:
-        """Begins the service, where it was if it has been."""
+        """Start the service, at its earlier endpoint if it ran before."""
         listen = f"tcp/{Link.ADDRESS if self.network == 'link' else '127.0.0.1'}:0"
         if self._lives:
             listen = self.service.endpoint
@@ -177,7 +180,7 @@ class FaultyCell:
         )
 
     def _listen(self) -> None:
-        """Keeps every command that leaves the service."""
+        """Store every command that leaves the service."""
 
         def keep(sample: zenoh.Sample) -> None:
             if self._lives == 1 and sample.attachment is not None:
@@ -195,7 +198,7 @@ class FaultyCell:
         raise FaultError(f"no {what} was found among the children of the service")
 
     def until(self, what: Callable[[], bool], said: str, within_s: float = RESUMES_WITHIN_S) -> float:
-        """When something came to hold [s]. Raises FaultError where it does not."""
+        """Wait for a condition and return the time at which it held [s]. Raises FaultError."""
         end = time.monotonic() + within_s
         while not what():
             if time.monotonic() > end:
@@ -204,19 +207,21 @@ class FaultyCell:
         return time.monotonic()
 
     def until_fast(self, speed: float = FAST) -> float:
-        """When the tool came to be as fast [s]; a fault that nobody struck is counted and reset."""
+        """Wait until the tool is faster than `speed` and return the time [s]. Faults that were not
+        injected are counted and reset.
+        """
         end = time.monotonic() + RESUMES_WITHIN_S
         while time.monotonic() < end:
             with contextlib.suppress(FaultError, UnreachableError):
-                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_S)
+                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_TIMEOUT_S)
             with contextlib.suppress(UnreachableError):
                 if self.client.status().mode == "fault":
                     self.unasked += 1
                     self.client.reset()
         raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
 
-    def suffer(self, name: str, fault: Fault) -> Event:
-        """What came of a fault that strikes while the tool is fast, and of mending it."""
+    def suffer(self, name: str, fault: Fault) -> FaultTimes:
+        """Inject a fault while the tool is fast, repair it, and return the times."""
         time.sleep(STEADY_S)
         self.until_fast()
         lost = self.client.status().scribe["lost"]
@@ -229,8 +234,8 @@ class FaultyCell:
         fault.mend(self)
         moving = self.until_fast(MOVES)
         lost = self.client.status().scribe["lost"] - lost
-        return Event(name, struck, mended, moving, time.monotonic(), tick, lost)
+        return FaultTimes(name, struck, mended, moving, time.monotonic(), tick, lost)
 
     def close(self) -> int:
-        """The exit code of the service, asked to end."""
+        """End the service and return its exit code."""
         return self.service.stop()

@@ -1,8 +1,8 @@
-"""`python -m sim.golden`: the golden session, about 20 s in process with everything in it that the
-core has to cope with.
+"""`python -m sim.golden`: the golden session, 20 s in one process with everything that the core
+must handle.
 
-Made anew it is a new session; with `--refresh` its ticks are kept and only the frames are computed
-again, for a change of behaviour that is meant.
+Without options it makes a new session. With `--refresh` it keeps the ticks and computes the frames
+again, after an intended change of behaviour.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.cli.usage import option
 from service.contract import cdr
 from service.contract.explain import in_words
 from service.contract.requests import TOLERANCE_M
@@ -36,31 +37,31 @@ from sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript
 
-WHOLE_EVERY = 500  # ticks: of all other frames a checksum is kept
-# Resolutions of a tracker and of joint encoders [m, rad, rad/s]: finer noise would fill the file.
-TRACKED, ENCODED, ENCODED_SPEED = 2.0**-15, 2.0**-14, 2.0**-10
-SECONDS = 20.0
-MOVED = Scene(handover=(0.66, -0.22, 0.33))
-# What happens when [s].
-TEACH_S, BEGIN_S, DROPOUT_S, HOLD_S, BAD_S, AWAY_S, RETEACH_S = (
-    0.5,
-    2.0,
-    (6.5, 7.0),
-    (9.0, 9.6),
-    (10.0, 10.5),
-    (13.2, 13.8),
-    14.5,
-)
+WHOLE_EVERY = 500  # [ticks] interval of whole frames; the others have a checksum
+# Resolutions of tracker [m] and joint encoders [rad, rad/s]: finer noise would enlarge the file.
+TRACKED = 2.0**-15
+ENCODED = 2.0**-14
+ENCODED_SPEED = 2.0**-10
+SESSION_S = 20.0
+MOVED_SCENE = Scene(handover=(0.66, -0.22, 0.33))
+# Times of the session's events, or their begins and ends.
+TEACH_S = 0.5  # the via-points of the scene are taught
+BEGIN_S = 2.0  # the script begins
+DROPOUT_S = (6.5, 7.0)  # the left hand is out of sight
+HOLD_S = (9.0, 9.6)  # the operator holds and resumes
+BAD_S = (10.0, 10.5)  # each sample of the left hand follows an invalid one
+AWAY_S = (13.2, 13.8)  # the left hand is far away from the demonstrations
+RETEACH_S = 14.5  # a moved handover is taught
 
 
-class Session:
-    """The golden session: a bench in closed loop with all that happens to it, at its times."""
+class GoldenSession:
+    """The golden session: a bench in closed loop, with events at fixed times."""
 
     def __init__(self, bench: Bench, skill: StoredSkill) -> None:
         self._bench = bench
         self._adopted = {
             self._tick(TEACH_S): adapted(skill, bench.scene.via_points(), tolerance=TOLERANCE_M),
-            self._tick(RETEACH_S): adapted(skill, MOVED.via_points(), tolerance=TOLERANCE_M),
+            self._tick(RETEACH_S): adapted(skill, MOVED_SCENE.via_points(), tolerance=TOLERANCE_M),
         }
         self._orders = {self._tick(HOLD_S[0]): "hold", self._tick(HOLD_S[1]): "resume"}
         self.loop = ClosedLoop(bench, direct=self._direct, spoil=self._spoil)
@@ -69,9 +70,9 @@ class Session:
         return round(t / self._bench.period_s)
 
     def ticks(self) -> Iterator[Tick]:
-        """The ticks of the session; now and then deadlines are missed."""
+        """The ticks of the session, with some missed deadlines."""
         jump = 0
-        for tick in itertools.islice(self.loop.ticks(), self._tick(SECONDS)):
+        for tick in itertools.islice(self.loop.ticks(), self._tick(SESSION_S)):
             events, k = [_as_measured(event) for event in tick.inbox], tick.index
             if k in self._adopted:
                 events.append(Event("skill", self._adopted[k].file, self._adopted[k].for_loop()))
@@ -88,7 +89,7 @@ class Session:
             bench.turn_back()
 
     def _spoil(self, event: Event) -> tuple[Event, ...]:
-        """The left hand is missing, spoilt or far away in parts of the session."""
+        """Remove, spoil or displace samples of the left hand in parts of the session."""
         pose, t = event.value, self._bench.tick * self._bench.period_s
         if event.kind != "hands/left":
             return (event,)
@@ -110,7 +111,7 @@ class Session:
 
 
 def _as_measured(event: Event) -> Event:
-    """A sample to the resolution of what measures it."""
+    """A sample, rounded to the resolution of its sensor."""
     was = event.value
     if event.kind == "joints/state":
         position, velocity = _rounded(was.position, ENCODED), _rounded(was.velocity, ENCODED_SPEED)
@@ -131,8 +132,8 @@ def record(
     *,
     follow: Tap = lambda tick, frame: None,
 ) -> list[Frame]:
-    """The frames of the core run on ticks, which are shown to `follow` and recorded with a checksum
-    of each frame and command, and with every 500th frame as a whole.
+    """Run the core on ticks, record them with checksums of frames and commands and every 500th
+    frame as a whole, and return the frames. `follow` is called with each tick and frame.
     """
     steps: list[tuple[Tick, Frame]] = []
     checksums: dict[int, int] = {}
@@ -160,21 +161,21 @@ def _time_ns(tick: Tick, settings: Settings) -> int:
 
 
 def make(path: Path, skill: StoredSkill) -> None:
-    """Writes a new golden session."""
+    """Write a new golden session."""
     settings, scene = Settings(), Scene()
     with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
-        session = Session(bench, skill)
+        session = GoldenSession(bench, skill)
         record(path, settings, skill, session.ticks(), follow=session.loop.follow)
 
 
 def refresh(path: Path) -> dict[str, float]:
-    """Computes the frames of a golden session anew from its ticks; in how many ticks something
-    changed, and the largest change in each field of the frames that are kept as a whole.
+    """Compute the frames of a golden session again from its ticks. Returns the number of changed
+    ticks, and the largest change in each field of the frames that are recorded as a whole.
     """
     old = Recording.open(path)
     try:
         before = [step.frame for step in old.steps(whole=False) if step.frame is not None]
-    except RecordingError:  # frames or states had another layout then: there is nothing to compare with
+    except RecordingError:  # frames or states had another layout, and cannot be compared
         before = []
     beside = path.with_suffix(".new")
     frames = record(beside, old.settings, decoded(old.skill, origin=str(path), recorded=True), ticks(old))
@@ -190,33 +191,18 @@ def refresh(path: Path) -> dict[str, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Make or refresh the golden session; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.golden",
-        description="The golden session: what every later version must decide alike.",
+        description="The golden session: every later version must decide the same in it.",
         epilog="example:\n  python -m sim.golden --output recordings/golden.mcap --skill recordings/soldering.npz\n"
         "  python -m sim.golden --refresh",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "--output",
-        metavar="FILE",
-        type=Path,
-        default=Path("recordings/golden.mcap"),
-        help="the recording (default: %(default)s)",
-    )
-    p.add_argument(
-        "--skill",
-        metavar="FILE",
-        type=Path,
-        default=Path("recordings/soldering.npz"),
-        help="the skill (default: %(default)s)",
-    )
-    p.add_argument(
-        "--refresh",
-        action="store_true",
-        help="keep the ticks, compute the frames anew, print how many and the largest change per field",
-    )
+    option(p, "--output", "FILE", "the recording", Path("recordings/golden.mcap"))
+    option(p, "--skill", "FILE", "the skill", Path("recordings/soldering.npz"))
+    about = "keep the ticks, compute the frames again, print the number of changed ticks and the largest changes"
+    p.add_argument("--refresh", action="store_true", help=about)
     args = p.parse_args(arguments)
     try:
         if args.refresh:

@@ -1,9 +1,8 @@
-"""Made tasks that are not soldering: demonstrations of a dozen kinds of task by modelled people, in
-scenes whose places lie differently in each take. NumPy and SciPy only, each from its numbers alone.
+"""Synthetic tasks other than soldering: demonstrations of a dozen kinds of task by modelled people,
+in scenes with different places in each take. Each depends only on its numbers.
 
-A task is a list of stages: where both hands are, and where the tool is then. A person's hands go
-from one to the next, and a teacher leads the tool as the hand that is behind has come, a little
-late.
+A task is a list of stages with positions of both hands and of the tool. A person's hands move from
+stage to stage, and a teacher leads the tool by the progress of the slower hand, with a small delay.
 """
 
 from __future__ import annotations
@@ -21,63 +20,68 @@ from scipy.spatial.transform import Rotation
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.settings.config import Reach
-from sim.people import PROJECT_SEED, SEEDS, Person, person
+from sim.people import GROUP_SEEDS, PROJECT_SEED, Person, person
 from sim.scene import TOOL_ORIENTATION
 from sim.script import Array
 from sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
-KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
-TAUGHT = "visits"  # what the tutorial teaches; no experiment counts it
-RATE_HZ = 50
-REST_S, LAST_S = 1.2, 1.6  # before the first motion, after the last
-AHEAD_S = 2.0
-MOVED_M = (0.05, 0.10)  # least and most deviation of a scene's places; half as much up and down
-TOLD_M, TOOL_SCATTER_M, TOOL_NOISE_M = 0.004, 0.0025, 0.0005  # 3-D rms; of each axis
-HAND_OFF_M = (0.005, 0.010)  # by which a person's hand always stops off its places
-HAND_SCATTER_M = 0.002  # of that, each axis, each take
-LATE_S = (0.05, 0.35)  # the teacher's reaction
-NOISE_M = (0.001, 0.002)  # of a tracker, each axis; 1.5 mm in the mean
-TURNS_RAD = (0.6, 0.15, 0.15)  # deviations of what a hand carries: yaw, pitch, roll
-GRIP_RAD, TURN_NOISE_RAD = 0.03, 0.01
-CARRIED_M = (-0.10, 0.0, 0.12)  # the tool, seen from the hand that it is fixed to or goes beside
-CURVE_M = 0.07  # how far the path that the tool follows sways to either side
-ARC_M = 0.04  # that the tool gains on its way
-SMOOTHED_S = 0.08  # of the teacher's hand
-PAUSES, STRAYS = 0.12, 0.15  # how probable a hand does so in a leg
-MARGIN_M = 0.05  # of the tool's places inside the arm's reach
-LEAST_WAY_M = 0.10  # of a hand or tool from one place to the next
+TASK_KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
+TAUGHT = "visits"  # the task of the tutorial, which no experiment uses
+TAKE_HZ = 50
+START_REST_S = 1.2  # rest before the first motion
+END_REST_S = 1.6  # rest after the last motion
+LEAD_S = 2.0  # in the task "ahead", the left hand is this far ahead of the right one
+MOVED_M = (0.05, 0.10)  # range of the standard deviation of a scene's places; half of it vertically
+PERCEIVED_M = 0.004  # error of perceived places, 3-D rms
+TOOL_SCATTER_M = 0.0025  # standard deviation of the tool's places per axis
+TOOL_NOISE_M = 0.0005  # noise of the measured tool per axis
+HAND_OFF_M = (0.005, 0.010)  # range of a person's constant offset from a place
+HAND_SCATTER_M = 0.002  # standard deviation of that offset in each axis and take
+REACTION_S = (0.05, 0.35)  # range of the teacher's delay
+TRACKER_NOISE_M = (0.001, 0.002)  # range of a tracker's noise in each axis, mean 1.5 mm
+TURNS_RAD = (0.6, 0.15, 0.15)  # standard deviations of yaw, pitch and roll of a carried thing
+GRIP_RAD = 0.03  # standard deviation of a person's grip
+TURN_NOISE_RAD = 0.01  # noise of measured orientations
+CARRIED_M = (-0.10, 0.0, 0.12)  # position of the tool relative to the hand that carries or leads it
+CURVE_M = 0.07  # the path that the tool follows sways by this to both sides
+ARC_M = 0.04  # the tool's height gain in the middle of a motion
+TEACHER_SMOOTHING_S = 0.08  # standard deviation of the filter over the teacher's progress
+PAUSES = 0.12  # probability that a hand pauses in a leg
+STRAYS = 0.15  # probability that a hand strays before a leg
+TOOL_MARGIN_M = 0.05  # the tool's places are this far inside the arm's reach
+LEAST_WAY_M = 0.10  # successive places of a hand or tool are at least this far apart
 HANDS_BOX = np.array([[[0.55, -0.42, 0.07], [0.95, -0.02, 0.25]], [[0.55, 0.02, 0.07], [0.95, 0.42, 0.25]]])
 CARRYING_BOX = np.array([[0.55, -0.30, 0.07], [0.70, 0.05, 0.18]])
 TOOL_BOX = np.array([[0.35, -0.36, 0.15], [0.60, 0.36, 0.40]])
-FARTHEST = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # of a hand
-RESTS = np.array([[0.52, -0.05, 0.04], [1.00, 0.50, 0.20]])  # of a right hand that has nothing to do
+HAND_BOX = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # limits of a hand's places
+RESTS = np.array([[0.52, -0.05, 0.04], [1.00, 0.50, 0.20]])  # limits of an idle right hand's place
 
 
 class Take(NamedTuple):
-    """Whose demonstration it is, and the demonstration."""
+    """A demonstration and the number of its person."""
 
     person: int
     demonstration: Demonstration
 
 
 class Plan(NamedTuple):
-    """A task: of each stage its name and which of the places of left hand, right hand and tool it
-    is at; how much the tool goes with the left hand there; and how hands and tool go.
+    """A task: the names of its stages, the indices of their places of left hand, right hand and
+    tool, and the motion of hands and tool.
     """
 
     names: tuple[str, ...]
-    stages: Array  # (N, 3) of int
-    follow: Array  # (N,) 0 or 1
-    left_leads: bool = False  # the tool heeds the left hand alone
-    carried: bool = False  # the tool is fixed to what the left hand carries
-    curved: int = -1  # the stage from which the left hand goes a curve
-    ahead_s: float = 0.0
-    dwells: tuple[float, float] = (0.7, 1.6)
-    pauses: float = PAUSES  # how probable it is that a hand pauses in a leg, or both after it
+    stages: Array  # (N, 3) indices of places, int
+    follow: Array  # (N,) 1 where the tool moves with the left hand, else 0
+    left_leads: bool = False  # True if the tool ignores the right hand
+    carried: bool = False  # True if the tool is fixed to the thing that the left hand carries
+    curved: int = -1  # the stage after which the left hand moves on a curve
+    ahead_s: float = 0.0  # lead of the left hand
+    dwells: tuple[float, float] = (0.7, 1.6)  # [s] range of the rests at places
+    pauses: float = PAUSES  # probability that a hand pauses in a leg, or both hands after it
 
 
 def plan(kind: str) -> Plan:
-    """The task of one of KINDS."""
+    """The task of one of TASK_KINDS. Raises ValueError for others."""
     once = {"three": 3, "six": 6, "twelve": 12, "loose": 6, "ahead": 3, "heading": 3, "long": 24}
     if kind in once:
         count = once[kind]
@@ -94,7 +98,7 @@ def plan(kind: str) -> Plan:
     elif kind == "one_hand":
         names, stages = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
     else:
-        raise ValueError(f"{kind!r}: no kind of made task; there are {', '.join(KINDS)}")
+        raise ValueError(f"{kind!r}: no kind of synthetic task; {', '.join(TASK_KINDS)} accepted")
     follow = {"path": [0.0, 1.0, 1.0], "heading": [1.0] * 3}.get(kind, [0.0] * len(names))
     return Plan(
         names,
@@ -103,15 +107,15 @@ def plan(kind: str) -> Plan:
         left_leads=kind in ("path", "heading", "one_hand"),
         carried=kind == "heading",
         curved=1 if kind == "path" else -1,
-        ahead_s=AHEAD_S if kind == "ahead" else 0.0,
+        ahead_s=LEAD_S if kind == "ahead" else 0.0,
         dwells={"long": (4.5, 7.0), TAUGHT: (0.7, 1.1)}.get(kind, (0.7, 1.6)),
-        pauses=0.0 if kind == TAUGHT else PAUSES,  # live, a rest ends the take
+        pauses=0.0 if kind == TAUGHT else PAUSES,  # in the tutorial a rest ends the take
     )
 
 
-class Scene(NamedTuple):
-    """Where hands and tool are at each stage (N, 3) [m], and how what the left hand carries is
-    turned (N, 3): yaw, pitch and roll [rad].
+class TaskScene(NamedTuple):
+    """The positions of hands and tool at each stage (N, 3) [m], and yaw, pitch and roll of the
+    thing that the left hand carries (N, 3) [rad].
     """
 
     left: Array
@@ -121,24 +125,24 @@ class Scene(NamedTuple):
 
 
 def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list[Take]:
-    """So many demonstrations of each of these people, one every five minutes; another `seed` is
+    """`each` demonstrations of each of these people, one every five minutes. Another `seed` gives
     another task of the same kind.
 
-    Raises ValueError for what is not one of KINDS.
+    Raises ValueError for a kind outside TASK_KINDS.
     """
     return [Take(who, run(kind, who, number, seed=seed).demonstration()) for who in people for number in range(each)]
 
 
-def run(kind: str, who: int, number: int, *, seed: int = 0, scene: Scene | None = None) -> Run:
-    """How a person does a task once, in a scene of its own if none is given."""
+def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | None = None) -> Run:
+    """A person's run of a task, in a scene of its own if none is given."""
     task = plan(kind)
-    key = (PROJECT_SEED, SEEDS["made"], (*KINDS, TAUGHT).index(kind), seed, who, number + 1)
+    key = (PROJECT_SEED, GROUP_SEEDS["made"], (*TASK_KINDS, TAUGHT).index(kind), seed, who, number + 1)
     random = np.random.default_rng(key)
     habits = person("made", who)
     habits = habits._replace(tremor=0.4 * habits.tremor, lead_s=task.ahead_s or 0.2 * habits.lead_s)
     scene = scene or _moved(task, _usual(kind, seed), random)
     right_rests = _within(RESTS, random)
-    if kind == "one_hand":  # where it rests says nothing
+    if kind == "one_hand":  # the place of the idle hand carries no information
         scene = scene._replace(right=np.tile(right_rests, (len(task.names), 1)))
     order = _order(len(task.names), random) if kind == "loose" else [(i, False) for i in range(len(task.names))]
     return Run(
@@ -148,36 +152,36 @@ def run(kind: str, who: int, number: int, *, seed: int = 0, scene: Scene | None 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A person's way through a task."""
+    """A person's run of a task."""
 
     task: Plan
-    scene: Scene
+    scene: TaskScene
     habits: Person
     number: int
-    order: tuple[int, ...]  # of the stages
+    order: tuple[int, ...]  # the stages in the order of the run
     key: tuple[int, ...]
     legs: tuple[tuple[Leg, ...], tuple[Leg, ...]]
 
     @property
     def lasts_s(self) -> float:
-        """From begin to end."""
-        return max(legs[-1].begin_s + legs[-1].lasts_s for legs in self.legs) + LAST_S
+        """Duration [s]."""
+        return max(legs[-1].begin_s + legs[-1].lasts_s for legs in self.legs) + END_REST_S
 
     def hands(self, times: Array) -> Array:
-        """Both hands (T, 6) [m] as they are."""
+        """True positions of both hands (T, 6) [m]."""
         sway, tremor = restless(self.habits, self.key, times)
         return np.hstack([along(legs, times)[0] for legs in self.legs]) + sway + tremor
 
     def tool(self, times: Array) -> tuple[Array, Array]:
-        """The tool (T, 3) [m] at evenly spaced times as the teacher leads it, and how what the left
-        hand carries was turned then (T, 3).
+        """Positions of the tool (T, 3) [m] at evenly spaced times as the teacher leads it, and yaw,
+        pitch and roll of the carried thing (T, 3) [rad].
         """
         random = np.random.default_rng([*self.key, 3])
-        late = times - random.uniform(*LATE_S)
+        late = times - random.uniform(*REACTION_S)
         (left, by_left), (_, by_right) = (along(legs, late) for legs in self.legs)
         rate_hz = 1.0 / float(times[1] - times[0])
         progress = by_left if self.task.left_leads else np.minimum(by_left, by_right)
-        progress = gaussian_filter1d(progress, SMOOTHED_S * rate_hz, mode="nearest")
+        progress = gaussian_filter1d(progress, TEACHER_SMOOTHING_S * rate_hz, mode="nearest")
         order = np.array(self.order)
         nodes = np.arange(len(order))
 
@@ -195,12 +199,12 @@ class Run:
         return between(self.scene.tool + scatter) + arc * (1.0 - follow) + beside, turns
 
     def demonstration(self) -> Demonstration:
-        """What a tracker and the arm make of it, with the places as they are perceived."""
+        """The run as measured by a tracker and the arm, with the places as perceived."""
         random = np.random.default_rng([*self.key, 4])
         habit = np.random.default_rng([*self.key[:2], self.number])
-        steps = np.arange(int(self.lasts_s * RATE_HZ))
-        times, count = steps / RATE_HZ, len(steps)
-        hands = self.hands(times) + habit.uniform(*NOISE_M) * random.standard_normal((count, 6))
+        steps = np.arange(int(self.lasts_s * TAKE_HZ))
+        times, count = steps / TAKE_HZ, len(steps)
+        hands = self.hands(times) + habit.uniform(*TRACKER_NOISE_M) * random.standard_normal((count, 6))
         tool, late = self.tool(times)
         (_, by_left), _ = (along(legs, times) for legs in self.legs)
         nodes = np.arange(len(self.order))
@@ -212,18 +216,18 @@ class Run:
         usual = Rotation.from_quat(TOOL_ORIENTATION)
         turned = Rotation.from_euler("ZYX", late) * usual if self.task.carried else usual
         return Demonstration(
-            steps * (1_000_000_000 // RATE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
+            steps * (1_000_000_000 // TAKE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
             np.hstack([hands[:, :3], _quaternions(left, count)]),
             np.hstack([hands[:, 3:], _quaternions(right, count)]),
             np.hstack([tool + TOOL_NOISE_M * random.standard_normal(tool.shape), _quaternions(turned, count)]),
-            places=self._told(random),
+            places=self._perceived(random),
         )
 
-    def _told(self, random: np.random.Generator) -> tuple[ViaPoint, ...]:
-        """The places, each off by TOLD_M; one that is visited again is seen but once."""
+    def _perceived(self, random: np.random.Generator) -> tuple[ViaPoint, ...]:
+        """The places with errors of PERCEIVED_M; a place that is visited twice has one error."""
         parts = []
         for part, column in zip(self.scene[:3], self.task.stages.T, strict=True):
-            off = TOLD_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
+            off = PERCEIVED_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
             parts.append(np.round(part + off[column], 6))
         rows = [
             {
@@ -247,27 +251,29 @@ def _within(box: Array, random: np.random.Generator) -> Array:
 
 
 def _usual(kind: str, seed: int) -> list[Array]:
-    """The usual places of left hand, right hand and tool, and turns of each of the left's."""
+    """The nominal places of left hand, right hand and tool, and orientations at the left's
+    places.
+    """
     task = plan(kind)
-    random = np.random.default_rng([PROJECT_SEED, SEEDS["made"], KINDS.index(kind), seed])
+    random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS["made"], TASK_KINDS.index(kind), seed])
     boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
     out = []
     for box, column in zip(boxes, task.stages.T, strict=True):
         found: list[Array] = []
-        apart, way = 0.16, 0.22  # from all others, and from the one before
+        apart, way = 0.16, 0.22  # [m] least distance from all other places, and from the one before
         while len(found) <= column.max():
             tried = _within(box, random)
             if all(np.linalg.norm(tried - one) > apart for one in found) and (
                 not found or np.linalg.norm(tried - found[-1]) > way
             ):
                 found.append(tried)
-            apart, way = 0.998 * apart, 0.999 * way  # as many as there are find room
+            apart, way = 0.998 * apart, 0.999 * way  # the distances shrink until all places fit
         out.append(np.array(found))
     return [*out, np.array(TURNS_RAD) * random.standard_normal((len(out[0]), 3))]
 
 
-def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> Scene:
-    """A scene of the task: each place elsewhere, where arm and hands reach it."""
+def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> TaskScene:
+    """A scene of the task, with each place displaced within the reach of arm and hands."""
     sigma = random.uniform(*MOVED_M) * np.array([1.0, 1.0, 0.5])
 
     def placed(part: int, index: int, before: Array | None) -> Array:
@@ -275,7 +281,7 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
             tried = usual[part][index] + sigma * random.standard_normal(3)
             if before is not None and np.linalg.norm(tried - before) < LEAST_WAY_M:
                 continue
-            low, high = FARTHEST if part < 2 else np.array([[-1.0] * 3, [1.0] * 3])
+            low, high = HAND_BOX if part < 2 else np.array([[-1.0] * 3, [1.0] * 3])
             carries = part == 0 and task.follow.any()
             if (
                 ((tried >= low) & (tried <= high)).all()
@@ -283,7 +289,7 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
                 and (not carries or _reached(tried + CARRIED_M))
             ):
                 return np.asarray(tried)
-        raise ValueError(f"no room for place {index} near {usual[part][index]}")  # the boxes above leave it
+        raise ValueError(f"no room for place {index} near {usual[part][index]}")  # the boxes above prevent this
 
     parts = []
     for part in range(3):
@@ -298,22 +304,22 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> S
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
     else:
         tool = np.where(task.follow[:, None] > 0, left + CARRIED_M, tool)
-    return Scene(left, right, tool, turns)
+    return TaskScene(left, right, tool, turns)
 
 
 def _reached(tool: Array) -> bool:
     reach = Reach()
     away = float(np.linalg.norm(tool - reach.centre))
     return (
-        reach.inner + MARGIN_M <= away <= reach.outer - MARGIN_M
-        and tool[0] >= reach.min_x + MARGIN_M
-        and tool[2] >= reach.min_z + MARGIN_M
+        reach.inner + TOOL_MARGIN_M <= away <= reach.outer - TOOL_MARGIN_M
+        and tool[0] >= reach.min_x + TOOL_MARGIN_M
+        and tool[2] >= reach.min_z + TOOL_MARGIN_M
     )
 
 
 def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
-    """In which order the stages come, and whether hands break off on the way to one: as taught, or
-    with one left out, one repeated, or one interrupted.
+    """The order of stages, each with True if the hands interrupt their motion to it: as taught, or
+    with one stage left out, repeated or interrupted.
     """
     order = [(i, False) for i in range(count)]
     at, how = int(random.integers(1, count - 1)), int(random.integers(4))
@@ -327,9 +333,11 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
 
 
 def _legs(
-    task: Plan, scene: Scene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
+    task: Plan, scene: TaskScene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
 ) -> tuple[tuple[Leg, ...], tuple[Leg, ...]]:
-    """Both hands' legs from stage to stage: each waits for the other but for its lead."""
+    """The legs of both hands from stage to stage; each hand waits for the other, except for the
+    lead.
+    """
     random = np.random.default_rng([*key, 5])
     habit = np.random.default_rng([*key[:2], key[-2], 6])
     ends = np.stack([scene.left, scene.right])
@@ -338,8 +346,8 @@ def _legs(
         off *= habit.uniform(*HAND_OFF_M, (len(off), 1)) / np.linalg.norm(off, axis=1, keepdims=True)
         ends[side] += (off + HAND_SCATTER_M * random.standard_normal(off.shape))[column]
     legs: tuple[list[Leg], list[Leg]] = ([], [])
-    free = [0.5, 0.5]  # when each hand is free to go
-    both = REST_S + max(who.lead_s, 0.0)
+    free = [0.5, 0.5]  # [s] time from which each hand may move
+    both = START_REST_S + max(who.lead_s, 0.0)
 
     def go(
         side: int, at: float, way: Array, progress: tuple[float, float], bow: Array | None, *, curve: bool = False
@@ -355,7 +363,7 @@ def _legs(
         free[side] = at + lasts
 
     for i, ((a, _), (b, breaks)) in enumerate(itertools.pairwise(order)):
-        if breaks:  # both turn back to where they rested at first, and take it up again
+        if breaks:  # both hands return to their first place, and move again
             for way, progress in (((a, 0), (i, i)), ((0, a), (i, i))):
                 for side in (0, 1):
                     if not np.array_equal(ends[side, way[0]], ends[side, way[1]]):
@@ -363,7 +371,7 @@ def _legs(
                 both = max(*free, both) + random.uniform(1.0, 2.0)
         for side in (0, 1):
             begin = max(free[side] + 0.1, both - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
-            if task.stages[a, side] == task.stages[b, side]:  # it stays, and is waited for by nobody
+            if task.stages[a, side] == task.stages[b, side]:  # the hand rests, and the other does not wait for it
                 here = ends[side, a]
                 begin, at_once = max(free[side], begin - 0.6), np.linspace(0, 1, SHAPE_STEPS)
                 legs[side].append(Leg(begin, 0.1, here, here, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))

@@ -10,20 +10,21 @@ import numpy as np
 
 from service.settings.config import Settings
 from sim.description import simulated
-from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World
+from sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # pictures without a screen
+    os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen
 import mujoco
 
-SHAPES = {
+GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-FELT, SEEN = 0, 1  # groups of shapes; MuJoCo puts those of a URDF into these
-MOST_PIXELS = 2048  # each way
-# The arm is stopped by what is solid, and nothing by anything else. No link is without mass there.
+FELT_GROUP = 0  # group into which MuJoCo puts collision shapes of a URDF
+SEEN_GROUP = 1  # group into which MuJoCo puts visual shapes of a URDF
+MOST_PIXELS = 2048  # largest width and height of a picture
+# MuJoCo needs a mass for each link. Visual shapes are kept, and links are not merged.
 READ_AS = {
     "discardvisual": "false",
     "fusestatic": "false",
@@ -34,15 +35,15 @@ READ_AS = {
 
 
 class MujocoWorld(World):
-    """The bench's world, simulated by MuJoCo. The motors are those of PyBullet: each makes up part
-    of its position's error and all of its velocity's within a step, as far as its effort goes.
+    """The bench's world, simulated by MuJoCo. The motors are modelled as in PyBullet: within a step
+    each corrects a part of its position error and its whole velocity error, within its effort.
     """
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         spec = mujoco.MjSpec.from_string(simulated(settings, **READ_AS))
         spec.option.timestep = self._period_s
         for shape in spec.geoms:
-            shape.contype, shape.conaffinity = int(shape.group == FELT), 0
+            shape.contype, shape.conaffinity = int(shape.group == FELT_GROUP), 0
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -71,25 +72,25 @@ class MujocoWorld(World):
         mujoco.mj_step1(model, self._data)
 
     @staticmethod
-    def _add(spec: Any, name: str, body: Body) -> None:
+    def _add(spec: Any, name: str, body: WorldBody) -> None:
         x, y, z = body.look.size
         made = spec.worldbody.add_body(
             name=name, pos=body.at.position, quat=_w_first(body.at.orientation), mocap=not body.solid
         )
         made.add_geom(
             name=name,
-            type=SHAPES[body.look.shape],
+            type=GEOM_TYPES[body.look.shape],
             size=(x / 2, y / 2, z / 2) if body.look.shape == "box" else (x / 2, z / 2, 0),
             pos=body.offset.position,
             quat=_w_first(body.offset.orientation),
             rgba=body.look.colour,
             contype=0,
             conaffinity=int(body.solid),
-            group=SEEN,
+            group=SEEN_GROUP,
         )
 
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Set where the motors go: [rad] with [rad/s] fed forward."""
+        """Set the motors' target positions [rad] and velocities [rad/s]."""
         self._position, self._velocity = np.array(position), np.array(velocity)
 
     def step(self) -> None:
@@ -100,7 +101,9 @@ class MujocoWorld(World):
         mujoco.mj_step1(self._model, data)
 
     def _effort(self) -> Any:
-        """Of each motor [N m], so that all that are strong enough reach their velocities."""
+        """Torques of the motors [N m]. Motors that do not reach their limit reach their
+        velocity.
+        """
         data, motors = self._data, self._motors
         wanted = self._velocity + POSITION_GAIN / self._period_s * (self._position - data.qpos[self._joints])
         acceleration = (wanted - data.qvel[motors]) / self._period_s
@@ -109,7 +112,7 @@ class MujocoWorld(World):
         others = (data.qfrc_bias - data.qfrc_passive - data.qfrc_constraint)[motors]
         effort, weak = inertia @ acceleration + others, np.zeros(len(motors), bool)
         while (share := np.where(weak, 0.0, np.abs(effort) / self._efforts)).max() > 1.0:
-            weak[np.argmax(share)] = True  # it does all it can, and the others hold against that
+            weak[np.argmax(share)] = True  # its torque is at the limit; the others compensate
             effort[weak] = np.clip(effort[weak], -self._efforts[weak], self._efforts[weak])
             left = effort[weak] - others[weak] - inertia[np.ix_(weak, ~weak)] @ acceleration[~weak]
             acceleration[weak] = np.linalg.solve(inertia[np.ix_(weak, weak)], left)
@@ -121,7 +124,7 @@ class MujocoWorld(World):
         return tuple(self._data.qpos[self._joints].tolist()), tuple(self._data.qvel[self._motors].tolist())
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
         w, *turn = self._data.xquat[self._tool].tolist()
         speed = np.empty(6)
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0)
@@ -134,10 +137,8 @@ class MujocoWorld(World):
         self._data.mocap_quat[number] = _w_first(pose.orientation)
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
-        more.
-        """
-        mujoco.mj_kinematics(self._model, self._data)  # bodies may have been put elsewhere
+        """Smallest distance between the arm and a measured body [m], but at most `within`."""
+        mujoco.mj_kinematics(self._model, self._data)  # bodies may have moved
         other = self._model.geom(body).id
         return min(
             float(mujoco.mj_geomDistance(self._model, self._data, one, other, within, None)) for one in self._felt
@@ -150,7 +151,7 @@ class MujocoWorld(World):
         lens.lookat[:], lens.distance = target, np.linalg.norm(away)
         lens.azimuth = np.degrees(np.arctan2(away[1], away[0]))
         lens.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
-        shown.geomgroup[FELT] = 0
+        shown.geomgroup[FELT_GROUP] = 0
         with mujoco.Renderer(self._model, size[1], size[0]) as renderer:
             renderer.update_scene(self._data, lens, shown)
             return renderer.render()

@@ -1,6 +1,5 @@
-"""The bench on the network: hands and joint state out, joint commands in, in real time.
-
-A thin shell around `Bench`.
+"""The bench on the network, in real time: it publishes hands and joint states, and receives joint
+commands.
 """
 
 from __future__ import annotations
@@ -28,62 +27,62 @@ from sim.scene import Scene
 from sim.script import Array
 
 THINGS_HZ = 10
-STOP_S = 0.5  # between the last hands and the end
-QUIET_S = 1.0  # without a command, after which that is said
-MOST_QUEUED = 256  # commands, while the bench is held up
-HEADROOM = 1.25  # of the arm's drives beyond what is commanded: else it could not catch up after that
+FINAL_STOP_S = 0.5  # the bench runs for this time after the last hands, so that the service can stop the arm
+QUIET_S = 1.0  # missing commands are reported after this time
+MOST_QUEUED = 256  # commands wait in a queue of this length while the bench is held up
+DRIVE_HEADROOM = 1.25  # drive limits / command limits, so that the arm can catch up after a hold-up
 
 
 class BenchError(RuntimeError):
-    """The bench cannot do its work; the message says what is missing."""
+    """The bench cannot run; the message has the cause."""
 
 
 class RunReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One run: the events, and how promptly the commands came."""
+    """The report of a run: its events, and the timing of commands."""
 
     success: bool
     events: TaskEvents
-    latency_ms: requests.Percentiles  # hand published to the first command received that answers it
-    answered: int  # hand samples among `hands` that a command answered
+    latency_ms: requests.Percentiles  # from a published hand to the first received command that answers it
+    answered: int  # number of hand samples among `hands` that a command answered
     hands: int
     commands: int
     rejected: int
-    largest_gap_ms: float  # between commands received
-    periods: int  # of the bench while the script ran
-    skipped: int  # of them the bench itself missed
-    longest_pause_ms: float  # of the bench
-    begun_ns: int  # the system clock's time at which the script began
+    largest_gap_ms: float  # longest time between received commands
+    periods: int  # number of the bench's periods while the script ran
+    skipped: int  # number of these that the bench missed
+    longest_pause_ms: float  # longest pause of the bench
+    begun_ns: int  # begin of the script by the system clock
     seed: int
     scene: Scene
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dropout:
-    """A hand that is not seen for a while [s of the script]."""
+    """A time in the script [s] in which one hand is hidden."""
 
     start_s: float
     lasts_s: float
     hand: Literal["left", "right"] = "left"
 
     def at(self, time_s: float) -> bool:
-        """Whether the hand is hidden at a time of the script."""
+        """True if the hand is hidden at a time of the script [s]."""
         return self.start_s <= time_s < self.start_s + self.lasts_s
 
 
 @dataclass(frozen=True, kw_only=True)
 class Live:
-    """How the bench appears on the network, and when it ends."""
+    """The bench's settings on the network, and its end."""
 
     cell: str = "thirdhand"
     hands_hz: int = 100
     once: bool = False
     duration_s: float = math.inf
-    wait_s: float = 60.0  # for the first command
+    wait_s: float = 60.0  # timeout of the first command
     dropout: Dropout | None = None
 
 
 class Commands:
-    """The newest joint command, and counts over all that came. Any other thread may take."""
+    """The newest joint command, and statistics of all received ones. For any thread."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._names = names
@@ -94,7 +93,7 @@ class Commands:
         self.restart()
 
     def restart(self) -> None:
-        """Count anew."""
+        """Reset the statistics."""
         with self._lock:
             self.count = self.rejected = self._answered_ns = self._last_ns = 0
             self.largest_gap_ms = 0.0
@@ -102,7 +101,7 @@ class Commands:
             self._since_ns = time.time_ns()
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Keep one command. Only the first answer to each new hand stamp tells of latency."""
+        """Store a command. Its latency counts only for the first answer to each hand stamp."""
         now_ns, now = time.time_ns(), time.perf_counter_ns()
         try:
             message = cdr.decode_joints(sample.payload.to_bytes())
@@ -127,13 +126,13 @@ class Commands:
                 self.latencies_ms.append((now_ns - attachment.hand_stamp_ns) / 1e6)
 
     def take(self) -> tuple[tuple[float, ...], tuple[float, ...]] | tuple[None, None]:
-        """The newest command not yet taken: position [rad] and velocity [rad/s]."""
+        """The newest command, position [rad] and velocity [rad/s], if it was not taken before."""
         with self._lock:
             newest, self._newest = self._newest, None
         return newest or (None, None)
 
     def queued(self) -> list[Command]:
-        """All commands not yet taken this way, as they came: what a `Playback` takes."""
+        """All commands since the last call, in the order of arrival, for `Playback`."""
         with self._lock:
             queued = list(self._queue)
             self._queue.clear()
@@ -141,18 +140,18 @@ class Commands:
 
 
 class Led:
-    """The bench's arm, led as `thirdhand follow` leads a real one."""
+    """The bench's arm, driven like a real one by `thirdhand follow`."""
 
     def __init__(self, bench: Bench, commands: Commands, gripper: Gripper) -> None:
         self._bench, self._commands, self._gripper = bench, commands, gripper
         names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
-        more = {name: tuple(HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
+        more = {name: tuple(DRIVE_HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
         limits = msgspec.structs.replace(bench.limits, **more)
         self._playback = Playback(limits, joints, period_s=bench.period_s)
 
     def step(self, periods: int = 1) -> tuple[Observation, bool]:
-        """The bench a period later, of so many that passed, and whether commands came. Raises
-        BenchError where they come too slowly to be followed.
+        """Advance the bench by one period, `periods` after the last step. Returns the observation,
+        and True if commands arrived. Raises BenchError if they arrive too slowly to be followed.
         """
         commands = self._commands.queued()
         moved = self._playback.step(commands, elapsed_s=periods * self._bench.period_s)
@@ -163,13 +162,13 @@ class Led:
 
 
 class Gripper:
-    """The newest command of the gripper: 0 open, 1 closed; None: there was none."""
+    """The newest command of the gripper, 0 open to 1 closed; None before the first."""
 
     def __init__(self) -> None:
         self.newest: float | None = None
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Keep one command; what is none is let pass, as those of the joints tell."""
+        """Store a command. Unreadable ones are ignored."""
         try:
             command = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), (messages.GRIPPER,))[0]
         except messages.WireError:
@@ -179,9 +178,9 @@ class Gripper:
 
 
 class Bridge:
-    """The bench's channels on a session: closes what it declared.
+    """The bench's channels on a session.
 
-    Of an arm that is `observed` it hears; without one it tells of its own.
+    It receives the joint states of an `observed` arm, or else publishes those of the simulated arm.
     """
 
     def __init__(
@@ -191,15 +190,14 @@ class Bridge:
         self.gripper = Gripper()
         self._names, self._observed = names, observed
         self.hands_sent = 0
-        told = ("hands/left", "hands/right", "objects", *(() if observed else ("joints/state", "gripper/state")))
+        own = ("hands/left", "hands/right", "objects", *(() if observed else ("joints/state", "gripper/state")))
         self._publishers = {
             suffix: session.declare_publisher(
                 channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
             )
-            for suffix in told
+            for suffix in own
         }
-        # A callback costs 20 µs on its own thread, stamps each command as it comes, and overwrites
-        # the last: the newest wins.
+        # Callbacks run on another thread for 20 µs and note the time of arrival of each command.
         self._subscribers = [
             session.declare_subscriber(channels.key(live.cell, suffix), receive)
             for suffix, receive in (
@@ -210,7 +208,7 @@ class Bridge:
         ]
 
     def publish_joints(self, seen: Observation) -> None:
-        """Send the arm's joints and its gripper, unless they are observed."""
+        """Publish the arm's joints and gripper, unless the arm is observed."""
         if self._observed:
             return
         state = messages.JointState(time.time_ns(), self._names, seen.joints, seen.joint_velocities)
@@ -220,7 +218,7 @@ class Bridge:
             self._publishers["gripper/state"].put(cdr.encode_joints(fingers))
 
     def publish_hands(self, poses: Sequence[Array], *, hidden: str | None = None) -> None:
-        """Send both hands with one stamp, as a tracker's frame; not the one that is hidden."""
+        """Publish both hands with one stamp, except a hidden one."""
         stamp_ns = time.time_ns()
         for hand, pose in zip(("left", "right"), poses, strict=True):
             if hand == hidden:
@@ -231,11 +229,11 @@ class Bridge:
         self.hands_sent += 1
 
     def publish_things(self, bench: Bench) -> None:
-        """Tell what lies on the bench, for viewers."""
+        """Publish the things on the bench for viewers."""
         self._publishers["objects"].put(channels.BY_KEY["objects"].codec.encode(time.time_ns(), bench.things()))
 
     def close(self) -> None:
-        """Take the channels back."""
+        """Undeclare the channels."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         for publisher in self._publishers.values():
@@ -251,8 +249,8 @@ def run(
     report: Callable[[RunReport], None],
     say: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
 ) -> None:
-    """Play the bench in real time until `stop`, the duration's end, or the first report when only
-    one is wanted. Raises BenchError.
+    """Run the bench in real time until `stop`, until the end of its duration, or with `live.once`
+    until the first report. Raises BenchError.
     """
     observed = bench.world if isinstance(bench.world, ObservedWorld) else None
     bridge = Bridge(session, live, bench.joint_names, observed)
@@ -277,12 +275,10 @@ def _play(
     things_every = max(1, round(rate_hz / THINGS_HZ))
     led = Led(bench, commands, bridge.gripper)
     deadlines, before = Deadlines(rate_hz), -1
-    ready_s: float | None = None  # since when commands come and the hands wait at their start
+    ready_s: float | None = None  # time from which commands arrive and the hands wait at their start
     running, spoke_s, quiet = False, 0.0, False
     said = missed_before = sent_before = begun_ns = begun_index = longest = 0
-    say(
-        f"waiting for {key} (silent while the service holds for want of an arm, or is at fault: thirdhand status tells)"
-    )
+    say(f"waiting for {key} (the service sends none without an arm, or in a fault: see thirdhand status)")
     while not stop.is_set():
         index = deadlines.wait()[0]
         now_s = index * bench.period_s
@@ -293,11 +289,11 @@ def _play(
         bridge.publish_joints(seen)
         if commanded:
             if quiet:
-                say("commands come again")
+                say("commands arrive again")
             spoke_s, quiet = now_s, False
         elif ready_s is not None and not quiet and now_s - spoke_s > QUIET_S:
             quiet = True
-            say("no commands come any more: thirdhand status tells why, and thirdhand reset ends a fault")
+            say("no commands arrive: thirdhand status shows the cause, and thirdhand reset ends a fault")
         if bench.tick % hands_every == 0:
             hidden = live.dropout.hand if live.dropout and running and live.dropout.at(seen.time_s) else None
             bridge.publish_hands(bench.script.sample(seen.time_s), hidden=hidden)
@@ -307,11 +303,13 @@ def _play(
         if ready_s is None:
             if commanded:
                 ready_s = now_s
-                say("commands come, the arm goes to where the hands want it")
+                say("commands arrive, the arm moves to its target")
             elif now_s > live.wait_s:
                 if isinstance(bench.world, ObservedWorld) and not bench.world.heard:
                     states = channels.key(live.cell, "joints/state")
-                    raise BenchError(f"no arm tells its joints on {states}: start its program, or omit --hands-only")
+                    raise BenchError(
+                        f"no joint states arrive on {states}: start the arm's program, or omit --hands-only"
+                    )
                 refused = f" ({commands.rejected} refused: {commands.last_error})" if commands.rejected else ""
                 raise BenchError(
                     f"no command on {key} within {live.wait_s:g} s{refused}. Is the service running in this cell?"
@@ -343,7 +341,7 @@ def _play(
                 if live.once:
                     _let_stop(bench, bridge, led, deadlines)
                     return
-                say("the hands go back")
+                say("the hands move back")
                 bench.turn_back()
                 running, ready_s = False, math.inf
         if ready_s == math.inf and bench.back:
@@ -351,21 +349,16 @@ def _play(
 
 
 def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> None:
-    """Without hands the service stops the arm; one that vanished before that would be a fault."""
-    for _ in range(round(STOP_S / bench.period_s)):
+    """Run without hands until the service has stopped the arm: an arm that disappears while it
+    moves is a fault.
+    """
+    for _ in range(round(FINAL_STOP_S / bench.period_s)):
         deadlines.wait()
         bridge.publish_joints(led.step()[0])
 
 
 def _report(
-    bench: Bench,
-    commands: Commands,
-    *,
-    hands: int,
-    periods: int,
-    skipped: int,
-    longest_pause_ms: float,
-    begun_ns: int,
+    bench: Bench, commands: Commands, *, hands: int, periods: int, skipped: int, longest_pause_ms: float, begun_ns: int
 ) -> RunReport:
     events = bench.events()
     latencies = list(commands.latencies_ms)

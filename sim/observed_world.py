@@ -1,5 +1,5 @@
-"""The world of an arm that is elsewhere, real or simulated by others: it is where its joint states
-tell. Only hands and things are here.
+"""The world of a real arm, or of one that another program simulates: its joint states give its
+position. Only hands and things are simulated here.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from service.core.arm.stage import Arm
 from service.core.geometry import between_segments, place, quaternion_of
 from service.core.separation.body import body_of
 from service.settings.config import Settings, robot_description
-from sim.world import LEVEL, Body, Floats, Pose, World, carried_by
+from sim.world import LEVEL, Floats, Pose, World, WorldBody, carried_by
 
 
 class ObservedWorld(World):
-    """The bench's world around an arm that is observed: what steps and moves it is elsewhere."""
+    """The bench's world around an observed arm, which another program moves."""
 
-    heard = False  # of the arm
+    heard = False  # True once a joint state was received
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         self._names = settings.joints.names
         description = robot_description(settings)
         self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies
@@ -32,7 +32,9 @@ class ObservedWorld(World):
         self._states = JointStates(self._names, settings.arm.silent_ms / 1000)
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Keep one joint state; what is none is let pass, as the service tells. In any thread."""
+        """Store a joint state. Others are ignored, because the service reports them. For any
+        thread.
+        """
         try:
             found = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
             if found is None:
@@ -44,17 +46,17 @@ class ObservedWorld(World):
             self._newest, self.heard = state, True
 
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Nothing: the arm follows commands itself."""
+        """Do nothing: the arm follows commands itself."""
 
     def step(self) -> None:
-        """Nothing: time passes by itself."""
+        """Do nothing: the arm moves in real time."""
 
     def joints(self) -> tuple[Floats, Floats]:
         """Position [rad] and velocity [rad/s] of the joints in chain order."""
         return self._newest
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
         position, velocity = self._newest
         here, turn = self._arm.at(np.array(position)), np.empty(4)
         quaternion_of(here.rotation, turn)
@@ -63,12 +65,10 @@ class ObservedWorld(World):
         return Pose(tuple(here.position.tolist()), (x, y, z, w)), tuple(speed.tolist())
 
     def _place(self, body: str, pose: Pose) -> None:
-        """Nothing more than to know it."""
+        """Do nothing: the base class stores the pose."""
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm's capsules and a hand [m]; `within` when there is
-        more.
-        """
+        """Smallest distance between the arm's capsules and a hand [m], but at most `within`."""
         capsules, near = self._body.capsules, np.empty(9)
         placed = np.empty((len(capsules), 2, 3))
         place(np.array(self._newest[0]), self._body.frames, self._body.axes, capsules, placed)
@@ -81,4 +81,4 @@ class ObservedWorld(World):
         raise NotImplementedError("there is no engine that draws; thirdhand view live shows the cell")
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""

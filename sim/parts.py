@@ -1,14 +1,14 @@
-"""Parts of a cell as processes of their own, to be killed, frozen and begun again: a tracker, a
-network between two ends, a Zenoh router.
+"""Parts of a cell as processes that tests kill, freeze and restart: a tracker, a network between
+two ends, and a Zenoh router.
 
-python -m sim.parts tracker ENDPOINT      both hands at 100 Hz, to and fro; after SIGUSR1 the
-                                          same sample for good, at each SIGUSR2 with a clock that
-                                          is set back by an hour, or ahead to where it was
-python -m sim.parts relay TARGET PORT     TCP from tcp/127.0.0.1:PORT to TARGET; frozen it is a
-                                          network that is silent
+python -m sim.parts tracker ENDPOINT      publishes both hands at 100 Hz; from SIGUSR1 on it repeats
+                                          the last sample; each SIGUSR2 sets its clock back by an
+                                          hour, or ahead again
+python -m sim.parts relay TARGET PORT     relays TCP from tcp/127.0.0.1:PORT to TARGET; if it is
+                                          frozen, the network is silent
 python -m sim.parts router PORT           a Zenoh session that routes between its clients
 
-Each says where it listens, if it does, or else that it began; port 0 takes a free one.
+A relay or router prints its endpoint, a tracker that it has begun. Port 0 takes a free port.
 """
 
 from __future__ import annotations
@@ -37,15 +37,19 @@ from service.process import child
 from sim.scene import Scene
 from sim.script import HandScript
 
-HANDS_HZ, HOUR_NS = 100, 3_600_000_000_000
-MIDDLE_S, SWING_S, FASTEST = 5.15, 1.2, 1.7  # of the script, where the tool is fastest; its rate there
+CELL = "thirdhand"  # the default cell
+PART_HANDS_HZ = 100
+HOUR_NS = 3_600_000_000_000
+MIDDLE_S = 5.15  # script time at which the tool is fastest
+SWING_S = 1.2  # amplitude of the swing about that time
+FASTEST = 1.7  # rate of the script in the middle of the swing
 START_TIMEOUT_S = 60.0
-PRIORITY = 20  # below the service's loop, above what it does beside
+PRIORITY = 20  # below the service's loop, above its other threads
 
 
 def before_others() -> None:
-    """Lets this thread, and those that it starts, run before other processes, if that is granted:
-    then a machine that is busy is not taken for a fault.
+    """Schedule this thread, and those that it starts, before other processes, if granted, so that a
+    busy machine does not look like a fault.
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -53,7 +57,7 @@ def before_others() -> None:
 
 @contextlib.contextmanager
 def as_usual_afterwards() -> Iterator[None]:
-    """Within it, threads that are started run before other processes; this one until its end."""
+    """A context in which this thread and new threads are scheduled before other processes."""
     before_others()
     try:
         yield
@@ -63,17 +67,17 @@ def as_usual_afterwards() -> Iterator[None]:
 
 
 class PartError(RuntimeError):
-    """A part that did not begin; the message says which."""
+    """A part did not start; the message has its name."""
 
 
 def script_time(time_s: float) -> float:
-    """The script's time [s] of hands that swing to and fro where they lead the tool fastest."""
+    """The script's time [s] for hands that swing to and fro where the tool is fastest."""
     return MIDDLE_S + SWING_S * math.sin(FASTEST / SWING_S * time_s)
 
 
 def track(endpoint: str) -> None:
-    """Publishes both hands for good; on SIGUSR1 what it sent last, again and again, on SIGUSR2 by a
-    clock that was set.
+    """Publish both hands forever. From SIGUSR1 on the last sample is repeated; SIGUSR2 sets the
+    clock of the stamps.
     """
     repeats, offs_ns = threading.Event(), itertools.cycle([HOUR_NS, 0])
     off_ns = 0
@@ -86,8 +90,8 @@ def track(endpoint: str) -> None:
     signal.signal(signal.SIGUSR2, set_the_clock)
     script, sides = HandScript(Scene(), seed=Scene().seed), ("left", "right")
     with open_session(connect=[endpoint]) as session:
-        publishers = [session.declare_publisher(channels.key("thirdhand", f"hands/{side}")) for side in sides]
-        clock, payloads = Deadlines(HANDS_HZ), [b"", b""]
+        publishers = [session.declare_publisher(channels.key(CELL, f"hands/{side}")) for side in sides]
+        clock, payloads = Deadlines(PART_HANDS_HZ), [b"", b""]
         print("begun", flush=True)
         while True:
             clock.wait()
@@ -107,20 +111,20 @@ async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> Non
         while data := await source.read(65536):
             sink.write(data)
             await sink.drain()
-    except OSError:  # an end that is gone ends both
+    except OSError:  # the other direction ends too
         pass
     finally:
         sink.close()
 
 
 async def relay(target: str, port: int) -> None:
-    """Carries bytes between whoever connects and the target, for good."""
+    """Relay bytes between each client and the target, forever."""
     host, _, target_port = target.removeprefix("tcp/").rpartition(":")
 
     async def carry(near: asyncio.StreamReader, to_near: asyncio.StreamWriter) -> None:
         try:
             far, to_far = await asyncio.open_connection(host, int(target_port))
-        except OSError:  # nobody there: so the asker learns
+        except OSError:  # nothing listens at the target
             to_near.close()
             return
         await asyncio.gather(_pump(near, to_far), _pump(far, to_near))
@@ -131,16 +135,16 @@ async def relay(target: str, port: int) -> None:
 
 
 def route(port: int) -> None:
-    """Routes between the clients that connect, for good."""
+    """Route between the clients that connect, forever."""
     with open_session(listen=[f"tcp/127.0.0.1:{port}"], more={"mode": "router"}) as session:
         print(f"listening on {endpoints(session)[0]}", flush=True)
         signal.pause()
 
 
-class Part:
-    """One of them, running; `endpoint` where it listens. Raises PartError where it does not begin.
+class CellPart:
+    """A running part with its `endpoint`. Raises PartError if it does not start.
 
-    `again` begins it anew at the same endpoint, after its end.
+    `again` restarts it at the same endpoint.
     """
 
     def __init__(self, *arguments: str) -> None:
@@ -160,18 +164,18 @@ class Part:
         self.endpoint = said[-1]
 
     def send(self, number: int) -> None:
-        """Sends a signal."""
+        """Send a signal to the process."""
         self.process.send_signal(number)
 
     def again(self) -> None:
-        """Ends it and begins it anew, where it was."""
+        """Restart the process at the same endpoint."""
         self.close()
         if self._arguments[0] != "tracker":
             self._arguments = (*self._arguments[:-1], self.endpoint.rsplit(":", 1)[1])
         self._start()
 
     def close(self) -> None:
-        """Ends it."""
+        """End the process."""
         self.process.kill()
         self.process.wait()
         if self.process.stdout is not None:
@@ -179,11 +183,11 @@ class Part:
 
 
 class Link:
-    """A cable between this machine and a network namespace of its own in which a service may run:
-    it can be taken down. Only root may have one; raises PartError where it is not allowed.
+    """A virtual cable between this machine and a network namespace in which a service may run. It
+    can be taken down. Only root may make one; raises PartError for others.
     """
 
-    ADDRESS, OTHER = "198.18.77.1", "198.18.77.2"  # of the range that is set aside for measurements
+    ADDRESS, OTHER = "198.18.77.1", "198.18.77.2"  # in the range that is reserved for measurements
 
     def __init__(self) -> None:
         self.name = f"thirdhand{os.getpid()}"
@@ -201,12 +205,12 @@ class Link:
             raise
 
     def set(self, state: str) -> None:
-        """Takes it `up` or `down`."""
+        """Set the cable `up` or `down`."""
         _ip("link", "set", self._cable, state)
 
     @property
     def program(self) -> tuple[str, ...]:
-        """A Python program that runs the service at the far end."""
+        """Arguments of Python for a service in the namespace."""
         return (
             "-c",
             "import ctypes, os, sys\n"
@@ -215,7 +219,7 @@ class Link:
         )
 
     def close(self) -> None:
-        """Removes it."""
+        """Remove the namespace and the cable."""
         _ip("netns", "del", self.name)
 
 
@@ -229,18 +233,18 @@ def _ip(*arguments: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 2 on bad usage."""
+    """Run a part; exit code 0, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.parts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     kinds = p.add_subparsers(dest="kind", required=True)
-    tracker = kinds.add_parser("tracker", help="both hands, to and fro")
-    tracker.add_argument("endpoint", metavar="ENDPOINT", help="where the service or a router listens")
+    tracker = kinds.add_parser("tracker", help="publish both hands, moving to and fro")
+    tracker.add_argument("endpoint", metavar="ENDPOINT", help="the endpoint of the service or of a router")
     relaying = kinds.add_parser("relay", help="a network between two ends")
-    relaying.add_argument("target", metavar="TARGET", help="where it leads to, like tcp/127.0.0.1:7447")
+    relaying.add_argument("target", metavar="TARGET", help="the endpoint of the other end, like tcp/127.0.0.1:7447")
     routing = kinds.add_parser("router", help="a Zenoh router")
     for one in (relaying, routing):
-        one.add_argument("port", metavar="PORT", type=int, help="where it listens; 0: a free one")
+        one.add_argument("port", metavar="PORT", type=int, help="the port to listen on; 0 for a free one")
     args = p.parse_args(arguments)
     child.end_with_parent()
     before_others()

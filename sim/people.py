@@ -1,7 +1,7 @@
-"""Modelled people at the soldering bench: their habits and their trackers, and where things are.
+"""Modelled people at the soldering bench: their habits, their trackers, and the places of things.
 
-NumPy only, each from its number alone. People come in groups that share nobody: who demonstrates,
-who parameters are chosen on, who is tested, and who does the made tasks.
+Each person depends only on a number. There are disjoint groups of people: for demonstrations, for
+tuning of parameters, for tests, and for synthetic tasks.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from sim.scene import RIGHT_FROM_OBJECT, TOOL_FROM_OBJECT
 from sim.script import Array
 
 Group: TypeAlias = Literal["demonstrations", "tuning", "test", "made"]
-SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
+GROUP_SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
 PROJECT_SEED = 2024
 LEAST_DWELL_S, MOST_DWELL_S = 0.9, 1.8
 LONGEST_LEAD_S = 2.0
-HABITS_M = (0.020, 0.008, 0.008)  # each axis: a hand held out in the air, on the board, at the iron
+HABITS_M = (0.020, 0.008, 0.008)  # standard deviation per axis of a hand in the air, at the board, at the iron
 
 
 class Places(NamedTuple):
-    """Where things are, or are told to be [m], (3,) each; `std_m` is how sure that is, 3-D rms."""
+    """The true or perceived positions of things [m], (3,) each, with the error `std_m`, 3-D rms."""
 
     left_start: Array
     right_start: Array
@@ -36,62 +36,62 @@ class Places(NamedTuple):
 
     @property
     def right_final(self) -> Array:
-        """Where the right hand holds the iron at the end (3,) [m]."""
+        """Final position of the right hand with the iron (3,) [m]."""
         return self.board + RIGHT_FROM_OBJECT
 
     @property
     def carry(self) -> Array:
-        """Where the tool holds the glass (3,) [m]."""
+        """Position of the tool that holds the glass (3,) [m]."""
         return self.board + TOOL_FROM_OBJECT
 
     def perceived(self, sigma_m: float, random: np.random.Generator) -> Places:
-        """The places as they are seen, each off by `sigma_m` (3-D rms); the robot knows its own."""
+        """The perceived places with errors of `sigma_m` (3-D rms), except the robot's own place."""
         off = sigma_m / np.sqrt(3.0) * random.standard_normal((6, 3))
         left_start, right_start, handover, glass, board, iron = np.array(self[:6]) + off
         return Places(left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m)
 
 
-class Tracker(NamedTuple):
-    """What a tracker makes of a hand: rate, noise of each axis, jumps and dropouts a second."""
+class TrackerModel(NamedTuple):
+    """A model of a tracker: its rate, noise per axis, and rates of jumps and dropouts."""
 
     rate_hz: float = 100.0
     noise_m: float = 0.0005
     jumps_hz: float = 0.0
     dropouts_hz: float = 0.0
-    residual: Array | None = None  # (M, 6) [m] of a recording, which is its noise then
+    residual: Array | None = None  # (M, 6) [m] recorded noise, used instead of `noise_m`
 
 
 class Person(NamedTuple):
     """A person's habits. Lengths in metres, (6,) or (2, 3) for the left and then the right hand."""
 
     name: str
-    start: Array  # (2, 3) from where hands usually start
-    reach: Array  # (3, 3) by which they stop off what they reach for, always: handover, board, iron
-    scatter: float  # of that, each axis, each time
-    bows: Array  # (2, 2, 3) of each hand's two legs
+    start: Array  # (2, 3) offset of the hands' start from the nominal start
+    reach: Array  # (3, 3) constant offset of the hands at handover, board and iron
+    scatter: float  # standard deviation of these offsets per axis
+    bows: Array  # (2, 2, 3) bows of the two legs of each hand
     speed: float
     skew: float
-    correction: float  # share of the way that is left to a second, slower motion
-    lead_s: float  # by which the right hand is early
-    dwells: tuple[float, float]  # least and most time for which hands wait at a place
-    haste: float  # share of the left hand's time that the right hand takes to get to the iron
-    sway: float  # of a waiting hand, rms of an axis
-    strays: float  # how probable it is that a waiting hand does something else in between
+    correction: float  # share of a path that a second, slower motion covers
+    lead_s: float  # lead of the right hand
+    dwells: tuple[float, float]  # [s] shortest and longest wait of hands at a place
+    haste: float  # duration of the right hand's motion to the iron / that of the left hand's motion
+    sway: float  # rms of a waiting hand's sway per axis
+    strays: float  # probability that a waiting hand makes another motion
     tremor: float
-    tracker: Tracker
-    mistakes: float = 0.25  # how probable one is in a session
-    swaps: float = 0.25  # how probable it is that a tracker takes left for right for a moment
-    shapes: Sequence[tuple[Array, Array]] = ()  # recorded reaches: shares (M,), deviations (M, 3) a metre, way along x
+    tracker: TrackerModel
+    mistakes: float = 0.25  # probability of a mistake in a session
+    swaps: float = 0.25  # probability that the tracker swaps left and right for a moment
+    shapes: Sequence[tuple[Array, Array]] = ()  # recorded reaches along x: shares (M,), deviations (M, 3) per metre
 
 
 def person(group: Group, number: int) -> Person:
     """One of a group's people."""
-    random = np.random.default_rng([PROJECT_SEED, SEEDS[group], number])
+    random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS[group], number])
     rate = (30.0, 60.0, 120.0)[number % 3]
     bow = random.standard_normal((2, 2, 3))
     bow[..., 2] += 0.7
     bow *= random.uniform(0.0, 0.10, (2, 2, 1)) / np.linalg.norm(bow, axis=2, keepdims=True)
-    bow[..., 2] = np.abs(bow[..., 2])  # over things, not under the table
+    bow[..., 2] = np.abs(bow[..., 2])  # paths are bowed upward
     return Person(
         name=f"{group} {number + 1}",
         start=np.clip(0.04 * random.standard_normal((2, 3)), -0.1, 0.1) * (1.0, 1.0, 0.5) + (0.0, 0.0, 0.01),
@@ -107,13 +107,13 @@ def person(group: Group, number: int) -> Person:
         sway=float(random.uniform(0.001, 0.004)),
         strays=float(random.uniform(0.0, 0.6)),
         tremor=float(random.uniform(0.0003, 0.0012)),
-        tracker=Tracker(
+        tracker=TrackerModel(
             rate, float(random.uniform(0.001, 0.003)), float(random.uniform(0, 0.4)), float(random.uniform(0, 0.1))
         ),
     )
 
 
-PLAIN = Person(
+PLAIN_PERSON = Person(
     name="plain",
     start=np.zeros((2, 3)),
     reach=np.zeros((3, 3)),
@@ -128,7 +128,7 @@ PLAIN = Person(
     sway=0.0015,
     strays=0.0,
     tremor=0.0005,
-    tracker=Tracker(),
+    tracker=TrackerModel(),
     mistakes=0.0,
     swaps=0.0,
 )

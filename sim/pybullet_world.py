@@ -10,13 +10,13 @@ import numpy as np
 from service.settings.config import Settings
 from sim.description import simulated
 from sim.quiet import pybullet
-from sim.world import POSITION_GAIN, UNLIMITED, Body, Floats, Pose, World, camera
+from sim.world import POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody, camera
 
 
 class PyBulletWorld(World):
     """The bench's world, simulated by PyBullet."""
 
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         names = settings.joints.names
         self._id: int = pybullet.connect(pybullet.DIRECT)
         pybullet.setTimeStep(self._period_s, physicsClientId=self._id)
@@ -39,7 +39,7 @@ class PyBulletWorld(World):
             pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._id)
         self._bodies = {name: self._body(body) for name, body in bodies.items()}
 
-    def _body(self, body: Body) -> int:
+    def _body(self, body: WorldBody) -> int:
         size, kind = body.look.size, getattr(pybullet, f"GEOM_{body.look.shape.upper()}")
         box = {"halfExtents": tuple(0.5 * edge for edge in size)}
         shown = box if body.look.shape == "box" else {"radius": size[0] / 2, "length": size[2]}
@@ -56,11 +56,7 @@ class PyBulletWorld(World):
         shape = -1
         if body.solid or body.measured:
             shape = pybullet.createCollisionShape(
-                kind,
-                collisionFramePosition=position,
-                collisionFrameOrientation=turn,
-                physicsClientId=self._id,
-                **felt,
+                kind, collisionFramePosition=position, collisionFrameOrientation=turn, physicsClientId=self._id, **felt
             )
         made: int = pybullet.createMultiBody(
             baseMass=0.0,
@@ -75,7 +71,7 @@ class PyBulletWorld(World):
         return made
 
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Set where the motors go: [rad] with [rad/s] fed forward."""
+        """Set the motors' target positions [rad] and velocities [rad/s]."""
         pybullet.setJointMotorControlArray(
             self._arm,
             self._joints,
@@ -98,7 +94,7 @@ class PyBulletWorld(World):
         return tuple(state[0] for state in states), tuple(state[1] for state in states)
 
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
         state = pybullet.getLinkState(
             self._arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
         )
@@ -110,9 +106,7 @@ class PyBulletWorld(World):
         )
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
-        more.
-        """
+        """Smallest distance between the arm and a measured body [m], but at most `within`."""
         near = pybullet.getClosestPoints(self._arm, self._bodies[body], within, physicsClientId=self._id)
         return min((float(point[8]) for point in near), default=within)
 

@@ -1,4 +1,4 @@
-"""PyBullet, without the line that it prints to standard error where it is imported."""
+"""Import of PyBullet without the line that it prints on standard error."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The soldering scene: where things lie, how long each phase lasts, and the three places taught to
-the service.
+"""The soldering scene: positions of things, durations of phases, and the three via-points that are
+taught to the service.
 
 Frame `base`: metres, z up, the arm's base plate at the origin, the table top at z = 0. The user
 sits at +x and faces -x, so left is -y.
@@ -28,58 +28,53 @@ from service.settings.config import Reach
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 
-TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] where the tool holds the glass, seen from the soldering place
-# Where the tool offers the board, seen from the hand that takes it: the arm stays 4 cm away, the
-# board's edge lies in the hand.
+TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] position of the tool with the glass, relative to the soldering place
+# Position of the tool that offers the board, relative to the hand that takes it: the arm is 4 cm
+# away, and the board's edge is in the hand.
 TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
-RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] where the right hand holds the iron, seen from the soldering place
-GRASP_DISTANCE = 0.03  # [m] within it, a thing can be taken over or is held where it is wanted
-# The tool's +z points 45° forward and down, its y axis stays level: a turn of 135° about y (x y z
-# w).
+RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] position of the hand with the iron, relative to the soldering place
+GRASP_DISTANCE = 0.03  # [m] within this distance a thing is taken over, or is at its target
+# The tool's +z points 45° forward and down, and its y axis is level: a turn of 135° about y.
 TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radians(67.5)))
 # Both hands point at the robot, palms down: half a turn about z.
 HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 
-FAR_OFF = 5.0  # [m] nobody means
-IN_REACH = 0.01  # [m] within its ends
-MOST_MOVED = 0.15  # [m] from the nominal place: beyond it the arm cannot reach every scene
-LOWEST = {  # [m] above the table
+FAR_OFF = 5.0  # [m] a place farther off is probably in other units
+IN_REACH = 0.01  # [m] places are moved this far into the arm's reach
+MOST_MOVED = 0.15  # [m] with a larger distance from the nominal places, the arm cannot reach every scene
+MIN_HEIGHT_M = {  # least height of places above the table
     "robot_start": 0.05,
     "handover": 0.05,
     "glass": 0.05,
     "soldering": 0.05,
     "iron": 0.05,
-    "solder": 0.01,  # nobody's tool goes there
+    "solder": 0.01,  # the tool never moves there
     "left_start": 0.05,
     "right_start": 0.05,
 }
 
 
 class SceneError(ValueError):
-    """A scene that cannot be played: names the place, what was given and what is accepted."""
+    """A scene cannot be played; the message has the place, its value, and accepted values."""
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One soldering scene: places [m, frame `base`] and durations [s]."""
 
     robot_start: Point = (0.45, -0.05, 0.35)
-    handover: Point = (0.62, -0.28, 0.30)  # of the left hand
+    handover: Point = (0.62, -0.28, 0.30)  # the left hand at the handover
     glass: Point = (0.50, 0.38, 0.16)  # the handle of the magnifying glass
-    soldering: Point = (0.75, 0.0, 0.06)  # where the board is soldered
+    soldering: Point = (0.75, 0.0, 0.06)  # the board during soldering
     iron: Point = (0.90, 0.42, 0.10)
     solder: Point = (0.88, 0.22, 0.015)
     left_start: Point = (0.98, -0.32, 0.06)
     right_start: Point = (0.98, 0.32, 0.06)
-    phases_s: tuple[Duration, Duration, Duration] = (
-        3.0,
-        3.5,
-        3.0,
-    )  # board to the left hand; glass; work over the board
+    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)  # handover; fetch the glass; work over the board
     dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)  # the hands rest after each phase
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
     def __post_init__(self) -> None:
-        for name, lowest in LOWEST.items():
+        for name, lowest in MIN_HEIGHT_M.items():
             given: Point = getattr(self, name)
             nominal = _nominal(name)
             moved = math.dist(given, nominal)
@@ -96,17 +91,17 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def right_final(self) -> Point:
-        """Where the right hand holds the iron at the end [m]."""
+        """Final position of the right hand with the iron [m]."""
         return _add(self.soldering, RIGHT_FROM_OBJECT)
 
     @property
     def offer(self) -> Point:
-        """Where the tool offers the board to the left hand [m]."""
+        """Position of the tool that offers the board to the left hand [m]."""
         return _add(self.handover, TOOL_FROM_HAND)
 
     @property
     def carry(self) -> Point:
-        """Where the tool holds the glass over the board [m]."""
+        """Position of the tool that holds the glass over the board [m]."""
         return _add(self.soldering, TOOL_FROM_OBJECT)
 
     @property
@@ -129,8 +124,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return self.dwells[-1][1]
 
     def via_points(self, *, gripper: bool = False) -> tuple[requests.ViaPoint, ...]:
-        """The three via-points, each with a flat neighbourhood of 3 cm: handover, glass and
-        soldering; with what the gripper does there, if wanted.
+        """The three via-points handover, glass and soldering, each with a neighbourhood of 3 cm,
+        and if `gripper` with the state of the gripper.
         """
         s = self
         places = (
@@ -148,11 +143,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         )
 
     def in_reach(self, reach: Reach) -> tuple[Scene, tuple[str, ...]]:
-        """The scene with what an arm does not reach moved over the table until it does, and what
-        was moved, in words. Raises SceneError where that is too far.
+        """The scene with all places moved horizontally into an arm's reach, and messages on the
+        moved places. Raises SceneError if a place must be moved too far.
         """
         places, centre = msgspec.structs.asdict(self), reach.centre
-        said, lost = list[str](), list[str]()
+        moves, lost = list[str](), list[str]()
         for name, tool in (("handover", self.offer), ("glass", self.glass), ("soldering", self.carry)):
             up, out = tool[2] - centre[2], math.dist(tool[:2], centre[:2])
             low, high = (max(r * r - up * up, 0.0) ** 0.5 for r in (reach.inner + IN_REACH, reach.outer - IN_REACH))
@@ -167,24 +162,21 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
                 lost.append(f"{name} needs the tool at x = {at[0]:.2f}, z = {at[2]:.2f} m")
             elif by:
                 places[name] = place
-                said.append(f"{name} moved by {100 * by:.0f} cm into the arm's reach")
+                moves.append(f"{name} moved by {100 * by:.0f} cm into the arm's reach")
         if lost:
             reaches = f"from {reach.inner:.2f} to {reach.outer:.2f} m around its shoulder at {list(centre)}"
             raise SceneError(
                 f"the arm does not reach this scene, not even with each place moved by {MOST_MOVED:g} m: "
                 f"{'; '.join(lost)}. Its tool reaches {reaches}, where x is at least {reach.min_x:g} and z at least "
-                f"{reach.min_z:g} m. What to do: take a larger arm, put this one nearer (`thirdhand arm URDF --at X Y "
-                "Z`), or teach it a task of its own size (docs/tutorial.md). A scene of your own (--scene FILE) moves "
-                f"places by {MOST_MOVED:g} m at most"
+                f"{reach.min_z:g} m. What to do: use a larger arm, place this one nearer (`thirdhand arm URDF --at X Y "
+                "Z`), or teach it a task of its own size (docs/tutorial.md). A scene file (--scene FILE) moves places "
+                f"by at most {MOST_MOVED:g} m"
             )
-        return Scene(**places), tuple(said)
+        return Scene(**places), tuple(moves)
 
     @staticmethod
     def load(path: Path) -> Scene:
-        """The scene in a TOML file, the nominal one where the file says nothing.
-
-        Raises SceneError.
-        """
+        """The scene in a TOML file; places that are not given are nominal. Raises SceneError."""
         try:
             return validated(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
         except (OSError, UnicodeDecodeError) as error:
@@ -194,26 +186,21 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the request that teaches a scene's places.
-
-    The exit code: 0, 1 on failure, 2 on bad usage.
+    """Print the request that teaches a scene's via-points; exit code 0, 1 on failure, 2 on bad
+    usage.
     """
+    from service.cli.usage import option  # its import is slow, and most users of this module do not need it
+
     p = argparse.ArgumentParser(
         prog="python -m sim.scene",
-        description="The places of a scene as a `via_points` request.",
+        description="Prints the via-points of a scene as a `via_points` request.",
         epilog="example:\n  python -m sim.scene my-scene.toml | thirdhand via-points add --file -",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "scene",
-        metavar="FILE",
-        nargs="?",
-        type=Path,
-        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
-    )
-    about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml: what it does not reach is moved"
-    p.add_argument("--arm", default="wam", help=about)
-    p.add_argument("--gripper", action="store_true", help="tell what the gripper does there, too")
+    option(p, "scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)", nargs="?")
+    about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml; places are moved into its reach"
+    option(p, "--arm", "ARM", about, "wam")
+    p.add_argument("--gripper", action="store_true", help="include the state of the gripper")
     args = p.parse_args(arguments)
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
@@ -234,7 +221,7 @@ def _nominal(name: str) -> Point:
 
 
 def _add(a: Point, b: Point) -> Point:
-    # Rounded to 1 µm, so that taught places read as they were meant.
+    # Rounding to 1 µm gives short decimal numbers.
     return (round(a[0] + b[0], 6), round(a[1] + b[1], 6), round(a[2] + b[2], 6))
 
 

@@ -1,9 +1,8 @@
 """Scripted hands and the teacher's tool: minimum-jerk motions through a scene, in phase with each
 other, from a seed.
 
-The robot's place is to be a function of the two hand positions alone, so everything moves by one
-script clock: whatever scatters between demonstrations scatters at the ends of the motions, never in
-their timing.
+The tool's position must be a function of the two hand positions alone, so everything moves by one
+script clock. Demonstrations differ in the ends of the motions, not in their timing.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from sim.scene import HAND_ORIENTATION, TOOL_ORIENTATION, Scene
 
 Array = npt.NDArray[np.float64]
 
-PAUSE_RAMP_S = 0.3  # [s] to come to rest in a pause, and to be at full speed again
+PAUSE_RAMP_S = 0.3  # duration of stopping in a pause, and of accelerating after it
 TREMOR_HZ = (8.0, 10.0)  # physiological tremor of a resting hand
 TREMOR_WAVES = 6
-# Height that the tool gains in the middle of each motion [m], the same in all demonstrations: over
-# the hand, over the bench, over the board.
-GRIP_AT, GRIP_S = 0.88, 0.25  # of a motion the gripper opens or closes, as the hands arrive; how long that takes [s]
+GRIP_AT = 0.88  # the gripper begins to move at this share of a motion, as the hands arrive
+GRIP_S = 0.25  # duration of opening or closing
+# [m] Deviation of the tool in the middle of each motion: over the hand, the bench, and the board.
 TOOL_ARCS = ((0.0, 0.0, 0.03), (0.03, 0.0, 0.05), (0.0, 0.0, 0.04))
 
 
-class Motion(NamedTuple):
+class PointMotion(NamedTuple):
     """Position [m], velocity [m/s] and acceleration [m/s²] of a point, each (3,)."""
 
     position: Array
@@ -38,17 +37,18 @@ class Motion(NamedTuple):
 
 
 class HandMotions(NamedTuple):
-    """What both hands do at one time, free of tremor and noise."""
+    """The motions of both hands at one time, without tremor and noise."""
 
-    left: Motion
-    right: Motion
+    left: PointMotion
+    right: PointMotion
 
 
-class Pause(NamedTuple):
-    """A stop of the script: the hands begin to slow at `at_s` and are at full speed again `lasts_s`
-    later (at least 0.6 s).
+class ScriptPause(NamedTuple):
+    """A pause of the script: the hands begin to slow at `at_s` and are at full speed again
+    `lasts_s` later (at least 0.6 s).
 
-    With a `depth` of 2 they do not stop but go back, as fast as they came, and then come again.
+    With a `depth` of 1 they stop. With a depth of 2 they move back at the same speed, and then
+    forward again.
     """
 
     at_s: float
@@ -59,7 +59,7 @@ class Pause(NamedTuple):
 class Clock:
     """Script time against elapsed time: a speed factor, and pauses that begin and end smoothly."""
 
-    def __init__(self, *, speed: float = 1.0, pauses: Sequence[Pause] = ()) -> None:
+    def __init__(self, *, speed: float = 1.0, pauses: Sequence[ScriptPause] = ()) -> None:
         if not 0.05 <= speed <= 20.0:
             raise ValueError(f"speed {speed} given, 0.05 to 20 accepted")
         for pause in pauses:
@@ -88,13 +88,11 @@ class Clock:
         return self.speed * (t - lost), self.speed * (1.0 - slow), -self.speed * slow_rate
 
     def elapsed(self, script_s: float) -> float:
-        """Seconds after which the script has come to `script_s`, for good where the hands go back
-        in between.
-        """
+        """Time [s] at which the script reaches `script_s` for the last time."""
         low, high = 0.0, script_s / self.speed + sum(p.depth * p.lasts_s for p in self.pauses)
         last = max((p.at_s + p.lasts_s for p in self.pauses), default=0.0)
         if last < high and self.at(last)[0] < script_s:
-            low = last  # from here on it only grows
+            low = last  # after the last pause, script time only grows
         for _ in range(60):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.at(middle)[0] < script_s else (low, middle)
@@ -112,8 +110,8 @@ class Path:
         self._points = [np.asarray(point, dtype=np.float64) for point in points]
         self._arcs = [np.asarray(arc, dtype=np.float64) for arc in arcs] or [np.zeros(3)] * len(segments)
 
-    def at(self, script_s: float, rate: float = 1.0, rate_change: float = 0.0) -> Motion:
-        """The point's motion at a script time [s] whose rate and rate of change are given."""
+    def at(self, script_s: float, rate: float = 1.0, rate_change: float = 0.0) -> PointMotion:
+        """The point's motion at a script time [s], for the time's rate and rate of change [1/s]."""
         i = max((k for k, begin in enumerate(self._begins) if script_s >= begin), default=0)
         lasts = self._lasts[i]
         u = min(max((script_s - self._begins[i]) / lasts, 0.0), 1.0)
@@ -123,15 +121,15 @@ class Path:
         bump, d_bump, dd_bump = 64 * (u * v) ** 3, 192 * (u * v) ** 2 * (v - u), 384 * u * v * ((v - u) ** 2 - u * v)
         d = (d_share * way + d_bump * arc) / lasts
         dd = (dd_share * way + dd_bump * arc) / lasts**2
-        return Motion(start + share * way + bump * arc, d * rate, dd * rate * rate + d * rate_change)
+        return PointMotion(start + share * way + bump * arc, d * rate, dd * rate * rate + d * rate_change)
 
 
 class HandScript:
-    """The user's two hands through one scene: first the board is taken, then board and iron are
-    brought, then the iron is put to the board.
+    """The user's two hands in one scene: they take the board, bring board and iron to the soldering
+    place, and put the iron to the board.
 
-    Ends of the motions are off by `offset_std` [m] per axis, drawn once from the seed. A tracker
-    sees tremor and its own noise on top.
+    The ends of the motions have errors with standard deviation `offset_std` [m] per axis, drawn
+    once from the seed. A tracker adds tremor and its own noise.
     """
 
     def __init__(
@@ -140,7 +138,7 @@ class HandScript:
         *,
         seed: int,
         speed: float = 1.0,
-        pauses: Sequence[Pause] = (),
+        pauses: Sequence[ScriptPause] = (),
         offset_std: float = 0.008,
         tremor_rms: float = 0.0005,
         noise_std: float = 0.0005,
@@ -169,18 +167,17 @@ class HandScript:
         self._tremor_size = tremor_rms * math.sqrt(2.0 / TREMOR_WAVES)
 
     def truth(self, t: float) -> HandMotions:
-        """Both hands' motion `t` seconds after the script began (at rest before it, and after its
-        end).
+        """The motions of both hands at a time `t` [s] after the script's begin; at rest before and
+        after the script.
         """
         now = self.clock.at(max(t, 0.0))
         return HandMotions(self._left.at(*now), self._right.at(*now))
 
     def sample(self, t: float) -> tuple[Array, Array]:
-        """What a tracker reports of the left and the right hand:
+        """The tracked poses of the left and the right hand, (7,) each: x y z [m] and quaternion x y
+        z w.
 
-        (7,) each, x y z [m] and quaternion x y z w.
-
-        Tremor is a function of `t`; noise is drawn anew with each call, in the seed's order.
+        Tremor is a function of `t`; each call draws new noise from the seed's sequence.
         """
         hands = self.truth(t)
         shake = self._tremor_size * np.sin(2 * math.pi * self._tremor_hz * t + self._tremor_phase).sum(axis=0)
@@ -192,7 +189,7 @@ class HandScript:
 
 
 class Teacher:
-    """The robot's tool as a person leads it in a demonstration, in phase with the hands of the same
+    """The tool that a person leads in a demonstration, in phase with the hands of the same
     clock.
     """
 
@@ -206,8 +203,8 @@ class Teacher:
         self._path = Path(points, scene.segments, arcs=TOOL_ARCS)
         self._opens, self._closes = (begin + GRIP_AT * (end - begin) for begin, end in scene.segments[:2])
 
-    def truth(self, t: float) -> Motion:
-        """The tool's motion `t` seconds after the script began."""
+    def truth(self, t: float) -> PointMotion:
+        """The tool's motion at a time `t` [s] after the script's begin."""
         return self._path.at(*self._clock.at(max(t, 0.0)))
 
     def sample(self, t: float) -> Array:
@@ -215,7 +212,7 @@ class Teacher:
         return np.concatenate((self.truth(t).position, TOOL_ORIENTATION))
 
     def closure(self, t: float) -> float:
-        """How far the gripper is closed, 0 to 1: it lets the board go at the hand, and takes the
+        """Closure of the gripper, 0 open to 1 closed: it opens at the handover and closes at the
         glass.
         """
         script_s = self._clock.at(max(t, 0.0))[0]

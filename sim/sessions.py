@@ -1,5 +1,5 @@
-"""Sessions of modelled people: their hands through a scene, what a tracker says of them, and the
-tool as a teacher who knows the scene leads it. NumPy only, each from its numbers alone.
+"""Sessions of modelled people: the motions of their hands in a scene, the samples of a tracker, and
+the tool as led by a teacher who knows the scene. Each depends only on its numbers.
 """
 
 from __future__ import annotations
@@ -10,16 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.people import LONGEST_LEAD_S, PLAIN, PROJECT_SEED, SEEDS, Group, Person, Places, person
+from sim.people import GROUP_SEEDS, LONGEST_LEAD_S, PLAIN_PERSON, PROJECT_SEED, Group, Person, Places, person
 from sim.scene import MOST_MOVED, TOOL_FROM_HAND, Scene
 from sim.script import TOOL_ARCS, Array
 
-REST_S, LAST_S = 1.0, 1.6  # before the first motion, after the last
-PHASES_S = (3.0, 3.5, 3.0)  # at a speed of 1
-LOWEST_M = 0.03  # of a hand above the table
-SHAPE_STEPS = 200
-TEACHERS_SCATTER_M, TEACHERS_LAG_S = 0.005, 0.1
-EVENTS = ("handover", "glass", "soldering")
+REST_S = 1.0  # rest before the first motion
+LAST_S = 1.6  # rest after the last motion
+PHASES_S = (3.0, 3.5, 3.0)  # durations of the motions at a speed of 1
+MIN_HAND_HEIGHT_M = 0.03  # least height above the table
+SHAPE_STEPS = 200  # length of the table of a path's shape
+TEACHERS_SCATTER_M = 0.005  # standard deviation of the teacher's places per axis
+TEACHERS_LAG_S = 0.1  # longest delay of the teacher
+SESSION_EVENTS = ("handover", "glass", "soldering")
 MISTAKES = ("board first", "handover again", "iron again", "solder again", "right to the board")
 BREAKING = (
     "hands stop 24 mm off",
@@ -31,8 +33,8 @@ BREAKING = (
 
 
 class Leg(NamedTuple):
-    """A motion of one hand: its ends (3,) [m], the tables of its share of the way (M,) and of its
-    deviation from the straight line (M, 3) [m], and the progress of the task at its ends.
+    """A motion of one hand: its ends (3,) [m], tables of the covered share of the path (M,) and of
+    the deviation from a straight line (M, 3) [m], and the progress of the task at its ends.
     """
 
     begin_s: float
@@ -45,44 +47,44 @@ class Leg(NamedTuple):
 
     @property
     def end_s(self) -> float:
-        """When it is over."""
+        """End of the motion [s]."""
         return self.begin_s + self.lasts_s
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """One run: a person's hands through a scene, and what is known of it."""
+    """One run: the motions of a person's hands in a scene, and its true and perceived places."""
 
     person: Person
     number: int
-    places: Places  # as they are
-    told: Places  # as they are perceived
+    places: Places  # true places
+    told: Places  # perceived places
     legs: tuple[tuple[Leg, ...], tuple[Leg, ...]]
-    windows: tuple[tuple[float, float], ...]  # [s] in which the tool is wanted at each of EVENTS
+    windows: tuple[tuple[float, float], ...]  # [s] times in which the tool must be at each of SESSION_EVENTS
     lasts_s: float
     seed: tuple[int, ...]
     swapped_s: tuple[float, float] = (np.inf, np.inf)
     mistake: str = ""
 
     def hands(self, times: Array) -> Array:
-        """Both hands (T, 6) [m] as they are."""
+        """True positions of both hands (T, 6) [m]."""
         return np.hstack([along(self.legs[side], times)[0] for side in (0, 1)]) + sum(
             restless(self.person, self.seed, times)
         )
 
     def progress(self, times: Array) -> Array:
-        """How far the task has come by each hand's way (T, 2): 0 at the start, 1 and 2 where its
-        legs end.
+        """Progress of the task by each hand (T, 2): 0 at the start, 1 and 2 at the ends of the
+        legs.
         """
         return np.stack([along(self.legs[side], times)[1] for side in (0, 1)], axis=1)
 
     def tool(self, times: Array, *, off: Array | None = None) -> Array:
-        """The tool (T, 3) [m] as a teacher leads it who knows the scene and sees how far the hands
-        have come.
+        """The tool's positions (T, 3) [m], led by a teacher who knows the scene and the progress of
+        the hands.
 
-        It comes to the left hand as that reaches for the board, fetches the glass as the left hand
-        takes the board away, and brings it as the right hand comes with the iron. `off` (4, 3)
-        moves the ends.
+        It moves to the left hand while that reaches for the board, fetches the glass while the left
+        hand takes the board away, and brings the glass while the right hand brings the iron. `off`
+        (4, 3) [m] moves the ends.
         """
         left, right = self.progress(times).T
         handed = self.legs[0][self._leg_to_handover()].end + TOOL_FROM_HAND
@@ -94,7 +96,7 @@ class Session:
         return np.asarray(ends[0] + shares @ np.diff(ends, axis=0) + bumps @ np.array(TOOL_ARCS) + with_hand)
 
     def samples(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """What the tracker says of the left and of the right hand: times (M,) [s], positions (M, 3)
+        """The tracked samples of the left and the right hand: times (M,) [s], positions (M, 3)
         [m].
         """
         tracker, random = self.person.tracker, np.random.default_rng([*self.seed, 1])
@@ -121,7 +123,7 @@ class Session:
 
 
 def along(legs: Sequence[Leg], times: Array) -> tuple[Array, Array]:
-    """A hand that goes these legs: where it is (T, 3) [m], and the progress of the task (T,)."""
+    """Positions (T, 3) [m] of a hand on these legs, and the progress of the task (T,)."""
     x, progress = np.tile(legs[0].start, (len(times), 1)), np.full(len(times), float(legs[0].progress[0]))
     for leg in legs:
         on = times >= leg.begin_s
@@ -147,10 +149,10 @@ def restless(who: Person, seed: Sequence[int], times: Array) -> tuple[Array, Arr
 
 
 def session(who: Person, number: int, *, group: Group, sigma_m: float = 0.0, moved_m: float = MOST_MOVED) -> Session:
-    """A run of a person through a scene whose things lie up to `moved_m` from their usual places,
-    and are perceived with an error of `sigma_m` (3-D rms).
+    """A person's run in a scene whose things are up to `moved_m` away from their nominal places and
+    are perceived with an error of `sigma_m` (3-D rms).
     """
-    seed = (PROJECT_SEED, SEEDS[group], int("".join(c for c in who.name if c.isdigit()) or 0), number + 1)
+    seed = (PROJECT_SEED, GROUP_SEEDS[group], int("".join(c for c in who.name if c.isdigit()) or 0), number + 1)
     random = np.random.default_rng(seed)
     scene = Scene()
     usual = (scene.handover, scene.glass, scene.soldering, scene.iron)
@@ -166,13 +168,13 @@ def session(who: Person, number: int, *, group: Group, sigma_m: float = 0.0, mov
 def played(
     who: Person, number: int, places: Places, told: Places, *, seed: tuple[int, ...], mistake: str = ""
 ) -> Session:
-    """The person's run through these places, with one of MISTAKES or none."""
+    """A person's run with these places, and with one of MISTAKES or none."""
     random = np.random.default_rng([*seed, 3])
     scatter = who.scatter * random.standard_normal((2, 3, 3))
     at_handover, at_board, at_iron = who.reach
     left = np.array([places.left_start, places.handover + at_handover, places.board + at_board]) + scatter[0]
     right = np.array([places.right_start, places.iron + at_iron, places.right_final + at_iron]) + scatter[1]
-    left[:, 2], right[:, 2] = np.maximum(left[:, 2], LOWEST_M), np.maximum(right[:, 2], LOWEST_M)
+    left[:, 2], right[:, 2] = np.maximum(left[:, 2], MIN_HAND_HEIGHT_M), np.maximum(right[:, 2], MIN_HAND_HEIGHT_M)
     lasts = np.array(PHASES_S) / who.speed * random.uniform(0.85, 1.15, 3)
     dwell = random.uniform(*who.dwells, 2)
     hands: tuple[list[Leg], list[Leg]] = ([], [])
@@ -194,7 +196,7 @@ def played(
         at = there_and_back(0, at, left[0], left[0] + 0.7 * (left[2] - left[0]), (0.0, 0.0)) + 0.2
     if mistake == "right to the board":
         there_and_back(1, at, right[0], right[0] + 0.7 * (right[2] - right[0]), (0.0, 0.0))
-        at += 1.0  # the left hand waits to see what that is about
+        at += 1.0  # the left hand waits for the right one
     elif random.random() < who.strays:
         stray = right[0] + random.uniform(-0.1, 0.1, 3) * (1.0, 1.0, 0.3)
         there_and_back(1, at + random.uniform(0.0, lasts[0]), right[0], stray, (0.0, 0.0))
@@ -220,9 +222,9 @@ def played(
     return Session(who, number, places, told, (tuple(hands[0]), tuple(hands[1])), windows, end, seed, swapped, mistake)
 
 
-class Shown(NamedTuple):
-    """A demonstration: times (T,) [s], hands (T, 6) as tracked, tool (T, 3) [m], and the places as
-    they were perceived.
+class SessionDemonstration(NamedTuple):
+    """A demonstration: times (T,) [s], tracked hands (T, 6) [m], tool (T, 3) [m], and the perceived
+    places.
     """
 
     times: Array
@@ -231,20 +233,20 @@ class Shown(NamedTuple):
     places: Places
 
 
-def demonstration(run: Session, *, rate_hz: float = 25.0) -> Shown:
-    """What is recorded of a run in which a teacher, who knows the scene, leads the tool: a little
-    late, and off by some millimetres.
+def demonstration(run: Session, *, rate_hz: float = 25.0) -> SessionDemonstration:
+    """The demonstration of a run in which a teacher leads the tool with a small delay and an error
+    of some millimetres.
     """
     random = np.random.default_rng([*run.seed, 4])
     lag, off = TEACHERS_LAG_S * random.random(), TEACHERS_SCATTER_M * random.standard_normal((4, 3))
     times = np.arange(0.2, run.lasts_s - 0.05, 1.0 / rate_hz)
     hands = [np.interp(times, stamps, column) for stamps, seen in run.samples() for column in seen.T]
-    return Shown(times, np.stack(hands, axis=1), run.tool(times - lag, off=off), run.told)
+    return SessionDemonstration(times, np.stack(hands, axis=1), run.tool(times - lag, off=off), run.told)
 
 
-def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[Shown]:
-    """Two of each demonstrating person: things in their usual places, and things moved by up to
-    10 cm. Who makes a mistake does it again, so there is none.
+def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[SessionDemonstration]:
+    """Two demonstrations of each person, with things in their nominal places and with things moved
+    by up to 10 cm. There are no mistakes, because a person repeats a failed demonstration.
     """
     careful = [person("demonstrations", number)._replace(mistakes=0.0, swaps=0.0) for number in range(people)]
     return [
@@ -255,14 +257,14 @@ def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[Shown]:
 
 
 def breaking(kind: str, number: int, *, group: Group) -> Session:
-    """A run that differs from what was demonstrated in one way, one of BREAKING; places exact.
+    """A run that differs from the demonstrations by one of BREAKING, with exactly perceived places.
 
-    The hands are the bench's: together, straight, evenly fast, a good tracker. The iron that is
-    elsewhere is not told of: only hands go there.
+    The hands are those of the bench: synchronous, straight, at an even speed, with a good tracker.
+    If the iron is elsewhere, the perceived places do not show it: only the hands move there.
     """
-    seed = (PROJECT_SEED, SEEDS[group], 1000 + BREAKING.index(kind), number)
+    seed = (PROJECT_SEED, GROUP_SEEDS[group], 1000 + BREAKING.index(kind), number)
     random = np.random.default_rng(seed)
-    scene, who = Scene(), PLAIN
+    scene, who = Scene(), PLAIN_PERSON
     usual = (scene.handover, scene.glass, scene.soldering)
     handover, glass, board = (_moved(np.array(place), MOST_MOVED, random) for place in usual)
     starts = np.array(scene.left_start), np.array(scene.right_start)
@@ -284,7 +286,7 @@ def breaking(kind: str, number: int, *, group: Group) -> Session:
 
 
 def _moved(place: Array, most_m: float, random: np.random.Generator) -> Array:
-    """A place anywhere in the ball around a place, and high enough."""
+    """A random place in a ball around a place, and high enough above the table."""
     while True:
         step = random.uniform(-1.0, 1.0, 3)
         if np.linalg.norm(step) < 0.999 and place[2] + most_m * step[2] >= 0.05:
@@ -292,16 +294,18 @@ def _moved(place: Array, most_m: float, random: np.random.Generator) -> Array:
 
 
 def _away(place: Array, distance_m: float, random: np.random.Generator) -> Array:
-    """A place so far from a place, and above the table."""
+    """A random place at a distance from a place, and above the table."""
     while True:
         way = random.standard_normal(3) * (1.0, 1.0, 0.5)
         there = place + distance_m * way / np.linalg.norm(way)
-        if there[2] >= LOWEST_M:
+        if there[2] >= MIN_HAND_HEIGHT_M:
             return np.asarray(there)
 
 
 def shape(who: Person, ends: Array, bow: Array | None, random: np.random.Generator) -> tuple[Array, Array]:
-    """The tables of a leg between ends (2, 3): shares of the way, and deviations from it [m]."""
+    """The tables of a leg between ends (2, 3) [m]: shares of the path (M,), deviations (M, 3)
+    [m].
+    """
     way = ends[1] - ends[0]
     length = float(np.linalg.norm(way))
     if who.shapes and bow is not None:
@@ -323,7 +327,7 @@ def _minimum_jerk(u: Array) -> Array:
 
 
 def _turn_from_x(way: Array) -> Array:
-    """A rotation (3, 3) that takes x to a unit vector and keeps up as far up as it can."""
+    """A rotation (3, 3) from x to a unit vector, with the smallest tilt of the vertical axis."""
     up = np.array([0.0, 0.0, 1.0]) if abs(way[2]) < 0.95 else np.array([0.0, 1.0, 0.0])
     side = np.cross(up, way)
     side /= np.linalg.norm(side)

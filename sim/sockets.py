@@ -1,4 +1,4 @@
-"""A relay of TCP connections that counts what passes."""
+"""A relay of TCP connections that counts bytes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from typing import Self
 
 
 class CountingRelay:
-    """Carries bytes between whoever connects to `endpoint` and a target, as long as its context
-    lasts.
-    """
+    """A relay between clients of `endpoint` and a target; a context."""
 
     def __init__(self, target: str) -> None:
         host, _, port = target.removeprefix("tcp/").rpartition(":")
@@ -23,7 +21,7 @@ class CountingRelay:
         self._spawn(self._accept)
 
     def counted(self) -> tuple[int, int]:
-        """Bytes that were carried to the target and back from it so far."""
+        """Numbers of bytes that were sent to the target and received from it."""
         return self._there, self._back
 
     def __enter__(self) -> Self:
@@ -40,7 +38,7 @@ class CountingRelay:
         threading.Thread(target=work, args=arguments, name="relay", daemon=True).start()  # type: ignore[arg-type]
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # it is closed
+        with contextlib.suppress(OSError):  # the socket was closed
             while True:
                 near, _ = self._listening.accept()
                 far = socket.create_connection(self._target)

@@ -1,5 +1,5 @@
-"""`python -m sim.teach`: demonstrations of the soldering scene, as MCAP files (the same bytes for
-the same seed), or published live for `thirdhand record`.
+"""`python -m sim.teach`: demonstrations of the soldering scene, as MCAP files with equal bytes for
+equal seeds, or published live for `thirdhand record`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import zenoh
 
+from service.cli.usage import option
 from service.client import ClientSettings, client_settings
 from service.contract import cdr
 from service.contract.channels import ENDPOINT, key
@@ -32,17 +32,20 @@ from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
 from sim.script import Array, Clock, HandScript, Teacher
 
-RADIUS_M, LEAST_STD_M = 0.03, 0.001  # of the neighbourhood of each place, as the bench teaches them
-EXAMPLE = """example:
+RADIUS_M = 0.03  # radius of via-points
+MIN_PLACE_STD_M = 0.001  # least standard deviation of via-points
+TEACH_EXAMPLE = """example:
   python -m sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m sim.teach --output demonstrations --count 6
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
-BEFORE_S, AFTER_S = 0.5, 3.0  # of rest
-TRAY, BESIDE = (0.95, -0.15, 0.12), (0.95, 0.35, 0.07)  # [m] where the left hand comes twice; where the right one rests
-VISITED = made_tasks.Scene(
+REST_BEFORE_S = 0.5  # rest before a published demonstration
+REST_AFTER_S = 3.0  # rest after a published demonstration
+TRAY = (0.95, -0.15, 0.12)  # [m] the left hand visits this place twice
+RIGHT_REST = (0.95, 0.35, 0.07)  # [m] the right hand rests here
+VISITED = made_tasks.TaskScene(
     np.array([(0.60, -0.30, 0.07), TRAY, (0.70, 0.02, 0.22), TRAY, (0.75, -0.42, 0.25)]),
-    np.array([BESIDE, BESIDE, (0.78, 0.20, 0.20), BESIDE, BESIDE]),
+    np.array([RIGHT_REST, RIGHT_REST, (0.78, 0.20, 0.20), RIGHT_REST, RIGHT_REST]),
     np.array([(0.42, -0.28, 0.35), (0.62, -0.20, 0.30), (0.50, 0.15, 0.25), (0.38, -0.05, 0.40), (0.45, 0.30, 0.22)]),
     np.zeros((5, 3)),
 )
@@ -51,8 +54,8 @@ VISITED = made_tasks.Scene(
 def demonstrate(
     scene: Scene, *, seed: int, rate_hz: int = 100, begin_s: int = 0, gripper: bool = False
 ) -> Demonstration:
-    """One demonstration of a scene, sampled at `rate_hz`: hands as a tracker sees them, the tool as
-    the arm measures it, and what the gripper does, if wanted.
+    """One demonstration of a scene at `rate_hz`: tracked hands, the measured tool, and if `gripper`
+    the closure of the gripper.
     """
     script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
     steps = np.arange(round(scene.duration_s * rate_hz) + 1)
@@ -68,9 +71,7 @@ def demonstrate(
 
 
 def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False) -> list[Demonstration]:
-    """Several demonstrations of a scene, one a minute; the first ones do not depend on how many
-    there are.
-    """
+    """`count` demonstrations of a scene, one a minute; each is independent of `count`."""
     return [
         demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number, gripper=gripper)
         for number in range(1, count + 1)
@@ -78,14 +79,14 @@ def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False
 
 
 def by_people(people: int) -> list[Demonstration]:
-    """Two demonstrations of each of so many modelled people, things in their usual places and
-    moved, which name the task's places.
+    """Two demonstrations of each modelled person, with things in their nominal places and moved,
+    and with via-points.
     """
     return [recorded(one, begin_s=60 * number) for number, one in enumerate(sessions.demonstrations(people))]
 
 
-def recorded(shown: sessions.Shown, *, begin_s: int = 1) -> Demonstration:
-    """A demonstration of a session, as the service reads it from a recording."""
+def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demonstration:
+    """A demonstration of a session in the service's format."""
     count = len(shown.times)
     still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
     return Demonstration(
@@ -98,12 +99,10 @@ def recorded(shown: sessions.Shown, *, begin_s: int = 1) -> Demonstration:
 
 
 def places_of(places: Places) -> tuple[ViaPoint, ...]:
-    """The named places of the task, as the bench teaches them, in the order in which the tool comes
-    to them, with how sure they are.
-
-    A place's `std` is of each axis, its error 3-D rms.
+    """The via-points of the task in the order of the tool's motion, with their standard deviations
+    per axis: the error of the places (3-D rms) / sqrt(3).
     """
-    p, std = places, max(places.std_m / math.sqrt(3.0), LEAST_STD_M)
+    p, std = places, max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
     named = (
         ("start", p.left_start, p.right_start, p.robot_start),
         ("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND),
@@ -126,19 +125,19 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 def perform(
     scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
 ) -> bool:
-    """Publishes one demonstration of the soldering scene, see `publish`."""
+    """Publish one demonstration of the soldering scene, see `publish`."""
     script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
 
     def poses(t: float) -> tuple[Array, ...]:
         return (*script.sample(t), teacher.sample(t))
 
     return publish(
-        poses, script.duration_s, BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
+        poses, script.duration_s, REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
     )
 
 
 def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float) -> bool:
-    """Publishes how a person does the task that visits a place twice, see `publish`."""
+    """Publish a person's run of the task that visits a place twice, see `publish`."""
     shown = visits(number)
     times = shown.period_s * np.arange(len(shown.tool)) / speed
 
@@ -147,11 +146,11 @@ def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: flo
         at = ([np.interp(t, times, column) for column in part[:, :3].T] for part in shown[1:4])
         return tuple(np.append(one, part[row, 3:]) for one, part in zip(at, shown[1:4], strict=True))
 
-    return publish(poses, float(times[-1]), BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
+    return publish(poses, float(times[-1]), REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
 
 
 def visits(number: int) -> Demonstration:
-    """The demonstration of that task of this number, from 1; each is another person's."""
+    """A demonstration of that task; each number, from 1 on, is another person."""
     return made_tasks.run(made_tasks.TAUGHT, number - 1, 0, scene=VISITED).demonstration()
 
 
@@ -165,11 +164,11 @@ def publish(
     wait_s: float,
     rate_hz: int = 100,
 ) -> bool:
-    """Publishes hands and tool in real time, as their tracker would, from when somebody listens to
-    the hands until nobody does: they rest for `before_s` first, and AFTER_S at the end. `poses` are
-    those at a time [s] from the begin, (7,) each.
+    """Publish hands and tool in real time, as their tracker would, from when somebody listens to
+    the hands until nobody does: they rest for `before_s` first, and REST_AFTER_S at the end.
+    `poses` are those at a time [s] from the begin, (7,) each.
 
-    Whether somebody listened to its end. Raises UnreachableError.
+    Returns True if both hands had a subscriber until the end. Raises UnreachableError.
     """
     with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
@@ -182,7 +181,7 @@ def publish(
         begin, step = time.monotonic() + before_s, 0
         while _are_heard(of_hands):
             t = time.monotonic() - begin
-            if t > lasts_s + AFTER_S:
+            if t > lasts_s + REST_AFTER_S:
                 return True
             stamp_ns = time.time_ns()
             for publisher, pose in zip(publishers, poses(t), strict=True):
@@ -194,68 +193,46 @@ def publish(
 
 
 def _are_heard(publishers: list[zenoh.Publisher]) -> bool:
-    """Whether somebody listens to each."""
+    """True if each publisher has a subscriber."""
     return all(publisher.matching_status.matching for publisher in publishers)  # type: ignore[attr-defined]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Make or publish demonstrations; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m sim.teach",
-        description="Demonstrations of the soldering scene: hands and tool at 100 Hz, one MCAP file each, or live.",
-        epilog=EXAMPLE,
+        description="Demonstrations of the soldering scene with hands and tool at 100 Hz, as MCAP files or live.",
+        epilog=TEACH_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument(
-        "--output",
-        metavar="DIR",
-        type=Path,
-        help="folder for demonstration-1.mcap and so on; made if missing",
-    )
-    p.add_argument(
-        "--live", action="store_true", help="publish them instead, each from when somebody listens to the hands"
-    )
-    p.add_argument(
-        "--connect", metavar="EP", action="append", help=f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
-    )
-    p.add_argument("--speed", metavar="X", type=float, default=1.0, help="times as fast (default: %(default)s)")
-    p.add_argument(
-        "--wait", metavar="S", type=float, default=60.0, help="for somebody who listens (default: %(default)s)"
-    )
-    p.add_argument("--count", type=int, default=6, help="how many (default: %(default)s)")
-    p.add_argument("--seed", type=int, help="of their scatter (default: the scene's)")
-    p.add_argument(
-        "--scene",
-        metavar="FILE",
-        type=Path,
-        help="TOML file with places [x, y, z] in metres; the nominal scene otherwise",
-    )
-    p.add_argument(
-        "--people",
-        action="store_true",
-        help="by modelled people, two of each, with things moved and named: what is learned between places",
-    )
-    p.add_argument(
-        "--visits",
-        action="store_true",
-        help="another task, between five named via-points, with one place visited twice; with --live or --places",
-    )
-    p.add_argument(
-        "--places", metavar="FILE", type=Path, help="with --visits: write where they are, as `record --places` takes it"
-    )
-    p.add_argument("--cell", help="prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
-    p.add_argument("--gripper", action="store_true", help="tell what the gripper does, too")
+    option(p, "--output", "DIR", "folder for demonstration-1.mcap and so on; made if missing")
+    live = "publish them instead, each from the first subscriber of the hands on"
+    p.add_argument("--live", action="store_true", help=live)
+    connect = f"Zenoh endpoint ($THIRDHAND_CONNECT, else {ENDPOINT})"
+    option(p, "--connect", "EP", connect, action="append", type=str)
+    option(p, "--speed", "X", "the relative speed of the motions", 1.0, type=float)
+    option(p, "--wait", "S", "wait this long for a subscriber", 60.0)
+    option(p, "--count", None, "the number of demonstrations", 6, type=int)
+    option(p, "--seed", None, "the seed of their scatter (default: the scene's)", type=int)
+    option(p, "--scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)")
+    people = "two demonstrations each by modelled people, with moved things and via-points"
+    p.add_argument("--people", action="store_true", help=people)
+    visit = "another task, between five named via-points, with one place visited twice; with --live or --places"
+    p.add_argument("--visits", action="store_true", help=visit)
+    option(p, "--places", "FILE", "with --visits: write its via-points for `record --places`")
+    option(p, "--cell", "NAME", "prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
+    p.add_argument("--gripper", action="store_true", help="include the closure of the gripper")
     args = p.parse_args(arguments)
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
     if [args.live, args.output is not None, args.places is not None].count(True) != 1:
-        p.error("--output DIR, --live or --places FILE needed, and one of them")
+        p.error("exactly one of --output DIR, --live and --places FILE needed")
     if args.visits == (args.output is not None) and (args.visits or args.places):
-        p.error("--visits goes with --live or --places, and --places with --visits")
+        p.error("--visits needs --live or --places, and --places needs --visits")
     if args.live and args.people:
-        p.error("--people goes with --output: people show nothing live")
+        p.error("--people needs --output, not --live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
     try:
@@ -287,15 +264,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) -> int:
-    """The exit code: 1 where nobody listened to the end of each."""
+    """Publish all demonstrations; exit code 1 if one had no subscriber until its end."""
     seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
         to = {"connect": reach.connect, "cell": reach.cell, "speed": args.speed, "wait_s": args.wait}
         heard = perform_visits(number, **to) if args.visits else perform(scene, seed=1000 * seed + number, **to)
         if not heard:
-            print(f"python -m sim.teach: nobody listened to demonstration {number} to its end", file=sys.stderr)
+            print(f"python -m sim.teach: demonstration {number} had no subscriber until its end", file=sys.stderr)
             return 1
-        print(f"demonstration {number} of {args.count} shown", file=sys.stderr, flush=True)
+        print(f"demonstration {number} of {args.count} published", file=sys.stderr, flush=True)
     return 0
 
 

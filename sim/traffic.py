@@ -1,4 +1,4 @@
-"""What a cell says and hears on a network, measured, and what many would need of their router.
+"""Measurement of a cell's traffic on a network, and an estimate for a router of many cells.
 
 python -m sim.traffic [--seconds S] [--cells N]
 
@@ -28,17 +28,17 @@ import zenoh
 from service.client import Client, open_session
 from service.contract.explain import ExplainedError, in_words
 from service.daemon.launch import launched
-from sim.parts import Part, PartError
+from sim.parts import CELL, CellPart, PartError
 from sim.sockets import CountingRelay
 
-CELL = "thirdhand"
-READY_S, SETTLE_S = 60.0, 2.0
+READY_S = 60.0  # the service must follow the bench within this time
+TRAFFIC_SETTLE_S = 2.0
 OURS = {"service": "daemon", "bench": "arm and tracker", "observer": "observer of every stream"}
 
 
-class Measured(NamedTuple):
-    """Rates [messages/s, bytes/s] by key, [bytes/s] sent to and received from the router by each
-    of OURS, and the share of a core that the router took.
+class Traffic(NamedTuple):
+    """Rates [messages/s, bytes/s] by key, bytes per second that each of OURS sent to and received
+    from the router, and the share of a core that the router used.
     """
 
     messages: dict[str, float]
@@ -48,11 +48,11 @@ class Measured(NamedTuple):
     router_cores: float
 
 
-def measured(seconds: float) -> Measured:
-    """One cell's traffic over so many seconds. Raises ExplainedError and PartError."""
+def measured(seconds: float) -> Traffic:
+    """Measure one cell's traffic over a time [s]. Raises ExplainedError, PartError."""
     with contextlib.ExitStack() as closing:
         folder = Path(closing.enter_context(tempfile.TemporaryDirectory()))
-        router = closing.enter_context(contextlib.closing(Part("router", "0")))
+        router = closing.enter_context(contextlib.closing(CellPart("router", "0")))
         relays = {who: closing.enter_context(CountingRelay(router.endpoint)) for who in OURS}
         network = f'[network]\nlisten = []\nconnect = ["{relays["service"].endpoint}"]\n'
         closing.enter_context(launched(folder, network=network))
@@ -66,7 +66,7 @@ def measured(seconds: float) -> Measured:
         session = closing.enter_context(open_session(connect=[relays["observer"].endpoint]))
         client = Client(session, CELL)
         _until_following(client)
-        time.sleep(SETTLE_S)
+        time.sleep(TRAFFIC_SETTLE_S)
         messages, payload, lock = Counter[str](), Counter[str](), threading.Lock()
 
         def count(sample: zenoh.Sample) -> None:
@@ -86,9 +86,9 @@ def measured(seconds: float) -> Measured:
             for who, relay in relays.items()
         }
         if (now := client.status()).mode == "fault":
-            raise ExplainedError(f"the service is at fault ({now.reason}): try again while less else runs")
+            raise ExplainedError(f"the service is in fault ({now.reason}): try again on a machine with less load")
         with lock:
-            return Measured(
+            return Traffic(
                 {key: count / lasted for key, count in sorted(messages.items())},
                 {key: size / lasted for key, size in sorted(payload.items())},
                 {who: rate[0] for who, rate in rates.items()},
@@ -105,8 +105,8 @@ def _until_following(client: Client) -> None:
         time.sleep(0.1)
 
 
-def text(one: Measured, cells: int) -> str:
-    """The figures for people to read, and what so many cells would need."""
+def text(one: Traffic, cells: int) -> str:
+    """The measurement as a table in text, and an estimate for many cells."""
     lines = [f"{'':<28}{'messages/s':>12}{'payload kB/s':>14}"]
     for key in one.messages:
         lines.append(f"  {key:<26}{one.messages[key]:12.1f}{one.payload[key] / 1e3:14.1f}")
@@ -119,7 +119,7 @@ def text(one: Measured, cells: int) -> str:
     lines += [
         f"  router: {100 * one.router_cores:.0f} % of a core",
         "",
-        f"{cells} such cells on one router, calculated:",
+        f"estimate for {cells} such cells on one router:",
         f"  {_mbit(cells * passed):.0f} Mbit/s through it, {2 * cells} sessions, "
         f"at most {cells * one.router_cores:.1f} cores (this router passes each stream to an observer too)",
         f"  one more observer of every status: {_mbit(cells * status):.1f} Mbit/s; of every stream: "
@@ -133,11 +133,13 @@ def _mbit(bytes_per_s: float) -> float:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 on failure, 2 on bad usage."""
+    """Measure and print; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(prog="python -m sim.traffic", description=__doc__)
     p.formatter_class = argparse.RawDescriptionHelpFormatter
-    p.add_argument("--seconds", metavar="S", type=float, default=8.0, help="to measure for (default: %(default)g)")
-    p.add_argument("--cells", metavar="N", type=int, default=100, help="to calculate for (default: %(default)s)")
+    p.add_argument(
+        "--seconds", metavar="S", type=float, default=8.0, help="measure for this time (default: %(default)g)"
+    )
+    p.add_argument("--cells", metavar="N", type=int, default=100, help="estimate for this many (default: %(default)s)")
     args = p.parse_args(arguments)
     try:
         print(text(measured(args.seconds), args.cells))

@@ -1,9 +1,8 @@
-"""The bench's world, whichever engine simulates it: an arm, and around it table, board, magnifying
-glass, iron, solder and two hands. Headless, one step at a time.
+"""The bench's world for any physics engine: an arm, and around it table, board, magnifying glass,
+iron, solder and two hands. It runs without a screen, step by step.
 
-Only the arm is dynamic, and only the table stops it. Things that are held are moved with their
-holder: there is no grip to tune, and contact with what the arm grasps would push it away by
-centimetres.
+Only the arm is dynamic, and only the table stops it. Held things move with their holder: there is
+no grip to tune, and contact with a grasped thing would push the arm away by centimetres.
 """
 
 from __future__ import annotations
@@ -23,17 +22,16 @@ from sim.scene import HAND_ORIENTATION, Scene
 Floats = tuple[float, ...]
 ALONG_X = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))  # a capsule's own axis is z
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-POSITION_GAIN = 0.3  # this much of a position error is made up in one step
+POSITION_GAIN = 0.3  # a motor corrects this share of its position error in one step
 TABLE_THICKNESS = 0.04  # [m]
-UNLIMITED = 1e6  # [N m] of a motor of which the description does not say it
-FIELD_OF_VIEW, NEAR, FAR = 45.0, 0.1, 5.0  # of pictures: upright [degrees], and from where to where [m]
-GREEN, STEEL, WOOD, SKIN, BLUE = (
-    (0.1, 0.5, 0.2, 1.0),
-    (0.7, 0.7, 0.75, 1.0),
-    (0.75, 0.6, 0.4, 1.0),
-    (0.9, 0.7, 0.6, 1.0),
-    (0.2, 0.4, 0.8, 1.0),
-)
+UNLIMITED = 1e6  # [N m] effort of a motor without a limit in the description
+FIELD_OF_VIEW = 45.0  # [degrees] vertical field of view of pictures
+NEAR_PLANE_M, FAR_PLANE_M = 0.1, 5.0  # distances between which a camera draws
+BOARD_RGBA = (0.1, 0.5, 0.2, 1.0)
+STEEL_RGBA = (0.7, 0.7, 0.75, 1.0)
+WOOD_RGBA = (0.75, 0.6, 0.4, 1.0)
+SKIN_RGBA = (0.9, 0.7, 0.6, 1.0)
+IRON_RGBA = (0.2, 0.4, 0.8, 1.0)
 
 
 class Pose(NamedTuple):
@@ -48,8 +46,8 @@ BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.co
 
 
 class Look(NamedTuple):
-    """How a thing looks: a `box`, a `cylinder`, or a `capsule` (its size along z is its axis'), of
-    a size x y z [m]; and its colour.
+    """The look of a thing: its shape, which is `box`, `cylinder` or `capsule`, its size x y z [m],
+    for a capsule with the length of the axis as z, and its colour.
     """
 
     shape: str
@@ -57,9 +55,9 @@ class Look(NamedTuple):
     colour: Floats
 
 
-class Body(NamedTuple):
-    """What stands around the arm: how it looks, from where in its own frame, and where it is at
-    first. The arm is stopped by what is `solid`; how far it is from what is `measured`, one asks.
+class WorldBody(NamedTuple):
+    """A body around the arm: its look, its initial pose, and the offset of the look in its frame. A
+    `solid` body stops the arm; the clearance of the arm is measured to `measured` bodies.
     """
 
     look: Look
@@ -70,12 +68,10 @@ class Body(NamedTuple):
 
 
 class World(abc.ABC):
-    """The simulated bench: an arm that follows joint commands, and bodies, by name, that are put
-    where they are wanted.
-    """
+    """The simulated bench: an arm that follows joint commands, and movable bodies by name."""
 
     arm, board, glass, iron, solder, left, right = "arm", "board", "glass", "iron", "solder", "left", "right"
-    things: dict[str, Look]  # what lies on the bench and can be taken
+    things: dict[str, Look]  # the things on the bench that can be grasped
 
     def __init__(self, scene: Scene, settings: Settings, *, posture: Floats) -> None:
         self._period_s = settings.period_s
@@ -89,12 +85,12 @@ class World(abc.ABC):
         self.put(self.board, Pose(self.tool()[0].position, LEVEL))
 
     @abc.abstractmethod
-    def _build(self, settings: Settings, bodies: dict[str, Body], posture: Floats) -> None:
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         """Make the arm, at a posture [rad], and all bodies."""
 
     @abc.abstractmethod
     def follow(self, position: Floats, velocity: Floats) -> None:
-        """Set where the motors go: [rad] with [rad/s] fed forward."""
+        """Set the motors' target positions [rad] and velocities [rad/s]."""
 
     @abc.abstractmethod
     def step(self) -> None:
@@ -106,28 +102,26 @@ class World(abc.ABC):
 
     @abc.abstractmethod
     def tool(self) -> tuple[Pose, Floats]:
-        """The tool's pose and velocity [m/s]."""
+        """Pose and velocity [m/s] of the tool."""
 
     @abc.abstractmethod
     def _place(self, body: str, pose: Pose) -> None:
-        """Have the engine put a body somewhere."""
+        """Set the pose of a body in the engine."""
 
     @abc.abstractmethod
     def clearance(self, body: str, *, within: float = 2.0) -> float:
-        """Smallest distance between the arm and a body that is measured [m]; `within` when there is
-        more.
-        """
+        """Smallest distance between the arm and a measured body [m], but at most `within`."""
 
     @abc.abstractmethod
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
-        """What a camera sees (height, width, 3); where there is nothing it is white."""
+        """The picture of a camera (height, width, 3) on a white background."""
 
     @abc.abstractmethod
     def close(self) -> None:
         """End the simulation."""
 
     def _tool_on(self, plate: Pose, speed: Floats, turning: Floats) -> tuple[Pose, Floats]:
-        """Pose and velocity of the tool on a plate, from the plate's and how that turns [rad/s]."""
+        """Pose and velocity of the tool from those of the plate [m/s, rad/s]."""
         if self.plate_from_tool == AT_ITS_FRAME:
             return plate, speed
         tool = carried_by(plate, self.plate_from_tool)
@@ -135,24 +129,24 @@ class World(abc.ABC):
         return tool, tuple((speed + moved).tolist())
 
     def pose(self, body: str) -> Pose:
-        """Where a body is."""
+        """The pose of a body."""
         return self._poses[body]
 
     def put(self, body: str, pose: Pose) -> None:
-        """Put a body somewhere."""
+        """Set the pose of a body."""
         self._poses[body] = pose
         self._place(body, pose)
 
     def picture(self, *, eye: Floats, target: Floats, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
-        """What a camera sees: colours (height, width, 3), and the matrix (4, 4) from places [m] to
-        where they are in it, -1 to 1 each way.
+        """The picture of a camera (height, width, 3), and the matrix (4, 4) from positions [m] to
+        normalized coordinates in it, -1 to 1.
         """
         return self._colours(eye, target, size), np.matmul(*camera(eye, target, size))
 
 
 def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any]:
-    """Of a camera that looks from an eye at a target [m]: the projection (4, 4), and before it the
-    view (4, 4), both of columns.
+    """Projection (4, 4) and view (4, 4) of a camera that looks from an eye at a target [m], for
+    column vectors.
     """
     ahead = np.subtract(target, eye) / math.dist(target, eye)
     aside = np.cross(ahead, (0.0, 0.0, 1.0))
@@ -162,39 +156,42 @@ def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any
     view[:3, 3] = view[:3, :3] @ np.negative(eye)
     scale = 1 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     projection[:2, :2] = np.diag((scale * size[1] / size[0], scale))
-    projection[2, 2:] = (FAR + NEAR) / (NEAR - FAR), 2 * FAR * NEAR / (NEAR - FAR)
+    projection[2, 2:] = (
+        (FAR_PLANE_M + NEAR_PLANE_M) / (NEAR_PLANE_M - FAR_PLANE_M),
+        2 * FAR_PLANE_M * NEAR_PLANE_M / (NEAR_PLANE_M - FAR_PLANE_M),
+    )
     projection[3, 2] = -1.0
     return projection, view
 
 
-def furniture(scene: Scene, settings: Settings) -> dict[str, Body]:
-    """All that is around the arm, by name."""
+def furniture(scene: Scene, settings: Settings) -> dict[str, WorldBody]:
+    """All bodies around the arm, by name."""
     people, (x, y, top) = settings.people, settings.table.centre
     width, depth = settings.table.half_size
-    slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD)
-    bodies = {"table": Body(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
-    for name in ("soldering", "glass", "iron"):  # what things rest on
+    slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD_RGBA)
+    bodies = {"table": WorldBody(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
+    for name in ("soldering", "glass", "iron"):  # stands below these things
         at = getattr(scene, name)
-        stand = Look("box", (0.06, 0.06, at[2]), WOOD)
-        bodies[f"stand of {name}"] = Body(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
+        stand = Look("box", (0.06, 0.06, at[2]), WOOD_RGBA)
+        bodies[f"stand of {name}"] = WorldBody(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
     for name, shape, size, colour, at in (
-        (World.board, "box", (0.08, 0.05, 0.002), GREEN, (0.0, 0.0, 0.0)),
-        (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL, scene.glass),
-        (World.iron, "cylinder", (0.016, 0.016, 0.18), BLUE, scene.iron),
-        (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL, scene.solder),
+        (World.board, "box", (0.08, 0.05, 0.002), BOARD_RGBA, (0.0, 0.0, 0.0)),
+        (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL_RGBA, scene.glass),
+        (World.iron, "cylinder", (0.016, 0.016, 0.18), IRON_RGBA, scene.iron),
+        (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL_RGBA, scene.solder),
     ):
-        bodies[name] = Body(Look(shape, size, colour), Pose(at, LEVEL))
-    # A hand is a capsule from the palm back along the forearm; its shape is there to measure
-    # distances, and pushes nothing.
-    hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN)
+        bodies[name] = WorldBody(Look(shape, size, colour), Pose(at, LEVEL))
+    # A hand is a capsule from the palm along the forearm. It is for measuring distances and pushes
+    # nothing.
+    hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN_RGBA)
     back = Pose((-people.length / 2, 0.0, 0.0), ALONG_X)
     for name, start in ((World.left, scene.left_start), (World.right, scene.right_start)):
-        bodies[name] = Body(hand, Pose(start, HAND_ORIENTATION), back, measured=True)
+        bodies[name] = WorldBody(hand, Pose(start, HAND_ORIENTATION), back, measured=True)
     return bodies
 
 
 def pixels(points: Any, matrix: Any, size: tuple[int, int]) -> Any:
-    """Where points (N, 3) [m] are in a picture of a size, by its matrix (4, 4): (N, 2)."""
+    """Pixels (N, 2) of points (N, 3) [m] in a picture of a size, by its matrix (4, 4)."""
     seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
     flat = seen[:, :2] / seen[:, 3:]
     return (flat * (1, -1) + 1) / 2 * size
@@ -209,6 +206,6 @@ def seen_from(holder: Pose, thing: Pose) -> Pose:
 
 
 def carried_by(holder: Pose, grip: Pose) -> Pose:
-    """Where a thing is whose pose in its holder's frame is `grip`."""
+    """The pose of a thing whose pose in its holder's frame is `grip`."""
     at = rotation(holder.orientation) @ grip.position + holder.position
     return Pose(tuple(at.tolist()), multiply(holder.orientation, grip.orientation))

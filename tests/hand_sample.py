@@ -31,7 +31,7 @@ from service.core.controller import Controller, outgoing, run
 from service.core.frame import Event, Frame, Tick, Vector
 from service.daemon import daemon
 from service.daemon.cell_streams import Arrivals, CellStreams
-from service.daemon.input_monitor import KEYS
+from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.files.shipped import shipped_skill
 from service.settings.config import Settings, robot_description
 
@@ -89,7 +89,7 @@ def walk() -> Walk:
     controller = Controller(settings, skill, urdf=robot_description(settings))
     hands, names = skill.hands[0].reshape(2, 3), settings.joints.names
     listening = open_session(listen=["tcp/127.0.0.1:0"])
-    arrivals = {KEYS[source]: Arrivals() for source in SOURCES}
+    arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES}
     streams = CellStreams(listening, settings, arrivals=arrivals, failed=print)
     with open_session(connect=list(endpoints(listening))) as session:
         trackers = [publisher(session, settings.cell, f"hands/{side}") for side in SIDES]

@@ -37,6 +37,21 @@ STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
     *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
 }
 CONVENIENCES = {("kmp.primitive", "kmp.storage")}  # `KMP.save` and `KMP.load` import what stores primitives
+IN_EVERY_STAGE = {"FRAME", "STATE"}  # the fields that a stage owns in the frame and in the state
+# Names of constants and classes that are still defined twice. This list only becomes shorter.
+NAMED_TWICE = """
+    ARM BASES BEFORE_S BLOCK COMPONENTS COVARIANCE_ROUND_TO DEMONSTRATIONS DEMONSTRATORS DURATION_S
+    ELL EYE Evidence FAR_M FAULTS FOLDS FOLLOW Figures GATE GRIPPER HANDS HELD KEPT KINDS Kernel
+    LABELS LAMBDA LATENCY LATENESS LATE_MS LATE_US LEAST LEAST_MM LEAST_S LEAST_SLOPE LEAST_STD_M
+    LEFT LETTERS LEVELS LONGEST_NAME Learned Letter MACHINE MARGIN_M MAX_GAIN METHODS MISSED MOST
+    MOST_POINTS Model NEAR NEAREST NEAR_M NOISES NOISE_M NONE NOTED NOTED_M OBJECTS OFF OFF_M ORDERS
+    OUTPUTS Outcome PAPER_ELL PARTS PENALTY PEOPLE PLACE PLANNED_BRAKE_SHARE POINTS Parameters
+    Percentiles Placed Predicted RATE_HZ REACH_S REGIONS REPEAT_S RIGHT SAME_M SAMPLES SCENES SEED
+    SEEDS SEEN SEPARATED SETTLED_S SHIPPED SHOWN SHOWN_HZ SLACK SLOW_MPS STEP_S STOP STUCK Said Seen
+    Solution Stuck TARGET THINGS TIMES TIMING TOOL TRAIL_S TURN Task UNKNOWN UNSAFE UNSEEN USUAL
+    VIA_VARIANCE WEIGHTS WINDOW_S WITHIN_M WORK WayOut _ATTACHMENT _FREE _LAMBDAS _LENGTH _MACHINE
+    _NAMES _ROUNDS _SHOWN _System _TICK _TINY
+"""
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
     "what comes from outside": (
         {
@@ -201,6 +216,29 @@ def test_a_module_begins_with_what_it_is() -> None:
 
 def test_no_module_has_a_name_that_says_nothing() -> None:
     assert [named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE] == []
+
+
+def defined(path: Path) -> set[str]:
+    """The classes and constants that a module defines at its top level."""
+    found: set[str] = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))
+            found |= {name.id for name in names if isinstance(name.ctx, ast.Store) and name.id.strip("_").isupper()}
+    return found
+
+
+def test_a_class_or_constant_has_a_name_of_its_own() -> None:
+    """So a name that is searched for leads to one definition."""
+    modules: dict[str, list[str]] = {}
+    for path in (path for path in MODULES if not path.is_relative_to(ROOT / "tests")):
+        for name in defined(path) - IN_EVERY_STAGE - set(NAMED_TWICE.split()):
+            modules.setdefault(name, []).append(named(path))
+    assert len(modules) > 500
+    assert {name: places for name, places in modules.items() if len(places) > 1} == {}
 
 
 def test_tests_share_what_stands_in_support_and_never_import_each_other() -> None:

@@ -1,5 +1,5 @@
-"""A picture of an arm's first cell: from the side and from above, with its reach and the demo's
-places.
+"""A picture of an arm's first cell: the arm from the side and from above, its reach, and the tool
+positions of the demo.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 from scipy.spatial import ConvexHull
 
-from service.arms.first_cell import PLACES, Proposal
+from service.arms.first_cell import DEMO_TOOL_M, Proposal
 from service.core.frame import Vector
 from service.core.geometry import place
 from service.settings import palette
 
 VIEWS = (("from the side", 0, 2, "x [m]", "z [m]"), ("from above", 1, 0, "y [m]", "x [m]"))
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 40)
-AROUND_M = 0.15
+AROUND_M = 0.15  # margin around the drawing
 
 
 def draw(proposal: Proposal, path: Path) -> None:
-    """Writes the picture, a .png file."""
+    """Write the picture to a .png file."""
     figure = Figure(figsize=(12.0, 5.6), layout="constrained")
     settings, body = proposal.settings, proposal.body
     placed = np.empty((len(body.capsules), 2, 3))
@@ -39,14 +39,16 @@ def draw(proposal: Proposal, path: Path) -> None:
             is_tool = body.capsules["link"][i] == len(settings.joints.names)
             colour = palette.TOOL if is_tool else palette.GREY
             axes.add_patch(Polygon(outline, facecolor=_rgb(colour), edgecolor="black", linewidth=0.6, alpha=0.8))
-        for name, at in PLACES.items():
+        for name, at in DEMO_TOOL_M.items():
             colour = palette.VERMILLION if name in proposal.unmet else palette.BLUE
             axes.plot(at[across], at[up], "o", color=_rgb(colour), markersize=7, zorder=5)
             axes.annotate(name, (at[across], at[up]), (6, 5), textcoords="offset points", fontsize=9, zorder=6)
         axes.plot(0.0, 0.0, "k+", markersize=12, zorder=5)
         axes.annotate("frame base", (0.0, 0.0), (6, -12), textcoords="offset points", fontsize=9, zorder=6)
         axes.set(title=title, xlabel=label, ylabel=other, aspect="equal")
-        shown = np.vstack((placed[:, :, [across, up]].reshape(-1, 2), [(at[across], at[up]) for at in PLACES.values()]))
+        shown = np.vstack(
+            (placed[:, :, [across, up]].reshape(-1, 2), [(at[across], at[up]) for at in DEMO_TOOL_M.values()])
+        )
         low, high = shown.min(axis=0) - AROUND_M, shown.max(axis=0) + AROUND_M
         centre, outer = proposal.shell.centre, proposal.shell.outer
         sideways = centre[across] - outer if across == 1 else -AROUND_M
@@ -56,7 +58,7 @@ def draw(proposal: Proposal, path: Path) -> None:
             axes.invert_xaxis()  # y to the left, as seen by the arm
     figure.suptitle(
         f"{Path(settings.arm.urdf).name}: posture and reach, {proposal.shell.inner:.2f} to "
-        f"{proposal.shell.outer:.2f} m. Green: what the last joint moves; red: places of the demo out of reach"
+        f"{proposal.shell.outer:.2f} m. Green: links behind the last joint; red: positions of the demo out of reach"
     )
     figure.savefig(path, dpi=110)
 

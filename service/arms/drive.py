@@ -1,4 +1,4 @@
-"""The loop around a drive: joints measured and told, commands played back and written."""
+"""The loop around a drive: publish the measured joints, play back the commands, write them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
 
 
 class DriveError(ExplainedError, RuntimeError):
-    """A drive that cannot be reached, is another arm's, or stopped: says what to do about it."""
+    """A drive cannot be reached, belongs to another arm, or stopped; the message has the remedy."""
 
 
 class Measured(NamedTuple):
-    """An arm's joints (J,) [rad, rad/s] as a period begins, and the time [s] since the last."""
+    """An arm's joints (J,) [rad, rad/s] at the begin of a period, and the time [s] since the
+    last.
+    """
 
     position: Vector
     velocity: Vector
@@ -33,31 +35,31 @@ class Measured(NamedTuple):
 
 
 class Drive(AbstractContextManager[Any], Protocol):
-    """What one file an arm provides. Within its context it is controlled; that begins and ends with
-    the arm at rest. All raise DriveError.
+    """The drive of one arm. Its context controls the arm; it begins and ends with the arm at rest.
+    All methods raise DriveError.
     """
 
     limits: JointSettings
-    """Names and limits of the drive, which nothing that is written leaves."""
+    """Names and limits of the joints; nothing that is written exceeds them."""
     speed_limits: SpeedLimits | None
-    """Least and greatest velocities by position, where it has such."""
+    """Velocity limits that depend on the position, if the drive has such."""
     period_s: float
-    """Of what is written, the drive's own."""
+    """Period of the drive [s]."""
     takes_velocity: bool
-    """Whether it is led by velocities: then the joints as measured close the loop."""
+    """True if the drive follows velocities; the measured joints then close the loop."""
 
     def stands_at(self) -> Vector:
-        """The joints (J,) [rad], before it is controlled."""
+        """The joints (J,) [rad] before the arm is controlled."""
 
     def read(self) -> Measured:
-        """The joints, as soon as the drive's next period begins."""
+        """The joints at the begin of the drive's next period, for which it waits."""
 
     def write(self, position: Vector, velocity: Vector) -> None:
-        """Leads joints (J,) to a position and velocity [rad, rad/s] at the end of this period."""
+        """Move joints (J,) to a position and velocity [rad, rad/s] at the end of this period."""
 
 
 def say(line: str) -> None:
-    """Tells a line on standard error."""
+    """Print a line on standard error."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -70,10 +72,10 @@ def follow(
     wait_s: float = float("inf"),
     say: Callable[[str], None] = say,
 ) -> Playback:
-    """Drives an arm by a cell's commands until `stop`, and brakes it then.
+    """Drive an arm by a cell's commands until `stop`, then brake it.
 
-    Raises DriveError, also where commands come too slowly to be followed, and UnreachableError
-    where no command came for `wait_s` [s].
+    Raises DriveError, also if commands arrive too slowly to be followed, and UnreachableError if no
+    command arrives within `wait_s` [s].
     """
     playback = Playback(drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits)
     passed_s, told_s, following, refused = 0.0, 0.0, False, 0
@@ -95,15 +97,15 @@ def follow(
                 return playback
             if following != playback.following:
                 following, wait_s = not following, float("inf")
-                say("commands come, the arm follows" if following else "no commands: the arm brakes")
+                say("commands arrive, the arm follows" if following else "no commands arrive, the arm brakes")
             if (reason := playback.too_slow) and not moved.velocity.any():
                 raise DriveError(f"the daemon of cell {cell}: {reason}")
             if playback.refused and not refused:
-                say(f"refused: {playback.reason}")
+                say(f"command refused: {playback.reason}")
             refused = playback.refused
             if passed_s > wait_s:
-                heard = f"; {follower.rejected} were none of this arm's: {follower.reason}" * (follower.rejected > 0)
+                others = f"; {follower.rejected} were for another arm: {follower.reason}" * (follower.rejected > 0)
                 raise UnreachableError(
-                    f"no command came on {key(cell, 'joints/command')} within {wait_s:g} s{heard}: is the daemon "
-                    "running in this cell? `thirdhand doctor` tells what it waits for"
+                    f"no command arrived on {key(cell, 'joints/command')} within {wait_s:g} s{others}: is the daemon "
+                    "running in this cell? `thirdhand doctor` shows what it waits for"
                 )

@@ -1,7 +1,7 @@
-"""A Franka Research 3 by libfranka's own bindings: joint velocities at 1 kHz.
+"""A Franka Research 3, driven by joint velocities at 1 kHz through libfranka's own bindings.
 
-pylibfranka rather than franky-control, because that plans motions of its own in a thread of its
-own: here each cycle is written by the playback. It needs `pip install 'thirdhand[franka]'`.
+It uses pylibfranka, because franky-control plans its own motions in its own thread: here the
+playback writes each cycle. It needs `pip install 'thirdhand[franka]'`.
 """
 
 from __future__ import annotations
@@ -16,53 +16,62 @@ from service.arms.playback import SpeedLimits
 from service.core.frame import Vector
 from service.settings.config import JointSettings, Settings
 
-PERIOD_S = 0.001
-ACCELERATION, JERK = 9.0, 4000.0  # [rad/s², rad/s³] of 10 and 5000: a lost packet is made up for by the robot
-CATCH_UP = 1.1  # of the commands' speed
-BRAKE = 5.0  # [rad/s²] toward a joint's end, at most: so much of the acceleration follows the limit as it falls
-AHEAD_S, BELOW_RADPS = 0.01, 0.03  # by which that is foreseen, and kept below, for the jerk it takes
-# As published, https://frankarobotics.github.io/docs, "Limits for Franka Research 3": greatest
-# velocities min(v, sqrt(twice * distance) - offset) [rad/s], with distances to joints' ends.
+FRANKA_PERIOD_S = 0.001
+# [rad/s², rad/s³] The robot allows 10 and 5000, but extrapolates over lost packets by itself.
+ACCELERATION, JERK = 9.0, 4000.0
+CATCH_UP_RATIO = 1.1  # drive speed / commanded speed: the playback makes up for delays
+BRAKE = 5.0  # [rad/s²] assumed deceleration toward a joint's end, below ACCELERATION to follow the falling limit
+LIMIT_LOOKAHEAD_S = 0.01  # the speed limit is evaluated at position + 0.01 s * velocity
+LIMIT_MARGIN_RADPS = 0.03  # the speed remains below the robot's limit by this, for the jerk of a braking
+# https://frankarobotics.github.io/docs, "Limits for Franka Research 3": the largest velocity is
+# min(MAX_VELOCITY, sqrt(TWICE * distance) - OFFSET) [rad/s], for the distance [rad] to a joint's
+# end.
 MAX_VELOCITY = np.array((2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26))
-LOWEST = np.array((-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196))
-HIGHEST = np.array((2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196))
+LOWER_RAD = np.array((-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196))
+UPPER_RAD = np.array((2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196))
 OFFSET = np.array((0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35))
 TWICE = np.array((12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0))
 
 
 def speed_limits(position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
-    """Least and greatest velocities (7,) [rad/s], below those that the robot allows there."""
-    there, twice = position + AHEAD_S * velocity, np.minimum(TWICE, 2.0 * BRAKE)
-    up = np.sqrt(twice * np.maximum(HIGHEST - there, 0.0)) - OFFSET - BELOW_RADPS
-    down = np.sqrt(twice * np.maximum(there - LOWEST, 0.0)) - OFFSET - BELOW_RADPS
-    return -np.clip(down, 0.0, MAX_VELOCITY - BELOW_RADPS), np.clip(up, 0.0, MAX_VELOCITY - BELOW_RADPS)
+    """Lowest and highest velocity (7,) [rad/s], within the robot's limits at this position."""
+    there, twice = position + LIMIT_LOOKAHEAD_S * velocity, np.minimum(TWICE, 2.0 * BRAKE)
+    up = np.sqrt(twice * np.maximum(UPPER_RAD - there, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
+    down = np.sqrt(twice * np.maximum(there - LOWER_RAD, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
+    return -np.clip(down, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS), np.clip(up, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS)
 
 
 ROBOT_SPEED_LIMITS: SpeedLimits | None = speed_limits
 
 
 def limits_of(joints: JointSettings) -> JointSettings:
-    """What is written to a Franka whose commands keep these limits. Raises DriveError."""
-    least, most = LOWEST - 0.2, HIGHEST + 0.2
-    if len(joints.names) != len(LOWEST):
+    """The limits of the playback for a Franka whose commands have these limits. Raises
+    DriveError.
+    """
+    least, most = LOWER_RAD - 0.2, UPPER_RAD + 0.2
+    if len(joints.names) != len(LOWER_RAD):
         raise DriveError(f"a Franka has 7 joints, {len(joints.names)} are configured: give --config with its own URDF")
     if (np.array(joints.lower) < least).any() or (np.array(joints.upper) > most).any():
         raise DriveError(
-            f"a Franka's joints go from {least.tolist()} to {most.tolist()} rad, the configured ones farther: "
+            f"a Franka's joints move from {least.tolist()} to {most.tolist()} rad, the configured ones farther: "
             "give --config with its own URDF"
         )
     return msgspec.structs.replace(
         joints,
-        velocity=tuple(np.minimum(CATCH_UP * np.array(joints.velocity), MAX_VELOCITY - BELOW_RADPS).tolist()),
-        acceleration=(ACCELERATION,) * len(LOWEST),
-        jerk=(JERK,) * len(LOWEST),
+        velocity=tuple(
+            np.minimum(CATCH_UP_RATIO * np.array(joints.velocity), MAX_VELOCITY - LIMIT_MARGIN_RADPS).tolist()
+        ),
+        acceleration=(ACCELERATION,) * len(LOWER_RAD),
+        jerk=(JERK,) * len(LOWER_RAD),
     )
 
 
 class FrankaArm:
-    """The arm at an address, as `Drive` says. Raises DriveError where there is none."""
+    """The drive of the Franka at an address; see `Drive`. Raises DriveError if it does not
+    answer.
+    """
 
-    period_s: float = PERIOD_S
+    period_s: float = FRANKA_PERIOD_S
     takes_velocity: bool = True
 
     def __init__(self, settings: Settings, address: str) -> None:
@@ -75,12 +84,12 @@ class FrankaArm:
             ) from None
         self._library, self._address = pylibfranka, address
         self._control: Any = None
-        try:  # real-time scheduling is asked for by whoever runs the loop
+        try:  # the caller requests real-time scheduling for the loop
             self._robot = pylibfranka.Robot(address, pylibfranka.RealtimeConfig.kIgnore)
             self._state = self._robot.read_once()
-        except RuntimeError as error:  # its exceptions have no other base in common
+        except RuntimeError as error:  # the library's exceptions have no other common base
             raise DriveError(
-                f"no Franka at {address}: {error}. Is it on, its FCI activated in Desk, and --robot its address?"
+                f"no Franka at {address}: {error}. Is it on, is FCI active in Desk, and is --robot its address?"
             ) from None
 
     def __enter__(self) -> FrankaArm:
@@ -90,13 +99,13 @@ class FrankaArm:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            at_rest = self._library.JointVelocities([0.0] * len(LOWEST))
+            at_rest = self._library.JointVelocities([0.0] * len(LOWER_RAD))
             at_rest.motion_finished = True
             self._do(lambda: self._control.writeOnce(at_rest))
-        self._control = None  # else the robot stops by itself
+        self._control = None  # after an exception the robot stops by itself
 
     def stands_at(self) -> Vector:
-        """As `Drive` says, as all here."""
+        """The joints (J,) [rad] before the arm is controlled."""
         return np.array(self._state.q)
 
     def read(self) -> Measured:
@@ -111,5 +120,5 @@ class FrankaArm:
             return what()
         except RuntimeError as error:
             raise DriveError(
-                f"the Franka at {self._address} stopped: {error}. See Desk; free and unlock it, then start this again"
+                f"the Franka at {self._address} stopped: {error}. Look at Desk, free and unlock it, then restart"
             ) from None

@@ -1,8 +1,8 @@
-"""Playback of joint commands: smooth motion at a drive's own rate, whatever a network made of them.
+"""Playback of joint commands: smooth motion at a drive's own rate, also over an uneven network.
 
-Commands are queued by tick number and played back a little later: by a cubic through positions and
-velocities, as much behind as they come unevenly. What is written passes the joints' limiter, so it
-holds position, velocity, acceleration and jerk limits for any sequence of commands and losses.
+Commands are queued by tick number and played back with a delay that covers their jitter, by a cubic
+through positions and velocities. The result passes the joints' limiter, so it holds the limits of
+position, velocity, acceleration and jerk for any sequence of commands and losses.
 """
 
 from __future__ import annotations
@@ -21,32 +21,36 @@ from service.core.intake.arm_samples import in_turn
 from service.core.limiter.stage import Limited, Limiter
 from service.settings.config import RATES_HZ, JointSettings
 
-REJOIN_AFTER_S = 0.1  # a new sequence begins after this silence, or with a tick number this far from the last
-REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # a new sequence must begin this near to where the arm stands
-TICK_RANGE_S = 0.9 / RATES_HZ[1], 1.1 / RATES_HZ[0]  # stamps farther or less apart per tick: a clock was set
+REJOIN_AFTER_S = 0.1  # a new sequence begins after this silence, or at a tick number this far from the last
+REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # a new sequence must begin within this of the standing arm
+TICK_RANGE_S = (
+    0.9 / RATES_HZ[1],
+    1.1 / RATES_HZ[0],
+)  # a difference of stamps per tick outside shows that a clock was set
 TICK_SAMPLES = 15  # the length of a tick is the mean over these samples
 TICK_OUTLIER = 0.1  # samples that differ from their median by a larger share are left out
-MOST_DELAY_S = BRAKE_AFTER_S  # behind the newest command: beyond it the arm brakes all the same
-FEEDBACK = 8.0  # [1/s] of a position error that becomes velocity ...
-MOST_FEEDBACK_RADPS = 0.25  # ... and not more, as after a pause
-DAMPING = 30.0  # [1/s] of a velocity error that becomes acceleration, at most ...
-SETTLED_RADPS = 1.0  # ... and where this much of it needs no more jerk than there is
-JERK_SHARE = 0.999  # of the greatest: rounding
-CATCH_UP_S, MOST_CATCH_UP = 0.1, 0.05  # in which the delay becomes as needed; share of the speed that it may cost
-FORGET = 0.005  # [s/s] by which the delay shrinks while commands come evenly
-MOST_ELAPSED_S = 0.1  # between two steps; what is longer was a clock that stepped
-CLOCK_SHARE = 0.02  # of the time that a loop is off, made up each step ...
-PAUSE_S = 0.005  # ... and all of it after a pause, which tells nothing of the network
-HELD_S = 0.004  # an acceleration, beyond the newest command
-SLOW_RADPS = 0.01  # a slower motion does not tell how long it took
-TOLERANCE = 1e-6  # of limits [rad, rad/s]: rounding of who commands
+MAX_DELAY_S = BRAKE_AFTER_S  # with a longer delay the arm would brake before the newest command is played
+POSITION_GAIN_HZ = 8.0  # velocity += 8 / s * position error
+MAX_CORRECTION_RADPS = 0.25  # limit of that correction, for the error after a pause
+VELOCITY_GAIN = 30.0  # [1/s] max. gain: acceleration += gain * velocity error
+SETTLED_RADPS = 1.0  # gain <= sqrt(max. jerk / 1 rad/s): an error below 1 rad/s is corrected within the jerk limit
+JERK_SHARE = 0.999  # share of the jerk limit that is used, because of rounding
+CATCH_UP_S = 0.1  # the delay approaches the needed delay with this time constant
+MAX_CATCH_UP_SHARE = 0.05  # approaching it changes the speed by at most this share
+DELAY_DECAY = 0.005  # [s/s] the delay shrinks at this rate while commands arrive evenly
+MAX_ELAPSED_S = 0.1  # a longer time between two steps is a clock that was set, and is ignored
+CLOCK_SHARE = 0.02  # each step makes up this share of the loop's lateness
+LOOP_PAUSE_S = 0.005  # a larger lateness is a pause of the loop, made up at once: it shows nothing about the network
+EXTRAPOLATED_S = 0.004  # beyond the newest command the acceleration is held for this time
+MIN_TIMED_RADPS = 0.01  # a slower motion does not show its duration
+LIMIT_TOLERANCE = 1e-6  # [rad, rad/s] commands may exceed limits by rounding
 
 SpeedLimits: TypeAlias = Callable[[Vector, Vector], tuple[Vector, Vector]]
-"""Least and greatest velocity (J,) [rad/s] of joints at a position and velocity (J,)."""
+"""Lowest and highest velocity (J,) [rad/s] of joints at a position and velocity (J,)."""
 
 
 class Knot(NamedTuple):
-    """A command in the queue; `time_s` is when in the motion it is, which stands still while a
+    """A command in the queue; `time_s` is its time in the motion, which does not advance while a
     daemon misses its deadlines.
     """
 
@@ -56,12 +60,12 @@ class Knot(NamedTuple):
 
 
 class Playback:
-    """What a drive is to do in each of its periods, given the commands that came.
+    """The motion of a drive in each of its periods, given the commands that arrived.
 
-    `limits` are the drive's, of acceleration and jerk as well; an arm may be allowed less where it
-    stands: `speed_limits`. `period_s` is the drive's, `position` (J,) [rad] where the arm stands at
-    rest. The commands' period is measured: it is the difference of their stamps per tick. Nothing
-    here reads a clock, so none can step.
+    `limits` are the drive's limits of position, velocity, acceleration and jerk; `speed_limits` may
+    be lower, depending on the position. `period_s` is the drive's period, `position` (J,) [rad] the
+    position at rest. The commands' period is measured, as the difference of their stamps per tick.
+    The playback reads no clock, so a clock that is set does not disturb it.
     """
 
     def __init__(
@@ -72,54 +76,57 @@ class Playback:
         period_s: float,
         speed_limits: SpeedLimits | None = None,
     ) -> None:
-        self.refused, self.reason = 0, ""  # commands that were not followed, and why the last one was not
-        self.tick_s = 0.0  # of the commands, as measured; 0: not known yet
+        self.refused, self.reason = 0, ""  # number of refused commands, and the reason of the last one
+        self.tick_s = 0.0  # measured period of the commands; 0: not known yet
         self._period_s, self._speed_limits, self._limits = period_s, speed_limits, limits
         self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
         self._max_velocity, max_jerk = np.array(limits.velocity), np.array(limits.jerk)
         self._parameters = parameters(
             period_s=period_s,
             max_acceleration=np.array(limits.acceleration),
-            most_change=JERK_SHARE * period_s * max_jerk,  # [rad/s²] in a period
-            damping=np.minimum(DAMPING, np.sqrt(max_jerk / SETTLED_RADPS)),
+            max_change=JERK_SHARE * period_s * max_jerk,  # [rad/s²] change of acceleration in a period
+            velocity_gain=np.minimum(VELOCITY_GAIN, np.sqrt(max_jerk / SETTLED_RADPS)),
         )
         self._limiter = Limiter(limits, period_s)
-        self._state = np.zeros((3, len(limits.names)))  # as written: position, velocity, acceleration
+        self._state = np.zeros((3, len(limits.names)))  # written position, velocity, acceleration
         self._state[0] = position
         self._knots: deque[Knot] = deque()
-        self._newest: Knot | None = None  # of the sequence in force
+        self._newest: Knot | None = None  # newest command of the present sequence
         self._newest_stamp_ns = 0
-        self._lengths_s: deque[float] = deque(maxlen=TICK_SAMPLES)  # of ticks, in the sequence in force
-        self._now = self._heard = self._owed = 0.0  # [s] counted in steps; when the newest came; off the drive's clock
+        self._lengths_s: deque[float] = deque(maxlen=TICK_SAMPLES)  # lengths of ticks in the present sequence
+        self._now = self._heard = 0.0  # [s] time by counting steps, and the time at which the newest command arrived
+        self._lateness_s = 0.0  # time of the drive's clock that is not made up yet
         self._offset = self._needed = 0.0
         here = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
         self._knots.extend(here)
-        self._moved()  # compiled now: there is no time for it in a period
+        self._moved()  # compiles it: a period has no time for that
         self._knots.clear()
         self._moved()
-        self._paused = False  # the loop, before this step
-        self._offset = self._needed = 0.0  # [s] from the motion's time to the time when it is written
+        self._paused = False  # True if the loop paused before this step
+        self._offset = self._needed = 0.0  # [s] present and needed delay from the motion's time to the time of writing
 
     @property
     def following(self) -> bool:
-        """Whether commands are played back; else the arm brakes, or stands."""
+        """True while commands are played back; else the arm brakes or stands."""
         return len(self._knots) > 1
 
     @property
     def too_slow(self) -> str:
-        """Why commands come too slowly to be followed; empty where they do not, or too few came."""
+        """A message if commands arrive too slowly to be followed; empty also after too few
+        commands.
+        """
         return no_room_to_brake(self.tick_s) if len(self._lengths_s) == TICK_SAMPLES else ""
 
     @property
     def delay_ticks(self) -> float:
-        """How many ticks behind the newest command the arm is led, when that comes."""
+        """Delay of the arm [ticks] behind the newest command at its arrival."""
         if self._newest is None or not self.tick_s:
             return 0.0
         return (self._newest.time_s + self._offset - self._heard) / self.tick_s
 
     def in_turn(self, position: Sequence[float] | Vector) -> Vector:
-        """Measured joints (J,) [rad], the continuous ones in the turn in which they are led, as a
-        drive may wrap them at ±pi.
+        """Measured joints (J,) [rad], continuous ones in the commanded turn, because a drive may
+        wrap them at ±pi.
         """
         return in_turn(self._limits, np.array(position), self._state[0])
 
@@ -131,19 +138,19 @@ class Playback:
         elapsed_s: float = -1.0,
     ) -> Limited:
         """Position, velocity and acceleration (J,) [rad, rad/s, rad/s²] at the end of this period,
-        after what came since the last.
+        given the commands that arrived since the last.
 
-        `measured` (J,) [rad] closes the loop over a drive that takes velocities. `elapsed_s` since
-        the last step keeps the pace of a loop that is not punctual; else each is one period.
+        `measured` (J,) [rad] closes the loop over a drive that follows velocities. `elapsed_s` is
+        the time since the last step, for a loop that is not punctual; without it, one period.
         """
         if measured is not None:
             self._state[0] = self.in_turn(measured)
-        if 0.0 <= elapsed_s <= MOST_ELAPSED_S:
-            self._owed += elapsed_s - self._period_s
-        self._paused = self._owed > PAUSE_S
+        if 0.0 <= elapsed_s <= MAX_ELAPSED_S:
+            self._lateness_s += elapsed_s - self._period_s
+        self._paused = self._lateness_s > LOOP_PAUSE_S
         most = 0.1 * self._period_s
-        made_up = self._owed if self._paused else min(max(CLOCK_SHARE * self._owed, -most), most)
-        self._owed -= made_up
+        made_up = self._lateness_s if self._paused else min(max(CLOCK_SHARE * self._lateness_s, -most), most)
+        self._lateness_s -= made_up
         self._now += self._period_s + made_up
         for command in commands:
             if reason := self._take(command):
@@ -157,12 +164,12 @@ class Playback:
         return moved
 
     def _moved(self) -> Limited:
-        """The joints a period later."""
+        """The joints one period later."""
         q, dq, ddq = self._state
         return self._limiter.step(q, dq, ddq, self._wanted()) if self.following else self._limiter.stop(q, dq, ddq)
 
     def _take(self, command: Command) -> str:
-        """Queues a command; why not, if it is not to be followed."""
+        """Queue a command; returns the reason if it is refused, else an empty text."""
         position, velocity = np.array(command.position), np.array(command.velocity)
         at, last = self._state[0], self._newest
         if not position.shape == velocity.shape == at.shape:
@@ -170,9 +177,9 @@ class Playback:
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             return "a joint that is not finite"
         outside = np.maximum(np.minimum(self._lower, at) - position, position - np.maximum(self._upper, at))
-        if outside.max() > TOLERANCE:
+        if outside.max() > LIMIT_TOLERANCE:
             return f"joint {outside.argmax() + 1} outside its limits: {position[outside.argmax()]:.3f} rad"
-        if (fast := np.abs(velocity) - self._max_velocity).max() > TOLERANCE:
+        if (fast := np.abs(velocity) - self._max_velocity).max() > LIMIT_TOLERANCE:
             return f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} rad/s"
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
         ticks = 0 if last is None else tick - last.tick
@@ -184,7 +191,7 @@ class Playback:
             self._lengths_s.clear()
             time_s = self._now
         elif ticks <= 0:
-            return ""  # late or twice: the cubic goes on without it
+            return ""  # a late or repeated command is ignored
         else:
             lengths_s, since_s = self._lengths_s.copy(), (command.stamp_ns - self._newest_stamp_ns) * 1e-9
             if TICK_RANGE_S[0] <= since_s / ticks <= TICK_RANGE_S[1]:
@@ -194,14 +201,14 @@ class Playback:
                     f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after the command before, "
                     f"{1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a tick needed"
                 )
-            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * tick_s + TOLERANCE).any():
+            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * tick_s + LIMIT_TOLERANCE).any():
                 return "a jump from the command before"
             self.tick_s, self._lengths_s = tick_s, lengths_s
             time_s = last.time_s + tick_s * _steps(last, position, velocity, ticks, tick_s)
-        latest = self._now - time_s + MOST_DELAY_S
-        if self._knots:  # a segment is of use from now on, and should have been when it began
+        latest = self._now - time_s + MAX_DELAY_S
+        if self._knots:  # the segment to this command is known only now, but was needed at its begin
             begins_s = self._knots[-1].time_s
-            if time_s - begins_s < 2.5 * self.tick_s:  # one that was lost alone is not waited for
+            if time_s - begins_s < 2.5 * self.tick_s:  # a single lost command does not increase the delay
                 begins_s = time_s - self.tick_s
             needed = self._needed if self._paused else self._now - begins_s
             self._needed = min(max(self._needed, needed), latest)
@@ -217,17 +224,17 @@ class Playback:
         return ""
 
     def _wanted(self) -> Vector:
-        """The velocities (J,) [rad/s] for this period."""
-        slower = min(max((self._needed - self._offset) / CATCH_UP_S, -MOST_CATCH_UP), MOST_CATCH_UP)
+        """Target velocities (J,) [rad/s] for this period."""
+        slower = min(max((self._needed - self._offset) / CATCH_UP_S, -MAX_CATCH_UP_SHARE), MAX_CATCH_UP_SHARE)
         self._offset += slower * self._period_s
-        self._needed -= FORGET * self._period_s
+        self._needed -= DELAY_DECAY * self._period_s
         playhead_s = self._now - self._offset
         while len(self._knots) > 2 and self._knots[1].time_s <= playhead_s:
             self._knots.popleft()
-        one, other = self._knots[0], self._knots[1]
-        span = np.array((one.time_s, other.time_s, playhead_s, slower))
+        first, second = self._knots[0], self._knots[1]
+        span = np.array((first.time_s, second.time_s, playhead_s, slower))
         wanted: Vector = np.empty_like(self._state[1])
-        _aim(self._state, one.values, other.values, span, self._parameters, wanted)
+        _aim(self._state, first.values, second.values, span, self._parameters, wanted)
         if self._speed_limits is not None:
             wanted = np.clip(wanted, *self._speed_limits(self._state[0], self._state[1]))
         return wanted
@@ -240,32 +247,39 @@ def _mean_length(lengths: deque[float]) -> float:
 
 
 def _steps(last: Knot, position: Vector, velocity: Vector, ticks: int, tick_s: float) -> float:
-    """How many ticks the motion has gone on since the last command, by how far it came: fewer than
-    tick numbers say where these jumped over deadlines that were missed.
+    """Number of ticks by which the motion advanced since the last command, from its distance and
+    mean velocity. It is less than the difference of tick numbers if deadlines were missed.
     """
     mean = 0.5 * (last.values[1] + velocity)
-    if ticks == 1 or np.abs(mean).max() < SLOW_RADPS:
+    if ticks == 1 or np.abs(mean).max() < MIN_TIMED_RADPS:
         return float(ticks)
     return float(np.clip((position - last.values[0]) @ mean / (mean @ mean * tick_s), 1.0, ticks))
 
 
 @compiled
-def _aim(state: Vector, one: Vector, other: Vector, span: Vector, parameters: Records, wanted: Vector) -> None:
-    """Into `wanted` (J,) [rad/s] the joints' velocities after this period, on their way to where
-    the cubic between two commands (2, J) is then. Beyond these it goes on at constant acceleration
-    for HELD_S, then at constant velocity.
+def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters: Records, wanted: Vector) -> None:
+    """Write into `wanted` (J,) [rad/s] the joints' target velocities after this period.
 
-    span (4,): times [s] of both commands and of the playhead, and the share by which that is slow.
+    The target moves on the cubic Hermite curve between two commands (2, J): with u = t / T, the
+    velocities v0 T, v1 T scaled by the duration T and the distance d,
+
+        p = p0 + u (v0 T + u (3 d - 2 v0 T - v1 T + u (v0 T + v1 T - 2 d))).
+
+    Beyond the commands it continues at constant acceleration for EXTRAPOLATED_S, then at constant
+    velocity. Errors of position and velocity are fed back by POSITION_GAIN_HZ and VELOCITY_GAIN.
+
+    span (4,): times [s] of both commands and of the playhead, and the relative slowing of the
+    playhead.
     """
     given = parameters[0]
     lasts_s, playhead_s = span[1] - span[0], span[2] - span[0]
     inside_s = min(max(playhead_s, 0.0), lasts_s)
     beyond_s, u = playhead_s - inside_s, inside_s / lasts_s
-    held_s = min(max(beyond_s, -HELD_S), HELD_S)
+    held_s = min(max(beyond_s, -EXTRAPOLATED_S), EXTRAPOLATED_S)
     for i in range(len(wanted)):
-        begin, end, way = lasts_s * one[1, i], lasts_s * other[1, i], other[0, i] - one[0, i]
+        begin, end, way = lasts_s * first[1, i], lasts_s * second[1, i], second[0, i] - first[0, i]
         bend, twist = 3.0 * way - 2.0 * begin - end, begin + end - 2.0 * way
-        position = one[0, i] + u * (begin + u * (bend + u * twist))
+        position = first[0, i] + u * (begin + u * (bend + u * twist))
         velocity = (begin + u * (2.0 * bend + u * 3.0 * twist)) / lasts_s
         acceleration = (2.0 * bend + u * 6.0 * twist) / lasts_s**2
         position += beyond_s * velocity + held_s * (beyond_s - 0.5 * held_s) * acceleration
@@ -273,8 +287,8 @@ def _aim(state: Vector, one: Vector, other: Vector, span: Vector, parameters: Re
         if held_s != beyond_s:
             acceleration = 0.0
         error = position - state[0, i] - velocity * given.period_s
-        velocity += min(max(FEEDBACK * error, -MOST_FEEDBACK_RADPS), MOST_FEEDBACK_RADPS)
-        acceleration += given.damping[i] * (velocity - acceleration * given.period_s - state[1, i])
-        change = min(max(acceleration - state[2, i], -given.most_change[i]), given.most_change[i])
+        velocity += min(max(POSITION_GAIN_HZ * error, -MAX_CORRECTION_RADPS), MAX_CORRECTION_RADPS)
+        acceleration += given.velocity_gain[i] * (velocity - acceleration * given.period_s - state[1, i])
+        change = min(max(acceleration - state[2, i], -given.max_change[i]), given.max_change[i])
         acceleration = min(max(state[2, i] + change, -given.max_acceleration[i]), given.max_acceleration[i])
         wanted[i] = state[1, i] + given.period_s * acceleration

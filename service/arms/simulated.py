@@ -1,4 +1,4 @@
-"""An arm that is ideal and only a list of numbers: to try a cell without one."""
+"""An ideal arm without physics, to try a cell without a robot."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from service.arms.playback import SpeedLimits
 from service.core.frame import Vector
 from service.settings.config import Settings
 
-PERIOD_S = 0.001
-MOST_BEHIND_S = 0.05  # that is made up for; after a longer pause it goes on from then
+SIMULATED_PERIOD_S = 0.001
+MAX_BEHIND_S = 0.05  # a loop that is later than this does not make up for its delay
 
 
 class SimulatedArm:
-    """Does what it is told at once, from the posture in its settings."""
+    """The drive of an arm that follows each command at once, from the posture in its settings."""
 
     speed_limits: SpeedLimits | None = None
-    period_s: float = PERIOD_S
+    period_s: float = SIMULATED_PERIOD_S
     takes_velocity: bool = False
 
     def __init__(self, settings: Settings) -> None:
@@ -31,16 +31,16 @@ class SimulatedArm:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """It stands."""
+        """End the control; the arm stands."""
 
     def stands_at(self) -> Vector:
-        """As `Drive` says, as all here."""
+        """The joints (J,) [rad] before the arm is controlled."""
         return self.position
 
     def read(self) -> Measured:
-        before, due_s = self._read_s, self._read_s + PERIOD_S
+        before, due_s = self._read_s, self._read_s + SIMULATED_PERIOD_S
         time.sleep(max(due_s - time.monotonic(), 0.0))
-        self._read_s = max(due_s, time.monotonic() - MOST_BEHIND_S)
+        self._read_s = max(due_s, time.monotonic() - MAX_BEHIND_S)
         return Measured(self.position, self.velocity, self._read_s - before)
 
     def write(self, position: Vector, velocity: Vector) -> None:

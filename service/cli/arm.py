@@ -1,4 +1,4 @@
-"""`thirdhand arm`: what is understood of an arm's URDF, and a first cell for it."""
+"""`thirdhand arm`: a report on an arm's URDF, and a first cell for the arm."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from service.arms.arm_picture import draw
-from service.arms.first_cell import JERK_RATE, PLACES, RISE_S, TORQUE_SHARE, Proposal, proposed, written
+from service.arms.first_cell import DEMO_TOOL_M, Proposal, proposed, written
+from service.arms.rates import JERK_RATE, RISE_S, TORQUE_SHARE
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.settings.arm_description import SettingsError, description
 from service.settings.config import load
 from service.settings.mesh_cover import unfound
 
-DEGREES = 7.0  # [rad] more than a turn: limits beyond it are probably meant in degrees
+DEGREES = 7.0  # [rad] larger limits of a revolute joint are probably in degrees
 
 
 class ExistsError(ExplainedError):
-    """A file that is there already is not overwritten."""
+    """A file exists already, and is not overwritten."""
 
 
 def arm(args: argparse.Namespace) -> int:
@@ -32,7 +33,7 @@ def arm(args: argparse.Namespace) -> int:
     check_writable(cell, ".toml")
     for file in (cell, picture):
         if file.exists():
-            raise ExistsError(f"{file} is there already: name another one by --output, or remove it")
+            raise ExistsError(f"{file} exists already: name another file by --output, or remove it")
     proposal = proposed(
         args.urdf,
         plate=args.plate,
@@ -40,7 +41,7 @@ def arm(args: argparse.Namespace) -> int:
         stand=None if args.at is None else tuple(args.at),
     )
     if proposal.text and standing.exists():
-        raise ExistsError(f"{standing} is there already: name another cell by --output, or remove it")
+        raise ExistsError(f"{standing} exists already: name another cell by --output, or remove it")
     if proposal.text:
         standing.write_text(proposal.text, encoding="utf-8")
     urdf = standing if proposal.text else args.urdf
@@ -60,7 +61,7 @@ def arm(args: argparse.Namespace) -> int:
 
 
 def _named(urdf: Path, folder: Path) -> str:
-    """The file's name from a folder, where it is inside, or its full path."""
+    """The file's path relative to a folder that contains it, or else its absolute path."""
     try:
         return str(urdf.absolute().relative_to(folder.absolute()))
     except ValueError:
@@ -68,7 +69,7 @@ def _named(urdf: Path, folder: Path) -> str:
 
 
 def text(proposal: Proposal, path: Path) -> str:
-    """Report for people: the arm as it was understood, and the proposed settings."""
+    """The report in text: the arm by its URDF, and the proposed settings."""
     urdf, settings, body, shell = proposal.urdf, proposal.settings, proposal.body, proposal.shell
     others = [leaf for leaf in urdf.leaves if leaf != proposal.plate]
     lines = [
@@ -90,55 +91,55 @@ def text(proposal: Proposal, path: Path) -> str:
     basis = (
         f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts" if proposal.efforts else "no efforts in the URDF"
     )
-    lines.append(f"  {RISE_S:g} s or more, {basis}, jerk {JERK_RATE:g}/s of it. The data sheet knows better")
+    lines.append(f"  {RISE_S:g} s or more, {basis}, jerk = {JERK_RATE:g}/s * acceleration. See the data sheet")
     revolute = {joint.name for joint in proposal.chain if joint.kind == "revolute"}
     if wide := [
         name for name, upper in zip(limits.names, limits.upper, strict=True) if name in revolute and upper > DEGREES
     ]:
-        lines.append(f"  limits of {', '.join(wide)} are more than a turn: a URDF has radians, not degrees")
+        lines.append(f"  limits of {', '.join(wide)} exceed a turn: a URDF has radians, not degrees")
     radii = body.capsules["radius"]
     bare = sorted(set(range(len(limits.names) + 1)) - {_link(proposal, shape.link) for shape in urdf.shapes})
     lines += [
         "",
-        f"  body      {len(radii)} capsules, {radii.min():.3f} to {radii.max():.3f} m thick at most; "
-        f"{len(body.pairs)} pairs are kept apart",
+        f"  body      {len(radii)} capsules with radii from {radii.min():.3f} to {radii.max():.3f} m; "
+        f"{len(body.pairs)} pairs of them are checked for collision",
     ]
     raw = ElementTree.fromstring(description(path, cover=False))
     if lost := unfound(raw, path, settings.arm.packages, "visual"):
         lines += [
             f"  meshes    {lost}.",
-            "            The service does not need them. Drawings show the capsules of the collision shapes instead",
+            "            The service does not need them. Drawings show the capsules of the collision shapes instead.",
         ]
     if bare:
         lines.append(
-            f"            no collision shape moves with joint {', '.join(map(str, bare))}: [arm] link_radius = "
-            f"{settings.arm.link_radius:g} m stands for it"
+            f"            joint {', '.join(map(str, bare))} moves no collision shape: a capsule of [arm] link_radius = "
+            f"{settings.arm.link_radius:g} m replaces it"
         )
     x, y, z = shell.centre
     posture = ", ".join(f"{value:.3f}" for value in settings.arm.posture)
     lines += [
-        f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), above z = "
-        f"{settings.reach.min_z:g} m and before x = {settings.reach.min_x:g} m",
+        f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), where z ≥ "
+        f"{settings.reach.min_z:g} m and x ≥ {settings.reach.min_x:g} m",
         f"  posture   [{posture}] rad",
         f"            the tool is {math.degrees(proposal.tilt):.0f}° from straight down, the arm "
-        f"{100 * proposal.clearance:.0f} cm clear of the table and itself, and the nearest limit "
+        f"{100 * proposal.clearance:.0f} cm from the table and itself, and the nearest limit "
         f"{100 * proposal.margin:.0f} % of half a range away",
     ]
     if any(settings.tool.plate_from_tool[3:6]):
         lines.append(
-            "  tool      the plate's +z does not lead away from the arm: [tool] plate_from_tool turns it, "
+            "  tool      the plate's +z does not point away from the arm: [tool] plate_from_tool turns it, "
             f"({', '.join(f'{value:g}' for value in settings.tool.plate_from_tool[3:])}) as x y z w"
         )
     if proposal.text:
         x, y, z = proposal.stand
         lines.append(
-            f"  stand     the URDF's root at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 leaves it at the origin"
+            f"  base      the URDF's root is at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 puts it at the origin"
         )
     if proposal.unmet:
-        far = ", ".join(f"{name} at {math.dist(PLACES[name], shell.centre):.2f} m" for name in proposal.unmet)
+        far = ", ".join(f"{name} at {math.dist(DEMO_TOOL_M[name], shell.centre):.2f} m" for name in proposal.unmet)
         lines.append(
-            f"  demo      its scene is out of reach: the tool is needed for {far}. The demo moves a place by 15 cm at\n"
-            "            most; teach tasks of this arm's own size (docs/tutorial.md)"
+            f"  demo      its scene is out of reach, which needs the tool for {far}. The demo moves things by at most\n"
+            "            15 cm; teach tasks of this arm's size (docs/tutorial.md)"
         )
     return "\n".join(lines)
 

@@ -14,7 +14,7 @@ from service.contract.incidents import in_brief
 
 
 def cells(args: argparse.Namespace) -> int:
-    """Exit code 0 if any daemon is alive, 1 if none is."""
+    """Print the cells; exit code 0 if any daemon is alive, else 1."""
     with reached(args) as session:
         served = served_cells(session)
     if args.json:
@@ -32,7 +32,7 @@ def description(cell: Cell) -> str:
     """A daemon's status in one line."""
     now = cell.status
     if now is None:
-        return f"alive as Zenoh session {cell.session}, but without a status: it starts, or may not be asked"
+        return f"alive as Zenoh session {cell.session}, but without a status: it is starting, or denies access"
     mode = in_brief(now.mode, now.reason)
     hands = ", ".join(now.hand_age_ms) or "no hands"
     return f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"

@@ -1,5 +1,5 @@
-"""`thirdhand certificates`: a small authority of one's own, a certificate for each role, and
-further certificates by the same authority.
+"""`thirdhand certificates`: a new authority with a certificate for each role, and further
+certificates by the same authority.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"
-GIVEN = "given.txt"  # the names of all certificates that were made
-CLOCKS_DIFFER = datetime.timedelta(days=1)
+GIVEN = "given.txt"  # a file with the names of all certificates that were made
+CLOCKS_DIFFER = datetime.timedelta(days=1)  # certificates are valid this long before now, for clocks that are behind
 
 
 def certificates(args: argparse.Namespace) -> int:
-    """Exit code 0 once all are written."""
+    """Write the certificates and return exit code 0."""
     if not 1 <= args.days <= 10 * DAYS:
         raise UsageError(f"--days {args.days}: 1 to {10 * DAYS} accepted")
     if args.name and not args.role:
-        raise UsageError(f"--name {args.name}: the --role that it is to have needed too")
+        raise UsageError(f"--name {args.name}: --role needed with it")
     folder: Path = args.folder
     hosts = list(dict.fromkeys(["localhost", "127.0.0.1", "::1", socket.gethostname(), *(args.host or [])]))
     for host in hosts:
@@ -47,8 +47,8 @@ def certificates(args: argparse.Namespace) -> int:
     else:
         if folder.exists() and any(folder.iterdir()):
             raise ExplainedError(
-                f"{folder} is not empty: a new or empty folder needed, certificates are not written over; "
-                "--role makes one more by the authority that is there"
+                f"{folder} is not empty, and certificates are not overwritten: a new or empty folder needed; "
+                "--role makes one more certificate by the authority in a folder"
             )
         authority, key = _new_authority(folder, args.days)
         made = [DAEMON, *ROLES]
@@ -56,12 +56,12 @@ def certificates(args: argparse.Namespace) -> int:
     for name, what in zip(made, about, strict=True):
         until = _write(folder / name, authority, key, hosts=hosts, days=args.days)
         print(f"{folder / name}: {what}; valid until {until:%Y-%m-%d}")
-    print(f"{folder / AUTHORITY_KEY}: who has it can make more; keep it apart")
+    print(f"{folder / AUTHORITY_KEY}: this key makes further certificates; keep it in a safe place")
     return 0
 
 
 def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """A new authority, its key written to the folder."""
+    """A new authority, whose key is written to the folder."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("thirdhand authority")
     authority = _builder(name, name, key, _days_from_now(days), signs=True).sign(key, hashes.SHA256())
@@ -70,7 +70,7 @@ def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.Ellipt
 
 
 def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """The authority that this command made in the folder before. Raises ExplainedError."""
+    """The authority that this command made in a folder before. Raises ExplainedError."""
     try:
         key = serialization.load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
         beside = next(iter(sorted(folder.glob(f"*/{AUTHORITY}"))), folder / DAEMON / AUTHORITY)
@@ -84,33 +84,33 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
         raise ExplainedError(f"{folder / AUTHORITY_KEY} is not the key of {beside}")
     if authority.not_valid_after_utc <= now():
         raise ExplainedError(
-            f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: make all anew"
+            f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: make all of them again"
         )
     return authority, key
 
 
 def _free_name(folder: Path, role: str, wanted: str | None) -> str:
-    """A name that no certificate of the role had before, so that a revoked name stays revoked."""
+    """A name that no certificate of the role had before, so that a revoked name remains revoked."""
     taken = {path.name for path in folder.iterdir()}
-    if role != DAEMON and (folder / GIVEN).exists():  # also those that were moved to their machines
+    if role != DAEMON and (folder / GIVEN).exists():  # it lists certificates that were moved to their machines too
         taken |= set((folder / GIVEN).read_text(encoding="utf-8").split())
     if wanted is not None and wanted not in names(role):
         raise UsageError(f"--name {wanted}: {role} with a number needed, {names(role)[1]} to {names(role)[-1]}")
     if wanted in taken:
-        raise ExplainedError(f"{folder / str(wanted)} was made: a name that was not given before needed")
+        raise ExplainedError(f"{folder / str(wanted)} was made before: a new name needed")
     free = wanted or next((name for name in names(role) if name not in taken), None)
     if free is None:
-        raise ExplainedError(f"{folder} holds {MOST_OF_A_ROLE} certificates of role {role}, and no more are accepted")
+        raise ExplainedError(f"{folder} has {MOST_OF_A_ROLE} certificates of role {role}; the daemon accepts no more")
     return free
 
 
 def _write(
     folder: Path, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey, *, hosts: list[str], days: int
 ) -> datetime.datetime:
-    """The end of the validity of a certificate, which is written with its key and the authority's
-    certificate to a folder named as its holder, private to its user.
+    """Write a certificate, its key and the authority's certificate to a private folder with the
+    name of its holder, and return the end of its validity.
 
-    A daemon's or router's is valid for `hosts`.
+    A certificate of a daemon or router is valid for `hosts`.
     """
     record = os.open(folder.parent / GIVEN, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(record, "a", encoding="utf-8") as given:
@@ -133,7 +133,7 @@ def _write(
 
 
 def now() -> datetime.datetime:
-    """The current time in UTC."""
+    """The present time in UTC."""
     return datetime.datetime.now(datetime.UTC)
 
 
@@ -155,7 +155,7 @@ def _host(host: str) -> x509.GeneralName:
 def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime.datetime, *, signs: bool
 ) -> x509.CertificateBuilder:
-    """What all certificates hold; `signs` whether its holder signs others."""
+    """The common content of certificates; `signs` for the holder that signs others."""
     usage = x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,

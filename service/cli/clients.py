@@ -17,7 +17,7 @@ from service.contract.records import SIDES
 
 
 def via_points(args: argparse.Namespace) -> int:
-    """Exit code 0 once the daemon has carried out the request."""
+    """Send the request and print the via-points in force; exit code 0."""
     request: dict[str, Any] = {"op": args.action}
     if args.action == "remove":
         request["names"] = args.names
@@ -39,7 +39,7 @@ def via_points(args: argparse.Namespace) -> int:
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
     added = [point["name"] for point in request.get("points", ())]
     if replaced := [point["name"] for point in before if point["name"] in added]:
-        print(f"replaced, as there was one of this name: {', '.join(replaced)}")
+        print(f"replaced, because a via-point had the same name: {', '.join(replaced)}")
     for warning in reply.get("warnings", ()):
         print(f"warning: {warning}", file=sys.stderr)
     return 0
@@ -53,10 +53,11 @@ def _add(args: argparse.Namespace) -> Any:
             setattr(args, name, getattr(args, name) or position)
     given = [side for side in SIDES if getattr(args, side)]
     if args.name and args.tool and len(given) == 1 and ask(args, "status").get("hands") == given[0]:
-        args.left = args.right = args.left or args.right  # the other one makes no difference
+        args.left = args.right = args.left or args.right  # the skill ignores the other hand
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError(
-            "a name, and --here or --left, --right and --tool, are needed, or --file; where one hand conducts, it alone"
+            "NAME with --here, or NAME with --left, --right and --tool, or --file needed; for a skill of one hand, "
+            "its option suffices"
         )
     fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
     point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
@@ -64,7 +65,7 @@ def _add(args: argparse.Namespace) -> Any:
 
 
 def stage(args: argparse.Namespace) -> int:
-    """Exit code 0 once the task is known to have come to the via-point; prints the mode then."""
+    """Report the reached via-point and print the resulting mode; exit code 0."""
     reply = ask(args, "stage", {"name": args.name})
     mode, reason = (reply.get(name, "") for name in ("mode", "reason"))
     print(f"at {args.name} since tick {reply['tick']}: {in_brief(mode, reason)}")
@@ -72,7 +73,7 @@ def stage(args: argparse.Namespace) -> int:
 
 
 def hold(args: argparse.Namespace) -> int:
-    """Exit code 0 once hold, resume or reset is in force; prints the mode that resulted."""
+    """Send hold, resume or reset and print the resulting mode; exit code 0."""
     reply = ask(args, args.command)
     mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
     print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
@@ -85,6 +86,6 @@ resume = reset = hold
 
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
-    """The reply to one request, as received. Raises UnreachableError and RefusedError."""
+    """The reply to a request as received. Raises UnreachableError, RefusedError."""
     with reached(args) as session:
         return Client(session, args.cell).ask(suffix, request)

@@ -11,8 +11,8 @@ from service.process.progress import say
 
 
 def completion(args: argparse.Namespace) -> int:
-    """Exit code 0 once the shell's script is printed or written."""
-    from service.cli.main import parser  # which names this module
+    """Print or write the shell's script; exit code 0."""
+    from service.cli.main import parser  # here, because `main` imports this module
 
     try:
         import shtab
@@ -24,7 +24,7 @@ def completion(args: argparse.Namespace) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         check_writable(path)
         path.write_text(script, encoding="utf-8")
-        say(f"{path} written; it is in force in the next shell")
+        say(f"{path} written; the next shell uses it")
     else:
         print(script)
     return 0

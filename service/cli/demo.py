@@ -1,5 +1,5 @@
-"""The soldering scenario, closed loop: bench, service and scribe as separate processes, via-points
-taught over Zenoh as any client would.
+"""The soldering scenario in closed loop: bench, service and scribe as separate processes, with
+via-points taught over Zenoh.
 """
 
 from __future__ import annotations
@@ -16,23 +16,27 @@ from service.client import Client, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
-from service.daemon.machine import LATE_MS, MISSED_SHARE
+from service.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
 from service.files.shipped import cell_of
 from service.process.child import python
 from service.process.progress import say
 
-START_TIMEOUT_S = 60.0
-AFTER_S = 1.0  # behind the closest approach, which the search for a cause covers
-PLACES = {"handover": "handover", "grasp": "glass", "carry": "soldering"}  # via-points of the events
-EVENTS = {"handover": "board handed over", "grasp": "magnifying glass fetched", "carry": "glass held over the board"}
+SCENE_TIMEOUT_S = 60.0
+CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
+VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
+EVENT_TITLES = {
+    "handover": "board handed over",
+    "grasp": "magnifying glass fetched",
+    "carry": "glass held over the board",
+}
 
 
 class DemoError(ExplainedError):
-    """The demo could not be run; the message says what failed."""
+    """The demo could not be run; the message has the cause."""
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Exit code 0 only if the task succeeded and the recording lacks nothing."""
+    """Run the demo; exit code 0 if the task succeeded and the recording is complete, else 1."""
     report = run(args.output, scene=args.scene, arm=args.arm, engine=args.engine, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return 0 if report["success"] and not report["missing"] else 1
@@ -41,7 +45,7 @@ def demo(args: argparse.Namespace) -> int:
 def run(
     out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Runs the scenario once and returns its report. Raises DemoError, SettingsError."""
+    """Run the scenario once and return its report. Raises DemoError, SettingsError."""
     engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
     if reason := no_room_to_brake(settings.period_s):
         raise DemoError(reason)
@@ -58,13 +62,7 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            bench = [
-                "--engine",
-                engine,
-                "--arm",
-                str(service.config),
-                *(["--scene", str(scene)] if scene else []),
-            ]
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
             report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
@@ -74,7 +72,7 @@ def run(
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
-    from service.report.report import reported  # heavy, as below: first it says what it does
+    from service.report.report import reported  # its import is slow: the first messages must come before
 
     recording, rrd = status.scribe["recording"], status.scribe["rrd"]
     if recording is None:
@@ -102,24 +100,24 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 
 
 def too_busy(report: dict[str, Any]) -> str:
-    """Sentence on a machine that was too busy for the bench; empty if it was not."""
+    """A message on a machine that was too busy for the bench; empty if it was not."""
     periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
     found = []
     if skipped > MISSED_SHARE * periods:
         found.append(f"the bench missed {skipped} of its {periods} periods")
-    if pause_ms > LATE_MS:
-        found.append(f"the bench stood still for {pause_ms:.0f} ms")
+    if pause_ms > LATE_LOOP_MS:
+        found.append(f"the bench paused for {pause_ms:.0f} ms")
     return ", ".join(found)
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
-    """Why an event was missed, by the recording from the event before it on."""
+    """The cause of a missed event, from the recording after the event before it."""
     from service.report.report import why_missed
 
     names = list(events)
     before = [events[one]["time_s"] for one in names[: names.index(name)]]
-    until_s = events[name]["time_s"] + AFTER_S
-    return why_missed(found, PLACES[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
+    until_s = events[name]["time_s"] + CAUSE_AFTER_S
+    return why_missed(found, VIA_POINT_OF_EVENT[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
 
 
 def _percentiles(values: Any) -> dict[str, float]:
@@ -129,9 +127,9 @@ def _percentiles(values: Any) -> dict[str, float]:
 
 
 def text(report: dict[str, Any]) -> str:
-    """The report for people to read: each cause of a failure once."""
+    """The report in text, with each cause of a failure once."""
     lines, causes = list[str](), list[str]()
-    for name, what in EVENTS.items():
+    for name, what in EVENT_TITLES.items():
         event = report["events"][name]
         outcome = "reached" if event["reached"] else "MISSED"
         lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
@@ -171,7 +169,7 @@ def _shown(path: str) -> str:
 def _output(module: str, *arguments: str, say: Callable[[str], None]) -> str:
     command, environment = python("-m", module, *arguments)
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=START_TIMEOUT_S, check=False, env=environment
+        command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False, env=environment
     )
     if done.returncode != 0:
         raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")

@@ -1,4 +1,4 @@
-"""`thirdhand follow`: the arm's side, which drives an arm by a cell's commands."""
+"""`thirdhand follow`: drive an arm by a cell's commands."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ DRIVES = ("franka", "simulated")
 
 
 def follow(args: argparse.Namespace) -> int:
-    """Exit code 0 once it was ended, with the arm at rest. Raises DriveError, UnreachableError."""
+    """Drive the arm until Ctrl-C; exit code 0 with the arm at rest. Raises DriveError,
+    UnreachableError.
+    """
     if args.arm not in DRIVES:
         raise UnreadableError(
-            f"no arm {args.arm!r}; {' and '.join(DRIVES)} are shipped; examples/own_arm.py is where one's own begins"
+            f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with examples/own_arm.py"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
-        from service.arms.drive import Drive, DriveError  # heavy, as all below: nobody's absence is told sooner
+        from service.arms.drive import Drive, DriveError  # slow imports: a missing daemon is reported before
         from service.arms.drive import follow as driven
         from service.arms.franka import FrankaArm
         from service.arms.simulated import SimulatedArm
@@ -36,16 +38,16 @@ def follow(args: argparse.Namespace) -> int:
         status = Client(session, cell).wait_until_ready(timeout_s=args.wait, silent=False)
         if status.joints != settings.joints.names:
             raise DriveError(
-                f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; here "
-                f"{len(settings.joints.names)} were configured, {', '.join(settings.joints.names)}: "
-                "give --config, the daemon's own settings"
+                f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; the "
+                f"settings here have {len(settings.joints.names)}, {', '.join(settings.joints.names)}: "
+                "give the daemon's settings by --config"
             )
         drive: Drive = FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         ask_for_real_time()
-        say(f"{args.arm} of cell {cell} is driven; Ctrl-C ends it")
+        say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
         playback = driven(drive, session, cell, stop=stop, wait_s=args.wait)
-    say(f"ended at rest, {playback.delay_ticks:.1f} ticks behind; {playback.refused} commands were refused")
+    say(f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were refused")
     return 0

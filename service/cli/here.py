@@ -1,4 +1,4 @@
-"""`thirdhand via-points add NAME --here`: the positions of hands and tool by a running daemon."""
+"""`thirdhand via-points add NAME --here`: the positions of hands and tool from a running daemon."""
 
 from __future__ import annotations
 
@@ -13,27 +13,29 @@ from service.contract.explain import ExplainedError
 from service.contract.records import SIDES
 from service.process.progress import say
 
-STILL_S, STILL_M = 1.0, 0.015  # still: no more motion than STILL_M over STILL_S
-OLDEST_MS = 200.0  # of a hand
-TIMEOUT_S, POLL_S = 30.0, 0.05
+STILL_S = 1.0  # hands and tool hold still if they move less than STILL_M within this time
+STILL_M = 0.015  # trackers are noisy, and hands tremble
+MAX_HAND_AGE_MS = 200.0  # an older position of a hand is not used
+HERE_TIMEOUT_S = 30.0  # hands and tool must hold still within this time
+HERE_POLL_S = 0.05
 
 
 class NotHereError(ExplainedError, RuntimeError):
-    """The positions of hands or tool are not known, or do not hold still."""
+    """Hands or tool are not seen, or do not hold still."""
 
 
 def still(args: argparse.Namespace) -> dict[str, list[float]]:
-    """The positions of the hands by which the skill goes, and of the tool [m], that the arguments
-    do not give, once they hold still.
+    """The positions [m] of the skill's hands and of the tool that the arguments do not give, once
+    they hold still.
 
-    The tool's is measured where the arm publishes its joints, else commanded. Raises NotHereError
-    where hands or tool are not seen, or move, for TIMEOUT_S.
+    The tool's position is measured if the arm publishes its joints, else commanded. Raises
+    NotHereError if hands or tool are not seen, or move, for HERE_TIMEOUT_S.
     """
-    said: set[str] = set()
+    reported: set[str] = set()
     seen: list[tuple[float, dict[str, list[float]]]] = []
-    with reached(args, TIMEOUT_S) as session:
+    with reached(args, HERE_TIMEOUT_S) as session:
         client = Client(session, args.cell)
-        client.wait_until_ready(timeout_s=TIMEOUT_S)
+        client.wait_until_ready(timeout_s=HERE_TIMEOUT_S)
         hands = client.status().hands
         going = [name for name in (*SIDES, "tool") if name not in SIDES or hands in ("both", name)]
         wanted = [name for name in going if not getattr(args, name)]
@@ -42,9 +44,9 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
         while True:
             now, at_s = client.ask("status"), time.monotonic()
             lacking = _not_seen(now, wanted)
-            if lacking.keys() - said:
+            if lacking.keys() - reported:
                 say("; ".join(lacking.values()))
-            said = set(lacking)
+            reported = set(lacking)
             if lacking:
                 seen.clear()
             else:
@@ -54,19 +56,19 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
                     seen.pop(0)
                 if at_s - seen[0][0] >= STILL_S:
                     return seen[-1][1]
-            if at_s - begun_s > TIMEOUT_S:
+            if at_s - begun_s > HERE_TIMEOUT_S:
                 raise NotHereError(
-                    f"nothing taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
+                    f"nothing was taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
                 )
-            time.sleep(POLL_S)
+            time.sleep(HERE_POLL_S)
 
 
 def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
-    """Those of the wanted positions that are not known now, each in words."""
+    """Messages on the wanted positions that are not known now, by name."""
     found = {}
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
-        if age_ms is None or age_ms > OLDEST_MS:
+        if age_ms is None or age_ms > MAX_HAND_AGE_MS:
             ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
-            found[side] = f"the {side} hand {ago}; --{side} X Y Z says where it would be"
-    return found | ({"tool": "where the tool is is not known before the first tick"} if status["tick"] < 0 else {})
+            found[side] = f"the {side} hand {ago}; --{side} X Y Z gives its position"
+    return found | ({"tool": "the tool's position is unknown before the first tick"} if status["tick"] < 0 else {})

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import record_options
-from service.cli.usage import ARM, Parser, UsageError, option, reaching, within
+from service.cli.usage import ARM_HELP, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
@@ -31,18 +31,18 @@ RUN_BY = {  # the modules that are not named as their command
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
-SIM = "Runs the simulated bench: publishes hands and joint states, and follows commands."
+SIM = "Runs the simulated bench: it publishes hands and joint states, and follows commands."
 RATE = "the rate of the control loop (default: the rate in the cell's settings)"
-ZENOH_CONFIG = "Zenoh's own settings, for all that the service does not set itself ($THIRDHAND_ZENOH_CONFIG)"
+ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "play"),
-    "stop and go on": ("hold", "resume", "reset"),
+    "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
     "set up": ("arm", "certificates", "completion"),
 }
-CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # they end processes before Ctrl-C ends them
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # on Ctrl-C these commands first end their processes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
-        epilog="thirdhand COMMAND --help tells more, with an example. Begin with: thirdhand demo",
+        epilog="thirdhand COMMAND --help explains a command, with an example. Begin with: thirdhand demo",
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands_of = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -77,60 +77,47 @@ def parser() -> argparse.ArgumentParser:
         "the task went.",
         "thirdhand demo --scene my-scene.toml",
     )
-    option(
-        c,
-        "--output",
-        "DIR",
-        "write the recording, the drawing and the service's log to this folder",
-        Path("thirdhand-demo"),
-    )
-    option(
-        c, "--scene", "FILE", "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
-    )
-    option(c, "--arm", "ARM", ARM, "wam")
-    c.add_argument(
-        "--engine",
-        choices=("pybullet", "mujoco"),
-        help="the physics engine of the bench (default: the first that is installed)",
-    )
+    output = "write the recording, the drawing and the service's log to this folder"
+    option(c, "--output", "DIR", output, Path("thirdhand-demo"))
+    scene = "a TOML file with the places of the scene, as handover = [x, y, z] in metres, frame base"
+    option(c, "--scene", "FILE", scene)
+    option(c, "--arm", "ARM", ARM_HELP, "wam")
+    engine = "the physics engine of the bench (default: the first that is installed)"
+    c.add_argument("--engine", choices=("pybullet", "mujoco"), help=engine)
     option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
         "follow",
-        "Drives an arm by the joint commands of a running cell, and brakes it when they end.",
+        "Drives an arm by the joint commands of a running cell, and brakes it when the commands end.",
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
-    c.add_argument("arm", metavar="ARM", help="the arm to drive: franka, or simulated, an ideal arm to try a cell with")
-    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM}")
+    c.add_argument("arm", metavar="ARM", help="the arm to drive: franka, or simulated, which is an ideal arm")
+    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM_HELP}")
     option(c, "--robot", "ADDRESS", "the host name or IP address of a Franka's control box", "172.16.0.2")
-    option(c, "--wait", "S", "wait this long for the daemon, and as long again for its first command", 60.0)
+    option(c, "--wait", "S", "wait this long for the daemon, and again this long for its first command", 60.0)
     _reach(c)
 
     c = command(
-        "bench",
-        "Measures how punctual the control loop is on this machine.",
-        "thirdhand bench --rate 1000 --seconds 60",
+        "bench", "Measures the timing of the control loop on this machine.", "thirdhand bench --rate 1000 --seconds 60"
     )
     option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    option(c, "--arm", "ARM", ARM, "wam")
+    option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
     other = c.add_mutually_exclusive_group()
-    other.add_argument(
-        "--loads", action="store_true", help="measure under each kind of load beside the loop, --seconds for each"
-    )
-    other.add_argument(
-        "--soak", action="store_true", help="measure memory and open files over time, with a sample every 5 s or less"
-    )
+    loads = "measure under each kind of load beside the loop, --seconds for each"
+    other.add_argument("--loads", action="store_true", help=loads)
+    soak = "measure memory and open files over time, with a sample every 5 s or less"
+    other.add_argument("--soak", action="store_true", help=soak)
 
     c = command(
         "serve",
         "Runs the daemon of a cell: it receives hand poses and publishes joint commands.",
         "thirdhand serve --record recordings --joints state",
     )
-    option(c, "--config", "CELL", f"the cell: {ARM}; the options below override its settings")
+    option(c, "--config", "CELL", f"the cell: {ARM_HELP}; the options below override its settings")
     option(c, "--cell", "NAME", "the prefix of all keys on the network (default: thirdhand)")
     listen = f"listen on this Zenoh endpoint; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
@@ -138,9 +125,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
     option(c, "--rate", "HZ", RATE)
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
-    joints = (
-        "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, which is state)"
-    )
+    joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
     c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
@@ -159,32 +144,31 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "replay",
-        "Runs the core on a recording, or on several that follow each other, and compares every frame. What is missing "
-        "or damaged is listed; only --exact fails for it.",
+        "Runs the core on a recording, or on several that follow each other, and compares every frame. Missing and "
+        "damaged parts are listed; only with --exact they are failures.",
         "thirdhand replay recordings/golden.mcap --exact",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
-    c.add_argument(
-        "--exact", action="store_true", help="forbid gaps, damage, a cut, and even differences below 10 µm and 10 µrad"
-    )
+    exact = "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
+    c.add_argument("--exact", action="store_true", help=exact)
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
-    option(c, "--output", "FILE", "a recording of what is decided now, to be reported, viewed or compared")
+    option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
 
-    c = command("record", record_options.ABOUT, record_options.EXAMPLE)
+    c = command("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
     _reach(c)
 
     c = command(
         "report",
-        "Reports on recordings: what they lack, modes and reasons, faults and what led to them, promptness, closest "
-        "approach, places, limits, rejections. Several are set side by side.",
+        "Reports on recordings: missing ticks, modes and reasons, faults and their causes, timing, closest approach, "
+        "via-points, limits, rejections. Several recordings are compared.",
         "thirdhand report thirdhand-demo/*.mcap --html report.html",
     )
-    option(c, "files", "FILE", "a recording (.mcap); of two their differences", nargs="+")
-    option(c, "--html", "FILE", "all of it with plots as one page, too")
-    option(c, "--csv", "DIR", "each table, and every tick, as CSV files there, too")
-    option(c, "--lerobot", "DIR", "all as a new data set of LeRobot 3.0 there: joints, hands and commands, too")
-    option(c, "--fps", "N", "rows of it a second", 50, type=within(int, 1, 1000))
+    option(c, "files", "FILE", "a recording (.mcap); several are compared", nargs="+")
+    option(c, "--html", "FILE", "also write the report with plots as a page to this file")
+    option(c, "--csv", "DIR", "also write each table, and every tick, as CSV files to this folder")
+    option(c, "--lerobot", "DIR", "also write joints, hands and commands as a LeRobot 3.0 data set to this new folder")
+    option(c, "--fps", "N", "the rate of the data set [rows/s]", 50, type=within(int, 1, 1000))
     option(c, "--task", "TEXT", "the task of the data set, in words (default: the name of the skill)")
 
     c = command(
@@ -208,25 +192,20 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--output", "FILE", "write the skill to this .npz file", required=True)
     option(c, "--plot", "FILE", "draw the held-out errors to this .png file")
     c.add_argument("--name", help="the name of the skill (default: the name of the file)")
-    option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM}")
+    option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM_HELP}")
     places = (
-        "the named places of the task, as `via-points add --file` reads them, for demonstrations that do not hold "
-        "them; the skill is then learned between these places and follows them when they move"
+        "the via-points of the task, as `via-points add --file` reads them, for demonstrations without via-points; the "
+        "skill is then learned between these via-points and follows them when they move"
     )
     option(c, "--places", "FILE", places)
     count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
     option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
-    option(
-        c,
-        "--ell",
-        "L",
-        "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)",
-        type=positive,
-    )
+    ell = "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)"
+    option(c, "--ell", "L", ell, type=positive)
     components = "take the reference from a mixture of K Gaussians, as in the paper (default: from the demonstrations)"
     option(c, "--components", "K", components, type=count)
     option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)
-    option(c, "--seed", None, "the seed for the start of the mixture and for the sampled inputs", 0, type=int)
+    option(c, "--seed", None, "the seed of the mixture's start and of the sampled inputs", 0, type=int)
 
     c = command("via-points", "Adds, lists and removes via-points of a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -234,105 +213,110 @@ def parser() -> argparse.ArgumentParser:
     a = described(
         actions,
         "add",
-        "teach via-points, all or nothing",
+        "teach via-points: all of them, or none after an error",
         f"{example} add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
         f"--radius .03 --follow left --std .001\n  {example} add glass --here",
     )
     a.add_argument("name", nargs="?", help="the name of the via-point; a via-point of this name is replaced")
     for place in (*SIDES, "tool"):
-        at = "position [m] in frame base"
+        at = f"the position of the {place}{' hand' * (place != 'tool')} in frame base [m]"
         a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
-    a.add_argument("--here", action="store_true", help="hands and tool as they are, once they hold still")
+    a.add_argument("--here", action="store_true", help="use the present positions, once hands and tool hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
-    option(a, "--std", "M", "standard deviation of the tool's position there [m]", defaults.std)
-    option(a, "--radius", "M", "the via-point also holds for hands this far away [m]", defaults.radius)
+    option(a, "--std", "M", "the standard deviation of the tool's position there [m]", defaults.std)
+    option(a, "--radius", "M", "the via-point also holds for hands within this distance [m]", defaults.radius)
     follow = "the hand that the tool moves with, within the radius"
     option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
     turn = "the orientation of the tool there, as a quaternion"
     a.add_argument("--orientation", nargs=4, type=within(float, -1.001, 1.001), metavar=("X", "Y", "Z", "W"), help=turn)
     a.add_argument("--gripper", choices=("open", "closed"), help="the state of the gripper there")
-    option(a, "--tolerance", "M", f"points learned nearer than this give way (default: {TOLERANCE_M} m)")
-    option(a, "--file", "FILE", "a request as JSON instead; - is standard input")
+    option(a, "--tolerance", "M", f"replace learned points within this distance (default: {TOLERANCE_M} m)")
+    option(a, "--file", "FILE", "read the request in JSON from this file instead; - is standard input")
     _reach(a)
-    a = described(actions, "remove", "forget via-points by name", f"{example} remove handover")
+    a = described(actions, "remove", "remove via-points by name", f"{example} remove handover")
     a.add_argument("names", metavar="NAME", nargs="+")
     _reach(a)
-    _reach(described(actions, "list", "the via-points in force", f"{example} list"))
-    _reach(described(actions, "clear", "forget all via-points", f"{example} clear"))
+    _reach(described(actions, "list", "list the via-points in force", f"{example} list"))
+    _reach(described(actions, "clear", "remove all via-points", f"{example} clear"))
 
     c = _reach(
-        command("stage", "Tells a running daemon that the task has reached a via-point.", "thirdhand stage handover")
+        command(
+            "stage", "Reports to a running daemon that the task has reached a via-point.", "thirdhand stage handover"
+        )
     )
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
 
-    c = _reach(command("status", "Shows what a running daemon does.", "thirdhand status --json"))
-    c.add_argument("--json", action="store_true", help="print what <cell>/status carries; with --watch a line each")
-    c.add_argument("--watch", action="store_true", help="hands, tool, target and distances as they change")
-    about = "Looks at a running cell, and says what is wrong and what to do. Then exit 1."
+    c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
+    c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")
+    c.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
+    about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
     option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))
-    _reach(command("hold", "Stops the arm, which then stays.", "thirdhand hold"))
+    _reach(command("hold", "Stops the arm until `resume`.", "thirdhand hold"))
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
     _reach(command("reset", "Ends a fault.", "thirdhand reset"))
 
     c = command(
-        "cells", "Lists the daemons on a network and what each does.", "thirdhand cells --connect tcp/127.0.0.1:7447"
+        "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
     _reach(c, one=False)
 
     c = command(
         "arm",
-        "Reads an arm's URDF, prints what it understands, and writes a first cell: settings, and a picture of them.",
+        "Reads an arm's URDF, reports on it, and writes a first cell: settings, and a picture of them.",
         "thirdhand arm my-arm.urdf",
     )
     option(c, "urdf", "URDF", "the arm's description", type=Path)
-    option(c, "--plate", "LINK", "the link that carries the tool (default: the likely one)")
-    at = "position of its root in frame base [m] (default: 0 0 0, or nearby if it reaches the demo's places from there)"
+    option(c, "--plate", "LINK", "the link that carries the tool (default: the most probable one)")
+    at = (
+        "position of the arm's root in frame base [m] (default: 0 0 0, or nearby if only that reaches the demo's scene)"
+    )
     c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=at)
-    option(c, "--packages", "DIR", "a folder with packages of ROS, for its meshes; may be repeated", action="append")
-    option(c, "--output", "FILE", "the cell's settings; the picture is beside it", Path("cell.toml"), type=Path)
+    option(c, "--packages", "DIR", "a folder with ROS packages, for the arm's meshes; may be repeated", action="append")
+    output = "write the cell's settings to this file, and the picture to a .png beside it"
+    option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)
 
     c = command(
         "certificates",
-        "Makes an authority, and a certificate for the daemon and for each role on a network; with --role, one more "
-        "certificate by the authority that is there.",
+        "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
+        "more certificate by the authority in the folder.",
         "thirdhand certificates secrets --host bench.local",
     )
-    option(c, "folder", "DIR", "a new folder, private to its user; with --role an old one")
-    option(c, "--host", "NAME", "or address at which clients reach the daemon; may be repeated", action="append")
+    option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
+    option(c, "--host", "NAME", "a name or address at which clients reach the daemon; may be repeated", action="append")
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
-    option(c, "--days", "N", "the certificates are valid for this time", 3650, type=int)
+    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)
 
-    # all arguments are passed to `python -m sim`, so nothing is an option here, not even --help
+    # All arguments are passed to `python -m sim`, so there are no options here, not even --help.
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
     c.set_defaults(run="cli.sim.sim")
     c.add_argument("options", nargs="*")
 
     c = command(
         "view",
-        "Shows recordings, or a running daemon, in Rerun. In a window, as a picture, or in a browser.",
+        "Shows recordings or a running daemon in Rerun: in a window, as a picture, or in a browser.",
         "thirdhand view thirdhand-demo/*.rrd\n  thirdhand view thirdhand-demo/*.rrd --screenshot scene.png --time 12\n"
         "  thirdhand view live --web 8080",
     )
-    option(c, "files", "FILE|live", "drawings (.rrd) and recordings (.mcap); or `live`: a running daemon", nargs="+")
+    option(c, "files", "FILE|live", "drawings (.rrd) and recordings (.mcap), or `live` for a running daemon", nargs="+")
     picture = c.add_argument_group("a picture")
-    option(picture, "--screenshot", "PNG", "write this picture instead of opening a window; of several files the last")
+    option(picture, "--screenshot", "PNG", "write a picture instead of opening a window; of several files, of the last")
     option(picture, "--time", "S", "show this time after the start (default: the last moment in mode follow)")
     tabs = ("task", "timing", "learning")
     option(picture, "--tab", None, "show this tab of the viewer (default: task)", choices=tabs)
     browser = c.add_argument_group("a browser")
-    web = "serve a page for browsers, with hold, resume and reset, of `live` (default: any port of this machine)"
+    web = "serve `live` as a page for browsers with hold, resume and reset (default: any port of this machine)"
     option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     _reach(c)
 
-    about = "Prints or writes a script by which a shell completes these commands, their options and files."
+    about = "Prints or writes a script with which a shell completes these commands, their options and files."
     example = "thirdhand completion bash --output ~/.local/share/bash-completion/completions/thirdhand"
     c = command("completion", about, example)
     c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
-    option(c, "--output", "FILE", "write the script there; folders that are missing are made")
+    option(c, "--output", "FILE", "write the script to this file; missing folders are made")
     top.groups = {
         title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
     }
@@ -340,7 +324,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Version(argparse.Action):
-    """Prints the version of the installed distribution."""
+    """Print the version of the installed distribution."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib import metadata  # slow to import
@@ -350,12 +334,12 @@ class _Version(argparse.Action):
 
 
 def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.ArgumentParser:
-    """The same parser, with the options by which a daemon is reached; `one`: and named."""
+    """The same parser with the options by which a daemon is reached, and if `one`, its cell."""
     group = sub.add_argument_group(
         "how the daemon is reached",
-        f"An option that is not given is taken from the variable in its text, else from the file\n{CLIENT_FILE}.",
+        f"An option that is not given is taken from the variable in its help, else from the file\n{CLIENT_FILE}.",
     )
-    endpoint = "Zenoh endpoint of the daemon or of a router; of several the first that answers"
+    endpoint = "Zenoh endpoint of the daemon or of a router; if repeated, the first that answers"
     option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
@@ -367,7 +351,7 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code of a command."""
+    """Run a command line and return its exit code."""
     args = parser().parse_args(arguments)
     module, function = args.run.rsplit(".", 1)
     try:
@@ -379,7 +363,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (UsageError, SettingsError) as error:
         say(f"thirdhand {args.command}: {in_file(str(error))}")
         return 1 if isinstance(error, UnreadableError) else 2
-    except BrokenPipeError:  # the reader, a pager for instance, has ended
+    except BrokenPipeError:  # the reader of standard output, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:

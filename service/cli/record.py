@@ -1,4 +1,4 @@
-"""`thirdhand record`: captures demonstrations of a running cell; shows, trims and deletes them."""
+"""`thirdhand record`: capture, show, trim and delete demonstrations of a running cell."""
 
 from __future__ import annotations
 
@@ -29,13 +29,15 @@ from service.process.progress import say
 from service.settings.config import Settings
 from service.trackers.capture import capture
 
-LONGEST_PERSON = 64  # letters of who demonstrates
+LONGEST_PERSON = 64  # [characters]
 
 
 def record(args: argparse.Namespace) -> int:
-    """Exit code 0 once a demonstration is written, or an existing one shown, trimmed or deleted."""
+    """Capture, show, trim, list or delete takes. Exit code 0; 1 if --list finds an unusable
+    take.
+    """
     if args.list == (args.name is not None):
-        raise UsageError("a take's name needed, or --list")
+        raise UsageError("either the name of a take or --list needed")
     if args.name is not None:
         try:
             path_of(args.folder, args.name)
@@ -51,13 +53,13 @@ def record(args: argparse.Namespace) -> int:
         deleted = [path, *([uncut(path)] if uncut(path).exists() else [])]
         for one in deleted:
             one.unlink()
-        print(f"{', '.join(map(str, deleted))} deleted")
+        print(f"deleted: {', '.join(map(str, deleted))}")
         return 0
     if args.trim is not None:
         start_s, end_s = args.trim
         if not 0 <= start_s < end_s:
             raise UsageError(
-                f"--trim {start_s:g} {end_s:g}: seconds from the start, the first below the second, needed"
+                f"--trim {start_s:g} {end_s:g}: two times [s] from the start needed, the first below the second"
             )
         print(trim(existing_path(args.folder, args.name), start_s, end_s), file=sys.stderr)
     elif not args.show:
@@ -71,7 +73,7 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _list(folder: Path, settings: Settings | None) -> int:
-    """Exit code 1 where one of the takes cannot be learned from."""
+    """List the takes; exit code 1 if one of them is not usable for learning."""
     if not folder.is_dir():
         raise DemonstrationNameError(
             f"{folder} {'is no folder' if folder.exists() else 'does not exist'}: a folder of takes needed (--folder)"
@@ -96,10 +98,10 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         if not low <= getattr(args, name) <= high:
             raise UsageError(f"--{name} {getattr(args, name):g}: {low:g} to {high:g} s accepted")
     if len(args.person or "") > LONGEST_PERSON:
-        raise UsageError(f"--person of {len(args.person)} letters: up to {LONGEST_PERSON} accepted")
+        raise UsageError(f"--person of {len(args.person)} characters: up to {LONGEST_PERSON} accepted")
     path = path_of(args.folder, args.name)
     if path.exists():
-        raise DemonstrationNameError(f"{path} is there already: another name needed, or --delete it first")
+        raise DemonstrationNameError(f"{path} exists already: give another name, or --delete it first")
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
     places = places_in(args.places) if args.places else ()
@@ -113,10 +115,10 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             timeout_s=CONNECT_TIMEOUT_S,
             certificate=reach.certificate,
             zenoh_config=reach.zenoh_config,
-            more={} if listen else {"mode": "client"},  # to clients a daemon passes on what others publish
+            more={} if listen else {"mode": "client"},  # a daemon forwards others' messages only to clients
         )
     except UnreachableError as error:
-        hint = "" if listen else f" Where no daemon runs, --listen {ENDPOINT} takes its place"
+        hint = "" if listen else f" Without a daemon, use --listen {ENDPOINT}"
         raise UnreachableError(f"{error}{hint}") from None
     with session:
         if args.until == "key":
@@ -139,7 +141,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         print(file=sys.stderr)
     captured.write(path, places)
     for key, count in captured.malformed.items():
-        print(f"{count} messages on {key} were not readable, and are left out", file=sys.stderr)
+        print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
 
 
 def _say_over_progress(line: str) -> None:
@@ -152,7 +154,9 @@ def _progress(line: str) -> None:
 
 
 class _Ended:
-    """Whether Enter was pressed; standard input that ends, or is another's, is ignored."""
+    """A function that is True once Enter was pressed. Standard input is ignored if it has ended or
+    belongs to another process group.
+    """
 
     def __init__(self) -> None:
         self._listens = True

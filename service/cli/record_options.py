@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import ARM, option
+from service.cli.usage import ARM_HELP, option
 
-ABOUT = (
+ABOUT_RECORD = (
     "Records a demonstration of hands and tool from a running cell, called a take, and summarizes it. Also lists, "
     "shows, trims and deletes takes. The pose of the tool is taken from tool/pose or, if nothing publishes that, is "
     "computed from the arm's joints/state and its URDF."
 )
-EXAMPLE = """thirdhand record take-1
+RECORD_EXAMPLE = """thirdhand record take-1
   thirdhand record take-1 --hands left
   thirdhand record take-2 --person Ada
   thirdhand record take-1 --trim 0.3 9
@@ -20,14 +20,14 @@ EXAMPLE = """thirdhand record take-1
 
 
 def add_options(c: argparse.ArgumentParser) -> None:
-    """Adds the command's own options."""
+    """Add the command's own options."""
     option(c, "name", "NAME", "the name of the take", nargs="?")
     option(c, "--folder", "DIR", "the folder of the takes; it is made if missing", Path("demonstrations"))
-    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM}")
+    option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM_HELP}")
     hands = "the hands that lead the tool; if it is one, only that one is recorded and the skill ignores the other"
     option(c, "--hands", None, hands, "both", choices=("both", "left", "right"))
     person = "the person who demonstrates; with two or more people, `learn` holds out all takes of a person together"
-    option(c, "--person", "WHO", person)
+    option(c, "--person", "NAME", person)
     until = (
         "end the take by a key (Enter or Ctrl-C), or also once hands and tool rest after they moved: all stay "
         "within 15 mm, joints within 0.02 rad (of the rest before and after, 0.3 s are then retained)"
@@ -39,7 +39,7 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--wait", "S", "wait this long for hands and tool to be published", 30.0)
     listen = "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
     option(c, "--listen", "EP", listen)
-    places = "the named places of the task in this take, as JSON that `via-points add --file` reads"
+    places = "the via-points of the task in this take, as JSON that `via-points add --file` reads"
     option(c, "--places", "FILE", places)
     option(c, "--plot", "FILE", "draw the take to this .png file")
     instead = c.add_mutually_exclusive_group()

@@ -20,7 +20,7 @@ from service.contract.printable import printable_lines
 from service.contract.requests import Status
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.mcap_file import ends_early
-from service.files.pose_streams import SIDES, PoseTopic
+from service.files.pose_streams import TRACK_NAMES, PoseTopic
 from service.files.recording import Recording
 from service.files.replay import replay as replayed
 from service.files.shipped import cell_of
@@ -31,18 +31,18 @@ from service.learning.table import table
 from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
 
-COUNTED_WITHIN_S = 1.0  # a status is up to a tenth of a second old
+COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 
 
 def play(args: argparse.Namespace) -> int:
-    """Exit code 0 once all hands are published."""
+    """Publish the hands of a recording; exit code 0 once all are published."""
     try:
         hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in iter_hands(args.file)]
     except WireError as error:
         raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
     start_ns, last_ns = hands[0][0], hands[-1][0]
     if ends_early(args.file):
-        print(f"{args.file} is cut: its end is missing, and what is there is played", file=sys.stderr)
+        print(f"{args.file} was cut: its end is missing, the rest is played", file=sys.stderr)
     with reached(args, None) as session, Tracker(session, args.cell) as tracker:
         client = Client(session, args.cell)
         print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
@@ -53,7 +53,7 @@ def play(args: argparse.Namespace) -> int:
                 early = begin + (time_ns - start_ns) / 1e9 / args.speed - time.monotonic()
                 if early > 0:
                     time.sleep(early)
-                # a tracker stamps what it sees now
+                # Without a stamp, the pose gets the present time, as from a tracker.
                 tracker.publish(side, pose.position, pose.orientation, frame_id=pose.frame_id)
             print(_arrived(client, before, Counter(side for _, side, _ in hands)), file=sys.stderr)
             if not args.loop:
@@ -61,9 +61,9 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
-    """The numbers of played poses that reached the daemon's loop, by its own count, in words.
+    """A message with the numbers of played poses that the daemon's loop counted.
 
-    Raises ExplainedError where none of a hand did.
+    Raises ExplainedError if it counted none of a hand.
     """
     until = time.monotonic() + COUNTED_WITHIN_S
     while True:
@@ -75,13 +75,15 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
     counts = ", ".join(f"{max(0, came[side])} of {played[side]} of the {side} hand" for side in played)
     refused = {cause: now.rejected[cause] - before.rejected.get(cause, 0) for cause in now.rejected}
     if any(came[side] <= 0 for side in played):
-        raise ExplainedError(f"of the poses played the daemon counted {counts}: was it restarted, or is it stalled?")
+        raise ExplainedError(f"the daemon received {counts}: was it restarted, or is it stalled?")
     causes = ", ".join(f"{count} {cause}" for cause, count in refused.items() if count > 0)
-    return f"{counts} came to the daemon's loop" + f"; rejected meanwhile: {causes}" * bool(causes)
+    return f"the daemon's loop received {counts}" + f"; rejected meanwhile: {causes}" * bool(causes)
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Exit code 0 if all frames are close enough; with `--exact`, complete and identical."""
+    """Replay recordings; exit code 0 if all frames are within tolerance, or with `--exact` complete
+    and identical.
+    """
     if args.output:
         check_writable(args.output, ".mcap")
     counts = [Recording.open(path).ticks() for path in args.files]
@@ -93,14 +95,14 @@ def replay(args: argparse.Namespace) -> int:
 
 
 def learn(args: argparse.Namespace) -> int:
-    """Exit code 0 once the skill is written; 1, and nothing written, where it would be unsafe."""
+    """Learn a skill; exit code 0 once it is written. An unsafe skill is not written."""
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
-    if args.demonstrations[0].exists():  # else its reader says that it does not
+    if args.demonstrations[0].exists():  # else its reader reports the missing file
         check_count([path.stem for path in args.demonstrations], args.components)
     settings = cell_of(str(args.config)) if args.config else None
-    topics = {name: PoseTopic.parsed(text) for name in SIDES if (text := getattr(args, name))}
+    topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
@@ -125,11 +127,11 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))  # what is unsafe is in the error
+    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))  # the error lists what is unsafe
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:
-        raise ExplainedError(f"{args.output} is not written: {'; '.join(figures.unsafe)}")
+        raise ExplainedError(f"{args.output} was not written: {'; '.join(figures.unsafe)}")
     args.output.write_bytes(skill.file)
     primitive = skill.model.primitive
     over = " over a mean that is linear in the hands" * isinstance(primitive.prior_mean, AffineMean)

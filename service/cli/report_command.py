@@ -1,4 +1,4 @@
-"""`thirdhand report`: a report of recordings, on the terminal, as a page or as tables in files."""
+"""`thirdhand report`: a report on recordings, on the terminal, as a page or as tables in files."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from service.report.columns import KEPT
 from service.report.report import Report, reported
 from service.report.tables import Table, comparison, names_of, summary, tables
 
-BAR = 72  # characters of the line that shows the modes over time
+BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
-MOST_ROWS = 40  # of a table on a terminal
-PLAIN_WIDTH = 120  # characters, where it is no terminal
+MOST_ROWS = 40  # a table on a terminal has at most this many rows
+PLAIN_WIDTH = 120  # [characters] width of tables that are not printed on a terminal
 
 
 def report(args: argparse.Namespace) -> int:
-    """Exit code 0 once all recordings are reported, whatever they hold."""
+    """Report on recordings; exit code 0 for any content."""
     if args.html:
         check_writable(args.html)
     if args.csv and args.csv.exists() and not args.csv.is_dir():
-        raise UsageError(f"--csv {args.csv} is a file, a folder needed")
+        raise UsageError(f"--csv {args.csv} is a file; a folder needed")
     if args.lerobot and args.lerobot.exists():
-        raise UsageError(f"--lerobot {args.lerobot} is there already, a new folder needed")
+        raise UsageError(f"--lerobot {args.lerobot} exists already; a new folder needed")
     reports = []
     for path in args.files:
         with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
@@ -61,7 +61,7 @@ def report(args: argparse.Namespace) -> int:
         parts, rows = lerobot.write(columns, args.lerobot, fps=args.fps, task=task)
         console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
     if args.html:
-        from service.report.page import page  # draws, which takes a while to import
+        from service.report.page import page  # its import is slow
 
         with progress("drawing", unit="recordings", total=len(reports)) as done:
             args.html.write_text(page(reports, progress=done), encoding="utf-8")
@@ -103,12 +103,12 @@ def _print_table(console: Console, table: Table) -> None:
     console.print(Text(table.title, style="bold"))
     console.print(drawn)
     if len(table.rows) > MOST_ROWS:
-        console.print(f"... and {len(table.rows) - MOST_ROWS} more; --csv and --html show all")
+        console.print(f"... and {len(table.rows) - MOST_ROWS} more rows; --csv and --html write all")
 
 
 def write_csv(reports: Sequence[Report], folder: Path) -> None:
-    """Writes each table of each report as a file in a folder of the report's name, and every tick
-    in `ticks.csv`; for several reports a comparison beside these folders.
+    """Write each table of a report, and every tick in `ticks.csv`, to a folder with the report's
+    name, and for several reports a comparison beside these folders.
     """
     for name, one in zip(names_of(reports), reports, strict=True):
         inside = folder / name
@@ -129,7 +129,7 @@ def _write(path: Path, table: Table) -> None:
 
 
 def _write_ticks(path: Path, one: Report) -> None:
-    """Writes every field of the report's frames, a row each tick, in SI units."""
+    """Write every field of the report's frames in SI units, with a row for each tick."""
     frames = one.columns.frames
     heads, formats, columns = ["time_s"], ["%.4f"], [one.columns.times[:, None]]
     for name in KEPT:

@@ -24,8 +24,8 @@ from service.settings.config import Settings, converted
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Exit code 0 once it has stopped and closed everything; 1 if recordings lack ticks."""
-    os.umask(0o077)  # its files are private to its user
+    """Run the daemon until it is stopped; exit code 0, or 1 if recordings lack ticks."""
+    os.umask(0o077)  # files are private to the user
     _open_standard_streams()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
@@ -39,12 +39,12 @@ def serve(args: argparse.Namespace) -> int:
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
-            raise OSError(f"nothing can be recorded in {folder}: {reason}") from None
+            raise OSError(f"cannot record in {folder}: {reason}") from None
     if folder is not None or args.live is not None:
-        child.preload("service.scribe.process")  # beside this process, which imports as much
+        child.preload("service.scribe.process")  # in parallel to the imports of this process
     with starting(settings) as start:
-        gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
-        from service.daemon import daemon  # heavy, while who asks is answered
+        gc.disable()  # imports leave no garbage, and its collection would take a tenth of their time
+        from service.daemon import daemon  # a slow import, during which `start` answers requests
         from service.scribe.scribe import Scribe
 
         gc.enable()
@@ -54,18 +54,18 @@ def serve(args: argparse.Namespace) -> int:
             line = f"listening on {where} as cell {settings.cell}"
             try:
                 print(line, flush=True)
-            except OSError as error:  # an arm that works does not depend on a reader
+            except OSError as error:  # the daemon runs on without a reader of its output
                 logging.getLogger("thirdhand").warning("%s (standard output: %s)", line, in_words(error))
 
         skill, scribe = args.skill or skills / SHIPPED_SKILL, Scribe(settings, folder=folder, live_port=args.live)
         missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
     logging.shutdown()
-    os._exit(1 if missing else 0)  # all is closed; does not wait for threads of libraries
+    os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
 
 
 def _open_standard_streams() -> None:
-    """Opens the null device for each of standard input, output and error that is closed, or a
-    socket would take its number, and receive what libraries write there.
+    """Open the null device for each closed one of standard input, output and error. Otherwise a
+    socket gets its number and receives the output of libraries.
     """
     for number in range(3):
         try:
@@ -75,15 +75,15 @@ def _open_standard_streams() -> None:
 
 
 class PrintableFormatter(logging.Formatter):
-    """Formats a record so that what it quotes has no effect on a terminal."""
+    """A formatter that makes control characters in log records printable."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's line or lines."""
+        """The record as one or more lines."""
         return CLEAR * sys.stderr.isatty() + printable_lines(super().format(record))
 
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
-    """The settings, with the options of the command line instead."""
+    """The settings, overridden by the options of the command line."""
     given: dict[str, Any] = msgspec.to_builtins(settings)
     for section, field, value in (
         (given, "cell", args.cell),

@@ -12,7 +12,7 @@ from service.process.child import python
 
 
 def sim(args: argparse.Namespace) -> NoReturn:
-    """Replaces this process by `python -m sim` with the same options."""
+    """Replace this process by `python -m sim` with the same options."""
     if not {"-h", "--help", "--via-points", "--hands-only"} & set(args.options):
         engine_of()
     command, environment = python("-m", "sim", *args.options)

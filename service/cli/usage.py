@@ -1,4 +1,4 @@
-"""Options and checks of arguments that the commands share, and usage errors."""
+"""Options and checks of arguments that several commands use, and usage errors."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest choice for an unknown one. `groups` are its commands by
-    what they are for, each with what it does, as its help lists them.
+    """A parser that suggests the nearest choice for an unknown one. `groups` has the commands and
+    their descriptions by title, for the help.
     """
 
     groups: Mapping[str, Mapping[str, str]] = {}
 
     def format_help(self) -> str:
-        """Usage, and the commands in their groups."""
+        """The help text: usage, and the commands in their groups."""
         if not self.groups:
             return super().format_help()
         shown = argparse.HelpFormatter(self.prog, max_help_position=15)
@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         return f"{self.format_usage()}\n{shown.format_help()}"
 
     def error(self, message: str) -> NoReturn:
-        """Prints usage and message, and exits with code 2."""
+        """Print usage and message, and exit with code 2."""
         found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         words = re.findall(r"[\w-]+", found[2]) if found else []
         near = difflib.get_close_matches(found[1], words, n=1, cutoff=0.5) if found else []
@@ -57,7 +57,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def within(kind: type[float], low: float, high: float, unit: str = "") -> Callable[[str], float]:
-    """What reads a number (an int or a float) from `low` to `high` from the command line."""
+    """A function that reads a number (int or float) from `low` to `high` from the command line."""
 
     def read(given: str) -> float:
         with contextlib.suppress(ValueError):
@@ -69,13 +69,13 @@ def within(kind: type[float], low: float, high: float, unit: str = "") -> Callab
 
 
 def endpoint(given: str) -> str:
-    """Reads a Zenoh endpoint from the command line."""
+    """Read a Zenoh endpoint from the command line."""
     if lacks := lacking(given):
         raise argparse.ArgumentTypeError(lacks)
     return given
 
 
-KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for an option's value
+TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
@@ -83,11 +83,11 @@ KINDS: dict[str | None, Callable[[str], Any]] = {  # by the word that stands for
     "EP": endpoint,
 }
 
-ARM = "wam, franka or ur5, or a cell's settings (FILE.toml)"
+ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml)"
 
-FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an option's value
-    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILES),
+FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
+COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # the functions with which a shell completes a value
+    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILE_COMPLETION),
     "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
 }
 
@@ -95,50 +95,47 @@ COMPLETED: dict[str | None, dict[str, str]] = {  # what a shell puts for an opti
 def option(
     c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
 ) -> None:
-    """Adds an option or argument that takes a value; its help tells its default."""
+    """Add an option or argument with a value; its default is appended to its help."""
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
-    more = {"type": KINDS.get(metavar, str), **more}
+    more = {"type": TYPE_OF_METAVAR.get(metavar, str), **more}
     added = c.add_argument(name, metavar=metavar, help=about, default=default, **more)
-    if metavar in COMPLETED:
-        added.complete = COMPLETED[metavar]  # type: ignore[attr-defined]  # as shtab reads it
+    if metavar in COMPLETION_OF_METAVAR:
+        added.complete = COMPLETION_OF_METAVAR[metavar]  # type: ignore[attr-defined]  # as shtab reads it
 
 
 def check_writable(path: Path, suffix: str = "") -> None:
-    """Raises UsageError where no file of this suffix can be written at this path; for a check
-    before long work.
+    """Raise UsageError if no file of this suffix can be written at a path; for a check before long
+    work.
     """
     folder = path.parent
     if path.is_dir():
-        raise UsageError(f"{path} is a folder, the name of a file needed")
+        raise UsageError(f"{path} is a folder; the name of a file needed")
     if suffix and path.suffix.lower() != suffix:
-        raise UsageError(f"{path}: a name that ends in {suffix} needed: {path.with_suffix(suffix).name}, say")
+        raise UsageError(f"{path}: a name that ends in {suffix} needed, like {path.with_suffix(suffix).name}")
     if not folder.is_dir():
         raise UsageError(f"{path}: there is no folder {folder}")
     if not os.access(path if path.exists() else folder, os.W_OK):
-        raise UsageError(f"{path} cannot be written: no permission")
+        raise UsageError(f"{path} cannot be written: permission denied")
 
 
 def reaching(args: argparse.Namespace) -> ClientSettings:
-    """How the daemon or router is reached. Raises SettingsError."""
+    """The client settings in a command line. Raises SettingsError."""
     return client_settings(
-        connect=args.connect,
-        cell=vars(args).get("cell"),
-        certificate=args.certificate,
-        zenoh_config=args.zenoh_config,
+        connect=args.connect, cell=vars(args).get("cell"), certificate=args.certificate, zenoh_config=args.zenoh_config
     )
 
 
 def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:
-    """A session to the daemon or router; None: it waits until Ctrl-C. Raises UnreachableError, at
-    once where the system says that nobody listens.
+    """A session to the daemon or router; with a timeout of None it waits until Ctrl-C. Raises
+    UnreachableError, immediately if the system reports that nothing listens.
     """
     return reaching(args).session(timeout_s=timeout_s, at_once=timeout_s is not None)
 
 
 def added_in(path: Path) -> Add:
-    """The request to add via-points in a file (-: standard input). Raises RequestError, which names
-    the file.
+    """The request to add via-points in a file (`-`: standard input). Raises RequestError with the
+    name of the file.
     """
     try:
         request: Add = decode_request(
@@ -152,5 +149,5 @@ def added_in(path: Path) -> Add:
 
 
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
-    """The via-points in such a file. Raises RequestError, which names the file."""
+    """The via-points in a file, see `added_in`. Raises RequestError with the name of the file."""
     return added_in(path).points

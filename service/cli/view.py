@@ -1,5 +1,5 @@
-"""`thirdhand view`: a recording drawn into a Rerun file, the Rerun viewer opened on it or on the
-running daemon, in a window or a browser, or a picture taken without a screen.
+"""`thirdhand view`: draw a recording into a Rerun file; open the Rerun viewer on it or on a running
+daemon, in a window or a browser; or take a picture without a screen.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.daemon.launch import free_port
-from service.files.recording import OBJECTS, Recording
+from service.files.recording import OBJECTS_NOTE, Recording
 from service.files.steps import Gap
 from service.process.progress import progress, say
 from service.settings import palette
@@ -40,16 +40,17 @@ from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program
 
 RRD_MAGIC = b"RRF2"
-TITLE_BAR = 30  # pixels that a window's bar has at least
-MARGIN, LETTERS = 14, 15  # of what is said of a picture at its top [pixels]
-TINT = 40  # difference of colour channels in a grey bar
+TITLE_BAR = 30  # [pixels] minimum height of a window's title bar
+CAPTION_MARGIN_PX = 14  # distance of the caption from the corner of a picture
+CAPTION_PX = 15  # height of its letters
+BAR_TINT = 40  # maximum difference of colour channels in the grey title bar
 NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
-FRESH_S = 1.0  # age of a live view's picture above which the age is printed
+FRESH_S = 1.0  # the age of a live view's picture is printed if it is larger
 FRESH_TIMEOUT_S = 10.0
 
 
 def view(args: argparse.Namespace) -> int:
-    """The viewer's exit code once its window is closed; 0 once a picture is written."""
+    """Show files or a live view; the viewer's exit code, or 0 once a picture is written."""
     check_usage(args)
     if args.files == ["live"]:
         now = ask(args, "status")
@@ -60,9 +61,9 @@ def view(args: argparse.Namespace) -> int:
     paths = [Path(name) for name in args.files]
     kinds = [_kind(path) for path in paths]
     if args.screenshot and len(paths) > 1:
-        say(f"the picture is of {paths[-1]}, the last of {len(paths)} files")
+        say(f"the picture shows {paths[-1]}, the last of {len(paths)} files")
         paths, kinds = paths[-1:], kinds[-1:]
-    _check_drawing(args)  # before what takes long
+    _check_drawing(args)  # before long work
     with tempfile.TemporaryDirectory() as folder:
         drawings = []
         for i, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
@@ -80,7 +81,7 @@ def _kind(path: Path) -> bytes:
         raise ExplainedError(f"no such file: {path}")
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
-    if not path.is_file():  # a pipe would be waited for
+    if not path.is_file():  # reading a pipe could wait forever
         raise ExplainedError(f"{path} is not a file; a recording (.mcap) or a drawing of Rerun's (.rrd) needed")
     with path.open("rb") as file:
         begins = file.read(len(MCAP0_MAGIC))
@@ -91,13 +92,13 @@ def _kind(path: Path) -> bytes:
 
 
 def check_usage(args: argparse.Namespace) -> None:
-    """Raises UsageError for arguments that are not valid, before anything is drawn."""
+    """Raise UsageError for invalid arguments, before anything is drawn."""
     if args.screenshot:
         check_writable(args.screenshot, ".png")
     if args.time is not None and not (args.screenshot and math.isfinite(args.time) and args.time >= 0):
-        raise UsageError(f"--time {args.time:g}: seconds from 0 on, of a --screenshot, needed")
+        raise UsageError(f"--time {args.time:g}: a time [s] from 0 on, together with --screenshot, needed")
     if "live" in args.files and len(args.files) > 1:
-        raise UsageError(f"live beside {len(args.files) - 1} files; either live alone or files needed")
+        raise UsageError(f"live and {len(args.files) - 1} files given; either live or files needed")
     if args.tab is not None and not args.screenshot:
         raise UsageError("--tab chooses the tab of a picture; --screenshot PNG needed with it")
     if args.web is not None and args.screenshot:
@@ -107,12 +108,9 @@ def check_usage(args: argparse.Namespace) -> None:
 
 
 def _serve(args: argparse.Namespace, url: str) -> int:
-    """Serves the page until it is interrupted."""
+    """Serve the page until Ctrl-C."""
     listen = _address(args.web)
-    with (
-        reached(args) as session,
-        web_viewer(rerun_program(), url, free_port()) as viewer,
-    ):
+    with reached(args) as session, web_viewer(rerun_program(), url, free_port()) as viewer:
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.status())
         page = LivePage(client=client, latest=latest, cell=args.cell, viewer=viewer)
@@ -120,7 +118,7 @@ def _serve(args: argparse.Namespace, url: str) -> int:
         def listening(address: Address) -> None:
             print(f"http://{address}/", flush=True)
             if not is_local(f"tcp/{address}"):
-                say("whoever reaches this address can hold, resume and reset the arm")
+                say("everyone who can reach this address can hold, resume and reset the arm")
 
         try:
             asyncio.run(page.serve(listen, listening))
@@ -139,8 +137,8 @@ def _address(given: str) -> Address:
 
 
 def _show(sources: list[str], args: argparse.Namespace) -> int:
-    """The exit code of the viewer on files or a live view, once its window is closed; or 0 once
-    the picture of a single one is written.
+    """Open the viewer on files or a live view and return its exit code, or write the picture of a
+    single one and return 0.
     """
     _check_drawing(args)
     if args.screenshot:
@@ -151,7 +149,7 @@ def _show(sources: list[str], args: argparse.Namespace) -> int:
 
 
 def _check_drawing(args: argparse.Namespace) -> None:
-    """Raises ViewerError where there is no screen for a window, or no Vulkan for a picture."""
+    """Raise ViewerError without a screen for a window, or without Vulkan for a picture."""
     if args.screenshot and not vulkan.is_there():
         raise ViewerError(f"{NO_VULKAN}: no Vulkan device was found")
     has_none = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -166,10 +164,10 @@ def convert(
     say: Callable[[str], None] = lambda line: None,
     progress: Callable[[int], None] = lambda ticks: None,
 ) -> int:
-    """The number of ticks of a recording drawn into a Rerun file.
+    """Draw a recording into a Rerun file and return the number of its ticks.
 
-    `say` is called with what the recording lacks, which the drawing's log shows too. Raises
-    RecordingError and ViewerError.
+    `say` is called with messages on missing parts, which the drawing's log shows too. Raises
+    RecordingError, ViewerError.
     """
     recording = Recording.open(recording_path)
     with tempfile.TemporaryDirectory() as folder:
@@ -178,7 +176,7 @@ def convert(
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
         if viewer.arm_remark:
             say(viewer.arm_remark)
-        notes = recording.notes("requests", "log", OBJECTS)
+        notes = recording.notes("requests", "log", OBJECTS_NOTE)
         note = next(notes, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
@@ -208,23 +206,24 @@ def convert(
     for text in missing:
         say(text)
     if missing:
-        say(f"{count} ticks are there and shown")
+        say(f"the other {count} ticks are shown")
     if viewer.problems:
         raise ViewerError("; ".join(viewer.problems))
     return count
 
 
 def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
-    """The age of the newest data in a picture of a live view [s]; None for a Rerun file.
+    """Take a picture of a Rerun file or a live view. Returns the age of a live view's newest data
+    [s]; None for a file.
 
-    The picture shows one tab, `time` [s] after the start or when the arm last followed, and says
-    which time or how old it is. Raises ViewerError, and UsageError for a time behind the end.
+    The picture shows one tab, `time` [s] after the start or when the arm last followed, with this
+    time or the age in its caption. Raises ViewerError, and UsageError for a time after the end.
     """
     from rerun.experimental import ViewerClient
 
     live = "://" in str(source)
     if not live and not Path(source).is_file():
-        raise ViewerError(f"nothing to picture: there is no {source}")
+        raise ViewerError(f"no picture: there is no file {source}")
     os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # else its graphics library logs errors
     try:
@@ -235,7 +234,7 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
             extent = _extent(client)
             if extent is None:
-                raise ViewerError(f"no picture of {source}: it holds nothing yet")
+                raise ViewerError(f"no picture of {source}: it has no data yet")
             _select_tab(client, tab)
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
@@ -252,7 +251,9 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:
-    """The time [ns] that is `time` [s] after the start, or the end. Raises UsageError if later."""
+    """The time [ns] that is `time` [s] after the start; None: the end. Raises UsageError if it is
+    after the end.
+    """
     start, end = extent
     at = end if time is None else start + round(time * 1e9)
     if at > end:
@@ -273,7 +274,7 @@ def last_followed(rrd: Path, end: int) -> int:
 
 
 def _select_tab(client: Any, tab: str) -> None:
-    """Brings one of the three tabs to the front."""
+    """Bring one of the three tabs to the front."""
 
     def is_selected() -> bool:
         blueprint = client.get_blueprint().blueprint
@@ -294,19 +295,19 @@ def _picture(client: Any) -> Image.Image:
     """A picture of the viewer, without the empty bar at its top."""
     with Image.open(io.BytesIO(client.take_screenshot())) as image:
         pixels = np.asarray(image.convert("RGB"))
-    bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > TINT)) + TITLE_BAR - 8
+    bar = int(np.argmax(np.ptp(pixels[TITLE_BAR:], axis=(1, 2)) > BAR_TINT)) + TITLE_BAR - 8
     return Image.fromarray(pixels[bar if bar < 2 * TITLE_BAR else 0 :])
 
 
 def _save(picture: Image.Image, png: Path, said: str) -> None:
-    """Saves a picture, with what is said of it at its top."""
-    at, font = (picture.width - MARGIN, MARGIN), ImageFont.load_default(LETTERS)
-    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM, anchor="rm", font=font)
+    """Save a picture with a caption at its top."""
+    at, font = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX), ImageFont.load_default(CAPTION_PX)
+    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM_BODY, anchor="rm", font=font)
     picture.save(png)
 
 
 def _fresh(client: Any, png: Path) -> float:
-    """The age of the data [s] in a picture of a live view, taken again until it is recent."""
+    """Take pictures of a live view until one is recent, save it, and return the data's age [s]."""
     until = clock.monotonic() + FRESH_TIMEOUT_S
     while True:
         newest, picture = _extent(client, "time"), _picture(client)
@@ -318,7 +319,7 @@ def _fresh(client: Any, png: Path) -> float:
 
 
 def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
-    """Start and end [ns] of what is loaded, None before there is anything."""
+    """Start and end [ns] of the loaded data; None without data."""
     lines = [
         line for recording in client.get_state().recordings for line in recording.timelines if line.name == timeline
     ]
@@ -326,7 +327,9 @@ def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
 
 
 def _settled(client: Any, png: Path, said: str) -> None:
-    """Saves the picture once three in a row are the same: all is loaded, notifications are gone."""
+    """Save the picture once three successive ones are equal: everything is loaded, and
+    notifications have disappeared.
+    """
     seen: list[Image.Image] = []
 
     def same() -> bool:

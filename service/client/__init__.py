@@ -1,5 +1,5 @@
-"""For clients of the daemon: sessions, requests as calls, hands in and commands out, and the cells
-on a network.
+"""The library for clients of the daemon: sessions, requests as calls, trackers, followers, and the
+cells on a network.
 """
 
 from service.client.calls import Client
@@ -16,15 +16,7 @@ from service.client.session import (
     endpoints,
     open_session,
 )
-from service.client.streams import (
-    BRAKE_AFTER_S,
-    ENCODINGS,
-    Command,
-    Follower,
-    Tracker,
-    no_room_to_brake,
-    publisher,
-)
+from service.client.streams import BRAKE_AFTER_S, ENCODINGS, Command, Follower, Tracker, no_room_to_brake, publisher
 
 __all__ = [
     "AUTHORITY",

@@ -15,16 +15,16 @@ from service.contract import channels, requests
 from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
-RETRIES = 5
+ALIVE_QUERIES = 5
 Answer = TypeVar("Answer")
 
 
 class Client:
     """Requests to a running daemon as calls.
 
-    Each raises RefusedError with the daemon's message, UnreachableError where nobody answers, or
-    StartingError, one of these, where it tells how far its start is.
-    Only the reply of a live daemon counts, not one that a Zenoh storage kept.
+    Each raises RefusedError with the daemon's message, UnreachableError if no daemon answers, or
+    its subclass StartingError if the daemon reports the progress of its start. Replies that a Zenoh
+    storage kept are ignored: only those of a live daemon are returned.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
@@ -33,19 +33,19 @@ class Client:
         self._timeout_s = timeout_s
 
     def hold(self) -> Reply:
-        """Stops the arm, which then stays; returns once that is in force."""
+        """Stop the arm, which then holds; returns once that is in force."""
         return self._typed("hold", None, Reply)
 
     def resume(self) -> Reply:
-        """Ends an operator's hold; returns once that is in force."""
+        """End an operator's hold; returns once that is in force."""
         return self._typed("resume", None, Reply)
 
     def reset(self) -> Reply:
-        """Ends a fault; returns once that is in force."""
+        """End a fault; returns once that is in force."""
         return self._typed("reset", None, Reply)
 
     def set_stage(self, name: str) -> Reply:
-        """Tells that the task has come to this via-point; returns once that is in force."""
+        """Report that the task has reached this via-point; returns once that is in force."""
         return self._typed("stage", requests.StageRequest(name), Reply)
 
     def status(self) -> Status:
@@ -53,26 +53,26 @@ class Client:
         return self._typed("status", None, Status)
 
     def places(self) -> tuple[ViaPointInForce, ...]:
-        """The via-points in force, and how far each is missed [m]."""
+        """The via-points in force, each with the distance [m] by which the skill misses it."""
         return self._typed("via_points", requests.List(), Reply).points or ()
 
     def add(self, points: Iterable[ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> Reply:
-        """Teaches via-points, all or nothing; returns once they are in force.
+        """Teach via-points, all or nothing; returns once they are in force.
 
         Learned points nearer than `tolerance` [m] to one are replaced.
         """
         return self._typed("via_points", requests.Add(tuple(points), tolerance), Reply)
 
     def remove(self, *names: str) -> Reply:
-        """Removes via-points by name, all or nothing; returns once that is in force."""
+        """Remove via-points by name, all or nothing; returns once that is in force."""
         return self._typed("via_points", requests.Remove(names), Reply)
 
     def clear(self) -> Reply:
-        """Removes all via-points; returns once that is in force."""
+        """Remove all via-points; returns once that is in force."""
         return self._typed("via_points", requests.Clear(), Reply)
 
     def load_skill(self, name: str) -> Reply:
-        """Loads a file of the daemon's skill folder; returns once it is in force."""
+        """Load a file of the daemon's skill folder; returns once it is in force."""
         return self._typed("skill", requests.SkillRequest(name), Reply)
 
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
@@ -81,9 +81,11 @@ class Client:
         return answer
 
     def wait_until_ready(self, *, timeout_s: float | None = 15.0, silent: bool | None = None) -> Status:
-        """The status, once a daemon is ready on this cell; it waits for `timeout_s` [s], and as
-        long as the daemon's start goes on. None: until Ctrl-C. Unless it is `silent`, as by default
-        where it ends by itself, that it waits is said once on standard error.
+        """The status, once a daemon of this cell is ready.
+
+        It waits for `timeout_s` [s], and longer while the daemon's start makes progress. None:
+        until Ctrl-C. One message on standard error reports the waiting unless `silent`, which by
+        default holds if there is a timeout.
         """
         return tried(self.status, timeout_s, silent=silent)
 
@@ -98,12 +100,12 @@ class Client:
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
-        kept = False  # whether a storage answered
+        kept = False  # True once a storage has answered
         for reply in self._session.get(
             self._key(suffix),
             payload=payload,
             encoding=zenoh.Encoding.APPLICATION_JSON,
-            # else only a storage that declares itself complete may be queried, and its reply used
+            # With other targets Zenoh may query only a storage that declares itself complete.
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=self._timeout_s,
@@ -121,15 +123,16 @@ class Client:
             return reply.ok.payload.to_bytes()
         raise UnreachableError(
             f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
-            + " Something did answer, but no daemon of this cell is alive: a Zenoh storage keeps an old reply." * kept
+            + " A Zenoh storage answered with an old reply, but no daemon of this cell is alive." * kept
         )
 
     def _is_alive(self, own: str) -> bool:
-        """Whether a daemon of the cell has this Zenoh session.
+        """True if a daemon of the cell has this Zenoh session.
 
-        Tokens may be missing for a moment while others join or leave, so it queries RETRIES times.
+        Tokens may be missing for a moment while other sessions join or leave, so the query is
+        repeated up to ALIVE_QUERIES times.
         """
-        for _ in range(RETRIES):
+        for _ in range(ALIVE_QUERIES):
             if own in living(self._session, self._cell, timeout_s=self._timeout_s):
                 return True
             time.sleep(RETRY_S)

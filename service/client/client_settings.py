@@ -1,4 +1,4 @@
-"""How a client reaches its cell: by what it is given, else the environment, else a file."""
+"""The settings by which a client reaches its cell: arguments, else the environment, else a file."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Endpoints = Annotated[tuple[str, ...], msgspec.Meta(extra={"accepted": "an endpo
 
 
 class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a client reaches its cell."""
+    """The settings by which a client reaches its cell."""
 
-    connect: Endpoints = ()  # the first that answers; none: those of `zenoh_config`, else ENDPOINT
+    connect: Endpoints = ()  # the first that answers is used; none: those of `zenoh_config`, else ENDPOINT
     cell: Cell = "thirdhand"  # prefix of all keys
-    certificate: str = ""  # the folder of one's role; empty: none
-    zenoh_config: str = ""  # a file of Zenoh's own; empty: none
+    certificate: str = ""  # the folder of the client's role; empty: none
+    zenoh_config: str = ""  # a file with Zenoh's own settings; empty: none
 
     def __post_init__(self) -> None:
         for i, endpoint in enumerate(self.connect):
@@ -58,18 +58,18 @@ def client_settings(
     certificate: str | Path | None = None,
     zenoh_config: str | Path | None = None,
 ) -> ClientSettings:
-    """The settings of a client. What is None is taken from $THIRDHAND_CONNECT (endpoints with
-    commas between), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE and $THIRDHAND_ZENOH_CONFIG, else from
-    the file, else it is the default.
+    """The settings of a client. An argument that is None is taken from $THIRDHAND_CONNECT
+    (endpoints separated by commas), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE or
+    $THIRDHAND_ZENOH_CONFIG, else from the file CLIENT_FILE, else it has its default.
 
-    Raises SettingsError, which names the file, variable or option that is wrong.
+    Raises SettingsError, which names the wrong file, variable or option.
     """
     path = _file()
     found = {} if path is None else _checked(str(path), _read(path))
     given = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
     for name, option in given.items():
-        if told := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
-            listed = [part.strip() for part in told.split(",")] if name == "connect" else told
+        if text := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
+            listed = [part.strip() for part in text.split(",")] if name == "connect" else text
             found |= _checked(f"${variable}", {name: listed})
         if option or option == "":
             found |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
@@ -82,7 +82,7 @@ def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
         validated(given, ClientSettings)
     except InvalidError as error:
         problems = str(error)
-        if origin.startswith(("$", "-")):  # a variable or an option, which names the value itself
+        if origin.startswith(("$", "-")):  # a variable or an option already names the value
             problems = re.sub(rf"(?m)^{next(iter(given))}(, entry \d+)?: ", "", problems)
         raise SettingsError(f"{origin}: {problems}") from None
     return given
@@ -93,13 +93,15 @@ def _file() -> Path | None:
     try:
         folder = Path(os.environ.get("XDG_CONFIG_HOME") or "").expanduser()
         path = (folder if folder.is_absolute() else Path.home() / ".config") / "thirdhand" / "client.toml"
-    except RuntimeError:  # no home
+    except RuntimeError:  # the user has no home folder
         return None
     return path if path.exists() else None
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a client's file holds; paths in it are relative to its folder. Raises SettingsError."""
+    """The content of a client's file; relative paths start from its folder. Raises
+    SettingsError.
+    """
     try:
         given = tomllib.loads(content(path, LARGEST_CONFIGURATION).decode())
     except (OSError, UnusableError, UnicodeDecodeError) as error:

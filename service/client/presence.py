@@ -1,5 +1,5 @@
-"""The daemons on a network, by their liveliness tokens, with their statuses; and the keys on which
-anything is published.
+"""The daemons on a network, found by their liveliness tokens, with their statuses; and the keys on
+which anything is published.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from service.contract import channels
 from service.contract.printable import printable
 from service.contract.requests import Status
 
-TIMEOUT_S = 5.0
-MOST_KEYS = 1000  # that Overheard remembers
+PRESENCE_TIMEOUT_S = 5.0
+MAX_KEYS = 1000  # `Overheard` remembers at most this many
 
 
 class Cell(NamedTuple):
     """A cell that a daemon serves: its name, the daemon's Zenoh session, and its status, which is
-    None where the daemon does not answer in time, or access to it is denied.
+    None if the daemon does not answer in time, or denies access.
     """
 
     name: str
@@ -30,20 +30,22 @@ class Cell(NamedTuple):
     status: Status | None
 
 
-def living(session: zenoh.Session, cell: str, *, timeout_s: float = TIMEOUT_S) -> frozenset[str]:
+def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> frozenset[str]:
     """The ids of the Zenoh sessions of the daemons that serve a cell."""
     return frozenset(own for _, own in _tokens(session, channels.presence(cell), timeout_s))
 
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
-    """Why nothing comes of a cell: its daemon begins or ends just now, or there is none."""
+    """A message with the likely reason for a cell's silence: its daemon starts or ends, or it has
+    none.
+    """
     if living(session, cell):
-        return "its daemon is there, but begins or ends, or may not be asked: try again"
+        return "its daemon is alive, but it is starting or ending, or it denies access: try again"
     return "is the daemon running there, and is the cell's name right?"
 
 
-def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell, ...]:
-    """All cells that are served on a network, by name; their daemons are queried in parallel."""
+def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> tuple[Cell, ...]:
+    """All cells that are served on a network, sorted by name; queried in parallel."""
     found = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))
     queries = [
         session.get(
@@ -65,7 +67,9 @@ def cells(session: zenoh.Session, *, timeout_s: float = TIMEOUT_S) -> tuple[Cell
 
 
 class Overheard(AbstractContextManager["Overheard"]):
-    """Collects the keys, matching some expressions, on which something is published; a context."""
+    """Collect the keys that match some expressions and on which something is published; a
+    context.
+    """
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
@@ -76,21 +80,21 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     @property
     def keys(self) -> list[str]:
-        """The keys so far, sorted."""
+        """The collected keys, sorted."""
         return sorted(self._keys.copy())
 
     def close(self) -> None:
-        """Ends the subscriptions."""
+        """End the subscriptions."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._subscribers = []
 
     def _take(self, sample: zenoh.Sample) -> None:
-        if len(self._keys) < MOST_KEYS:
+        if len(self._keys) < MAX_KEYS:
             self._keys.add(printable(str(sample.key_expr)))
 
 
 def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:
-    """Cell and Zenoh session of each token under a key."""
+    """The cell and the Zenoh session of each token under a key."""
     tokens = (str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=timeout_s) if reply.ok)
-    return {(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens}  # some come twice
+    return {(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens}  # some arrive twice

@@ -1,4 +1,4 @@
-"""Published and answered JSON of a daemon, checked, with its texts made printable."""
+"""JSON that a daemon publishes or replies, validated, with its texts made printable."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from service.client.session import RefusedError
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.printable import printable_values
 
-T = TypeVar("T")
+Decoded = TypeVar("Decoded")
 
 
-def decoded(data: bytes, kind: type[T]) -> T:
+def decoded(data: bytes, kind: type[Decoded]) -> Decoded:
     """The value of this type in JSON bytes, each of its texts printable. Raises RefusedError."""
     try:
         return validated(printable_values(msgspec.json.decode(data)), kind)
     except (msgspec.DecodeError, InvalidError, RecursionError, UnicodeDecodeError) as error:
         what = f"not a {kind.__name__}: {in_words(error, named=False)}"
-        raise RefusedError(f"{what}. Is the daemon of this version?") from None
+        raise RefusedError(f"{what}. Do daemon and client have the same version?") from None

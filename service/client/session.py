@@ -1,4 +1,4 @@
-"""Zenoh sessions between named endpoints, without scouting."""
+"""Zenoh sessions between named endpoints, without multicast discovery."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from service.contract.channels import lacking
 from service.contract.explain import ExplainedError, in_words
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
-CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # in the folder of a role
-ENDPOINTS_TIMEOUT_S = 30.0  # a busy machine answers late
-ATTEMPT_S, RETRY_S = 1.0, 0.05  # of an attempt that is one of many
-T = TypeVar("T")
+CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # files in the folder of a role
+ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
+ATTEMPT_S = 1.0  # timeout of one attempt
+RETRY_S = 0.05  # pause before the next attempt
+Attempted = TypeVar("Attempted")
 
 
 class UnreachableError(ExplainedError, OSError):
-    """There is no Zenoh session, or nobody answers."""
+    """No Zenoh session can be opened, or no daemon answers."""
 
 
 class StartingError(UnreachableError):
-    """The daemon is not ready yet; the message tells what it does and how far it is."""
+    """The daemon is not ready yet; the message has the progress of its start."""
 
 
 class RefusedError(ExplainedError, ValueError):
@@ -48,19 +49,19 @@ def open_session(
     more: Mapping[str, Any] | None = None,
     at_once: bool = False,
 ) -> zenoh.Session:
-    """An open Zenoh session between named endpoints, without scouting; `more` of Zenoh's settings.
+    """An open Zenoh session between named endpoints; `more` has further settings of Zenoh.
 
-    A session that only connects is a client of the first endpoint that answers. (Peers do not meet
-    through a router.) One that listens is a peer, or a router if it connects too. A `mode` in
-    `zenoh_config`, a file of Zenoh's own, overrides that; all else set here overrides the file. A
+    A session that only connects is a client of the first endpoint that answers, because peers do
+    not meet through a router. A session that listens is a peer, or a router if it also connects. A
+    `mode` in the file `zenoh_config` overrides that; all other settings here override the file. A
     client without `connect` takes the file's endpoints, or else those in `otherwise`.
 
-    It is tried for `timeout_s` [s]. None, where it only connects: until Ctrl-C, and that it waits
-    is said once on standard error, so that it does not matter who is started first. With `at_once`
-    it is not tried where the system says that nobody listens.
+    Opening is tried for `timeout_s` [s]. None, for a session that only connects: until Ctrl-C, with
+    one message on standard error, so that programs may be started in any order. With `at_once`, the
+    call fails immediately if the system reports that nothing listens.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
-    begin with `tls/`. Where one of the two is None, $THIRDHAND_CERTIFICATE or
+    begin with `tls/`. If `certificate` or `zenoh_config` is None, $THIRDHAND_CERTIFICATE or
     $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError.
     """
     for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
@@ -83,13 +84,13 @@ def open_session(
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
         "plugins_loading/enabled": False,
         "namespace": None,  # the contract's keys are absolute
-        "transport/shared_memory/enabled": False,  # no faster here, and it bypasses all bounds on messages
+        "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
         **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
         **(more or {}),
     }
 
     if at_once and _refused(connect):
-        raise UnreachableError(f"nobody listens at {', '.join(connect)}: is a daemon running there, or a router?")
+        raise UnreachableError(f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?")
 
     def opened() -> zenoh.Session:
         try:
@@ -103,7 +104,7 @@ def open_session(
 
 
 def _refused(endpoints: Sequence[str]) -> bool:
-    """Whether the system itself refuses a connection to every endpoint: nobody listens there."""
+    """True if the system refuses a connection to every endpoint: nothing listens there."""
     for endpoint in endpoints:
         protocol, _, address = endpoint.partition("/")
         host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
@@ -119,20 +120,22 @@ def _refused(endpoints: Sequence[str]) -> bool:
     return bool(endpoints)
 
 
-def tried(attempt: Callable[[], T], timeout_s: float | None, *, silent: bool | None = None) -> T:
-    """What an attempt returns once it raises no UnreachableError, which is raised after `timeout_s`
-    [s] in which it said the same. None: it is tried until Ctrl-C. Unless it is `silent`, as by
-    default where it ends by itself, that it waits is said once on standard error.
+def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: bool | None = None) -> Attempted:
+    """The result of `attempt`, which is repeated while it raises UnreachableError.
+
+    The error is raised after `timeout_s` [s] with the same message; None: never. One message on
+    standard error reports the waiting unless `silent`, which by default holds if there is a
+    timeout.
     """
-    begun_s, said = time.monotonic(), ""
+    begun_s, reported = time.monotonic(), ""
     silent = timeout_s is not None if silent is None else silent
     while True:
         try:
             return attempt()
         except UnreachableError as error:
-            if said and str(error) != said:
+            if reported and str(error) != reported:
                 begun_s = time.monotonic()
-            said = str(error)
+            reported = str(error)
             waited_s = time.monotonic() - begun_s
             if timeout_s is not None and waited_s >= timeout_s:
                 raise
@@ -144,14 +147,14 @@ def tried(attempt: Callable[[], T], timeout_s: float | None, *, silent: bool | N
 
 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
-    """The reason why there is no session between these endpoints, in words."""
+    """A message with the reason why there is no session between these endpoints."""
     if connect and "connect" in reason:
         secured = any(endpoint.startswith("tls/") for endpoint in connect)
         return (
             f"nobody answers at {', '.join(connect)}: "
-            "is a daemon running and listening there, `thirdhand record --listen` or a router, and not overrun?"
-            + " And is the certificate that was given, if any, of the daemon's authority, and the daemon's own "
-            "not expired?" * secured
+            "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
+            + " Is your certificate, if you gave one, from the daemon's authority, and is the daemon's own valid?"
+            * secured
         )
     found = re.search(r"\(os error (\d+)\)", reason)
     words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
@@ -159,7 +162,7 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
 
 
 def _zenoh_config(path: str | Path | None) -> zenoh.Config:
-    """The configuration in a file of Zenoh's own, or Zenoh's defaults. Raises UnreachableError."""
+    """The configuration in a Zenoh file, or Zenoh's defaults. Raises UnreachableError."""
     if not path:
         return zenoh.Config()
     try:
@@ -180,14 +183,14 @@ def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
 def _tls(folder: str | Path | None) -> dict[str, Any]:
     """Zenoh's settings for mutual TLS with the certificate in a folder; empty without a folder.
 
-    Raises UnreachableError where the folder is incomplete.
+    Raises UnreachableError for an incomplete folder.
     """
     if not folder:
         return {}
     try:
         own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
     except RuntimeError:
-        raise UnreachableError(f"certificate {folder}: there is no such user's folder") from None
+        raise UnreachableError(f"certificate {folder}: no user of this name has a folder here") from None
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
@@ -201,7 +204,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
 
 
 def _check_dates(path: Path) -> None:
-    """Raises UnreachableError for a certificate that is not valid now, as Zenoh gives no reason."""
+    """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason."""
     from cryptography import x509  # most sessions need no certificate
 
     try:
@@ -216,8 +219,8 @@ def _check_dates(path: Path) -> None:
         )
     if now < begin:
         raise UnreachableError(
-            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, and the clock here says {now:%Y-%m-%d %H:%M}: "
-            "is that right?"
+            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, but the clock here shows {now:%Y-%m-%d %H:%M}: "
+            "is it right?"
         )
 
 

@@ -17,26 +17,25 @@ from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from service.contract.records import SIDES
 
-BRAKE_AFTER_S = 0.02  # without a command, after which a follower brakes
-LATE_S = 0.005  # a command of the slowest accepted rate may be this late before the follower brakes
-MOST_COMMANDS = 256  # that a follower keeps until it is asked for them: half a second's at 500 Hz
+BRAKE_AFTER_S = 0.02  # a follower brakes after this time without a command
+LATE_COMMAND_S = 0.005  # at the lowest accepted rate, a command may be this late before the follower brakes
+MAX_COMMANDS = 256  # a follower queues this many, half a second of them at 500 Hz
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 def no_room_to_brake(tick_s: float) -> str:
-    """Why a follower cannot follow commands of this period [s]; empty where it can."""
-    if tick_s <= BRAKE_AFTER_S - LATE_S:
+    """A message for commands of a period [s] that a follower cannot follow; empty if it can."""
+    if tick_s <= (max_tick_s := BRAKE_AFTER_S - LATE_COMMAND_S):
         return ""
     return (
-        f"{1 / tick_s:.0f} Hz is too slow: commands would come every {1000 * tick_s:.0f} ms, and an arm brakes "
-        f"{1000 * BRAKE_AFTER_S:.0f} ms after its last command; {math.ceil(1 / (BRAKE_AFTER_S - LATE_S))} Hz or more "
-        "needed"
+        f"{1 / tick_s:.0f} Hz is too slow: commands would arrive every {1000 * tick_s:.0f} ms, and an arm brakes "
+        f"{1000 * BRAKE_AFTER_S:.0f} ms after its last command; {math.ceil(1 / max_tick_s)} Hz or more needed"
     )
 
 
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
-    """A publisher on one channel of a cell, which drops what cannot be sent at once."""
+    """A publisher on one channel of a cell; messages that cannot be sent at once are dropped."""
     return session.declare_publisher(
         channels.key(cell, suffix),
         encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
@@ -46,10 +45,10 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
 
 
 class Tracker(AbstractContextManager["Tracker"]):
-    """Publishes hand poses of a cell; a context.
+    """A publisher of a cell's hand poses; a context.
 
-    It waits up to `timeout_s` [s] until somebody listens to both hands, a daemon or `thirdhand
-    record`; None: until Ctrl-C. Raises UnreachableError where nobody does.
+    The constructor waits up to `timeout_s` [s] until a daemon or `thirdhand record` subscribes to
+    both hands; None: until Ctrl-C. Raises UnreachableError if there is no subscriber.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
@@ -70,10 +69,10 @@ class Tracker(AbstractContextManager["Tracker"]):
         stamp_ns: int | None = None,
         frame_id: str = BASE,
     ) -> None:
-        """Publishes one hand, `left` or `right`: position [m], quaternion x y z w.
+        """Publish the pose of one hand, `left` or `right`: position [m], quaternion x y z w.
 
-        `stamp_ns` is when it was seen [ns since 1970]; None: now. Stamps of a hand must grow.
-        Raises ValueError for another hand.
+        `stamp_ns` is the time of measurement [ns since 1970]; None: now. Stamps of a hand must
+        increase. Raises ValueError for another hand.
         """
         if side not in self._publishers:
             raise ValueError(f"hand {side!r} given; {' or '.join(SIDES)} accepted")
@@ -81,7 +80,7 @@ class Tracker(AbstractContextManager["Tracker"]):
         self._publishers[side].put(cdr.encode_pose(pose))
 
     def heard(self) -> bool:
-        """Whether somebody listens to both hands."""
+        """True if both hands have a subscriber."""
         return all(
             publisher.matching_status.matching  # type: ignore[attr-defined]
             for publisher in self._publishers.values()
@@ -95,7 +94,7 @@ class Tracker(AbstractContextManager["Tracker"]):
             )
 
     def close(self) -> None:
-        """Ends the publishers."""
+        """End the publishers."""
         for one in self._publishers.values():
             one.undeclare()  # type: ignore[no-untyped-call]
 
@@ -106,8 +105,9 @@ class Tracker(AbstractContextManager["Tracker"]):
 class Command(NamedTuple):
     """A joint command: position [rad] and velocity [rad/s] of the follower's joints.
 
-    `tick` decided it; `published_ns` is when it was sent, `hand_stamp_ns` the stamp of the newest
-    hand sample that it answers. These are -1, 0 and 0 where the sender did not attach them.
+    `tick` is the tick that decided it, `published_ns` the time of sending, and `hand_stamp_ns` the
+    stamp of the newest hand sample that it answers. They are -1, 0 and 0 if the sender did not
+    attach them.
     """
 
     stamp_ns: int
@@ -119,23 +119,23 @@ class Command(NamedTuple):
 
 
 class Follower(AbstractContextManager["Follower"]):
-    """Receives joint commands of a cell and publishes the joints' state; a context.
+    """A receiver of a cell's joint commands and publisher of its joint states; a context.
 
-    `names` are the arm's joints, in the order of all values here. Commands that do not fit these
-    joints are ignored: `rejected` counts them, `reason` is the last one's.
+    `names` are the arm's joints, in the order of all values here. Commands for other joints are
+    ignored: `rejected` counts them, and `reason` is the cause of the last one.
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
         self.rejected, self.reason = 0, ""
         self._names = tuple(names)
         self._came = threading.Condition()
-        self._queue: deque[Command] = deque(maxlen=MOST_COMMANDS)
+        self._queue: deque[Command] = deque(maxlen=MAX_COMMANDS)
         self._state = publisher(session, cell, "joints/state", express=True)
         self._subscriber = session.declare_subscriber(channels.key(cell, "joints/command"), self._take)
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
-        """The newest command that was not returned before; None after `timeout_s` [s] without one,
-        on which the arm has to brake.
+        """The newest command that was not returned before; None after `timeout_s` [s] without a
+        command, whereupon the arm must brake.
         """
         with self._came:
             self._came.wait_for(lambda: self._queue, timeout_s)
@@ -143,19 +143,19 @@ class Follower(AbstractContextManager["Follower"]):
         return commands[-1] if commands else None
 
     def commands(self) -> list[Command]:
-        """All commands that were not returned before, as they came: what a `Playback` takes."""
+        """All commands that were not returned before, in the order of arrival, for `Playback`."""
         with self._came:
             commands = list(self._queue)
             self._queue.clear()
         return commands
 
     def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
-        """Publishes the joints as measured [rad, rad/s]; `stamp_ns` is when [ns], None: now."""
+        """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now."""
         now_ns = time.time_ns() if stamp_ns is None else stamp_ns
         self._state.put(cdr.encode_joints(JointState(now_ns, self._names, tuple(position), tuple(velocity))))
 
     def close(self) -> None:
-        """Ends the subscription and the publisher."""
+        """End the subscription and the publisher."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._state.undeclare()  # type: ignore[no-untyped-call]
 

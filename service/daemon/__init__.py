@@ -1,1 +1,1 @@
-"""The control process around the core: clock, channels, requests, and their skill worker."""
+"""The control process around the core: loop, clock, streams, requests and skill worker."""

@@ -1,5 +1,5 @@
-"""The end of all commands: the planned stop to its end, and that the arm rests, said so often that
-it is heard.
+"""The last commands of a daemon: the planned stop, and the rest position, repeated in case messages
+are lost.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from service.daemon.cell_streams import CellStreams
 from service.daemon.clock import Deadlines
 from service.settings.config import Settings
 
-RESTS_S = 0.1  # so long it is said: a message may be lost, and some controllers go on by the last one
+RESTS_S = 0.1  # the rest position is repeated for this time, because some controllers extrapolate the last command
 
 
 def brake(settings: Settings, frame: Frame, clock: Deadlines, streams: CellStreams) -> None:
-    """Commands the stop that follows the newest frame, tick by tick; repeats the last command."""
+    """Command the stop that follows the newest frame, tick by tick, and repeat the last command."""
     limiter, names = Limiter(settings.joints, settings.period_s), settings.joints.names
     q, dq, ddq = (frame[name].copy() for name in ("joints", "joint_velocities", "joint_accelerations"))
     index, stamp_ns, resting = int(frame["tick"]), clock.stamp_ns, 0

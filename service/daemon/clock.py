@@ -1,5 +1,5 @@
-"""The daemon's clock: phase-locked deadlines, real-time scheduling where it is granted, and
-statistics of how well the deadlines are kept.
+"""The daemon's clock: phase-locked deadlines, real-time scheduling if the system grants it, and
+statistics of lateness.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ import numpy as np
 from service.contract.requests import Percentiles
 from service.core.frame import Vector
 
-SPIN_NS = 100_000  # of busy waiting before a deadline, under real-time scheduling only
-PREPARE_NS = 650_000  # before a deadline the next tick is prepared: more than half as long again as one takes
-STEP_NS = 20_000_000  # a larger difference to the system clock means that it was set
-DRAW = 256  # time constant of following a smaller difference, in deadlines
-CREEP_NS = 1_000  # from stamp to stamp while time catches up
-_LOCK_WHAT_IS_TOUCHED = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of Linux
-FIFO_PRIORITY, BESIDE_PRIORITY = 80, 10
+SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
+PREPARE_NS = 650_000  # the next tick is prepared this long before its deadline, 1.5 times the duration of a tick
+STEP_NS = 20_000_000  # a larger difference from the system clock shows that the clock was set
+DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
+CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
+_LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
+FIFO_PRIORITY = 80  # priority of the loop
+BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
 
 
 class Deadlines:
     """Deadlines at a fixed rate since start.
 
-    Deadlines that have passed are skipped and counted, never made up for in a burst. `stamp_ns` is
-    the newest one's time on the system clock [ns], and always grows. It advances by whole periods
-    and follows the system clock slowly. If that was set ahead it follows at once; if it was set
-    back it grows by CREEP_NS a deadline until time has caught up.
+    Missed deadlines are skipped and counted; there is no burst to make up for them. `stamp_ns` is
+    the time of the newest deadline on the system clock [ns], and always grows. It advances by whole
+    periods and follows the system clock slowly. If the clock was set ahead, it follows at once; if
+    the clock was set back, it grows by CREEP_NS per deadline until the clock has passed it.
     """
 
     def __init__(
@@ -56,9 +57,9 @@ class Deadlines:
         self._index = -1
 
     def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
-        """The number of the next deadline, once it has come, and its lateness [ns].
+        """Wait for the next deadline and return its number and lateness [ns].
 
-        `prepare` is called PREPARE_NS before it, if there is time.
+        `prepare` is called PREPARE_NS before the deadline, if there is time.
         """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
         passed = index - self._index
@@ -79,28 +80,29 @@ class Deadlines:
         return index, late
 
     def _sleep_until(self, at_ns: int) -> bool:
-        """Whether there was time to sleep."""
+        """Sleep until a time [ns]; False if it has passed."""
         early = at_ns - self._now_ns()
         if early > 0:
             self._sleep(early / 1e9)
         return early > 0
 
     def rate_hz(self) -> float:
-        """Ticks a second since start, as achieved."""
+        """Achieved ticks per second since start."""
         elapsed = self._now_ns() - self._start_ns
         return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
 
 
 class Granted(NamedTuple):
-    """The loop's requests that the operating system granted."""
+    """The requests of the loop that the operating system granted."""
 
-    realtime: bool  # scheduling of the thread
-    locked: bool  # the process's memory, which is not paged out once it was touched
+    realtime: bool  # real-time scheduling of the thread
+    locked: bool  # memory pages of the process remain in memory once they are used
 
 
 def ask_for_real_time() -> Granted:
-    """What was granted of real-time scheduling for this thread and of locked memory; existing
-    objects are exempt from garbage collection in any case.
+    """Request real-time scheduling for this thread and locked memory, and return what was granted.
+
+    Existing objects are exempted from garbage collection in any case.
     """
     gc.collect()
     gc.freeze()
@@ -118,38 +120,38 @@ def _scheduled() -> bool:
 
 def _locked() -> bool:
     try:
-        return bool(ctypes.CDLL(None).mlockall(_LOCK_WHAT_IS_TOUCHED) == 0)
+        return bool(ctypes.CDLL(None).mlockall(_LOCK_TOUCHED_PAGES) == 0)
     except (OSError, AttributeError):
         return False
 
 
 def run_beside_real_time() -> None:
-    """Lets this thread run before other processes, if that is granted: preempted while it holds the
-    interpreter lock, it would delay the loop.
+    """Schedule this thread before other processes, if granted: if it is preempted while it holds
+    the interpreter lock, it delays the loop.
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
 
 
 class Window:
-    """The last values of a quantity, written by one thread and read by another."""
+    """A buffer of the last values of a quantity, written by one thread and read by another."""
 
     def __init__(self, length: int) -> None:
         self._values: Vector = np.zeros(length)
         self._count = 0
 
     def add(self, value: float) -> None:
-        """One more value."""
+        """Add a value."""
         self._values[self._count % len(self._values)] = value
         self._count += 1
 
     def largest(self, count: int) -> float:
-        """The largest of the newest values, at most so many; 0 while it is empty."""
+        """The largest of the `count` newest values; 0 while the window is empty."""
         newest = self._values.take(range(self._count - min(count, self._count), self._count), mode="wrap")
         return float(newest.max(initial=0.0))
 
     def percentiles(self) -> Percentiles:
-        """Median, 99th percentile and maximum over the window; zeros while it is empty."""
+        """Median, 99th percentile and maximum over the window; zeros while the window is empty."""
         if not self._count:
             return Percentiles()
         return Percentiles(*np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist())

@@ -1,4 +1,4 @@
-"""The daemon: fills the controller's inbox from Zenoh, publishes each frame, and records it."""
+"""The daemon: it fills the controller's inbox from Zenoh, and publishes and records each frame."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
-from service.daemon.machine import WINDOW_S, Machine
-from service.daemon.newest_status import PAUSE_S, NewestStatus
+from service.daemon.machine import BUSY_WINDOW_S, Machine
+from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, skill_of
-from service.daemon.start import Start
+from service.daemon.start import Startup
 from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.way_finder import WayFinder
 from service.learning.reach import beyond_m, out_of_reach
@@ -54,23 +54,24 @@ from service.scribe.scribe import Scribe
 from service.settings.config import Settings, robot_description
 
 log = logging.getLogger("thirdhand")
-STOP_TIMEOUT_S = 3.0
+REST_TIMEOUT_S = 3.0  # the arm must come to rest within this time after a request to stop
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STAGE_NUMBERS = {stage: number for number, stage in enumerate(STAGES)}
-MOST_NOTES = 100  # a second
-MOMENT_TRIES = 10  # until a status tells of one moment
-STATUS_S, FIRST_TICK_S = 0.1, 0.01  # between two published statuses; between two looks for the first tick
-LONGEST_LATENCY_MS = 1000.0  # a longer one means that the clocks differ
+MAX_NOTES_PER_S = 100
+STATUS_TRIES = 10  # attempts to read a frame and the state of the same tick
+STATUS_S = 0.1  # interval of published statuses
+FIRST_TICK_S = 0.01  # interval at which the first tick is waited for
+MAX_LATENCY_MS = 1000.0  # a longer latency shows that the clocks differ
 
 
 class LoopError(ExplainedError, RuntimeError):
-    """The control loop cannot continue, not even to stop the arm."""
+    """The control loop failed twice in a row, so that it cannot even stop the arm."""
 
 
 class Daemon:
     """One cell's loop, and the threads and processes around it.
 
-    `serve` runs until it is asked to stop, then stops the arm and closes everything.
+    `serve` runs until `stop` is called, then stops the arm and closes everything.
     """
 
     def __init__(
@@ -81,10 +82,10 @@ class Daemon:
         skill_worker: SkillWorker,
         skills: Path,
         scribe: Scribe,
-        start: Start,
+        start: Startup,
     ) -> None:
         skill = stored.for_loop()
-        # of the skill in force, and of one on its way into the loop
+        # Files by digest, of the skill in force and of one that the loop adopts next.
         self._files: dict[bytes, bytes] = {stored.digest: stored.file}
         self._settings = settings
         self._scribe = scribe
@@ -99,21 +100,21 @@ class Daemon:
         self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
         self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST_REPORTED_M, self._controller.max_part_speed
         self._sources, self._machine = InputMonitor(settings), Machine()
-        self._failure = ""  # the service's last one
+        self._failure = ""  # message of the service's last failure
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
-        self._own: deque[Event] = deque()  # events of the service's own: faults, ways out
+        self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
         self._saved_stage = SavedStage(settings)
-        if came_to := self._saved_stage.read(stored):
-            self._own.append(order("stage", came_to))
-            log.info("the task continues at via-point %s, which an earlier run had reached", came_to)
+        if reached := self._saved_stage.read(stored):
+            self._own.append(order("stage", reached))
+            log.info("the task continues at via-point %s, which an earlier run had reached", reached)
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
-        self._notes = (0, 0)  # a second, and the number of notes in it
+        self._notes = (0, 0)  # time [s] and the number of notes in this second
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
-        self._newest = -1  # tick
+        self._newest = -1  # newest tick
         self._laps: list[tuple[str, int]] = []
-        self._outputs: Outputs = ()  # of the newest tick
+        self._outputs: Outputs = ()  # messages published in the newest tick
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
@@ -134,19 +135,19 @@ class Daemon:
         )
 
     def stop(self, *_: Any) -> None:
-        """Asks the loop to stop the arm and end. Safe in a signal handler."""
+        """Request the loop to stop the arm and end. Safe in a signal handler."""
         self._stop.set()
 
     def note(self, text: str) -> None:
-        """Writes a line to log and recording; beyond MOST_NOTES a second only their number."""
+        """Write a line to log and recording; lines beyond MAX_NOTES_PER_S are only counted."""
         second = int(time.monotonic())
         if second != self._notes[0]:
-            left_out = self._notes[1] - MOST_NOTES
+            left_out = self._notes[1] - MAX_NOTES_PER_S
             self._notes = (second, 0)
             if left_out > 0:
-                self._say(f"{left_out} more requests in a second, not noted one by one")
+                self._say(f"{left_out} more requests within a second were not logged")
         self._notes = (second, self._notes[1] + 1)
-        if self._notes[1] <= MOST_NOTES:
+        if self._notes[1] <= MAX_NOTES_PER_S:
             self._say(text)
 
     def _say(self, text: str) -> None:
@@ -154,9 +155,9 @@ class Daemon:
         self._scribe.note("requests", text, time.time_ns())
 
     def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
-        """What the recordings lack, in words (empty: nothing), once `stop` was called and
-        everything is flushed and closed. `announce` is called once requests are answered, which
-        they are from the loop's first tick on.
+        """Run until `stop` is called, close everything, and return a message on ticks that were not
+        recorded (empty: none). `announce` is called at the loop's first tick, once requests are
+        answered.
         """
         reporter: threading.Thread | None = None
         try:
@@ -184,17 +185,19 @@ class Daemon:
         return missing
 
     def _fail(self, what: str) -> None:
-        """Reports a failure of the service; the next tick enters the mode `fault` for it."""
+        """Report a failure of the service; the next tick enters the mode `fault`."""
         self._failure = what
         self._own.append(order("fault", what))
         self._say(what)
 
     def _fail_in_the_loop(self, what: str) -> None:
-        """Has the loop stop the arm. Raises LoopError where no tick came since it failed last."""
+        """Have the loop stop the arm. Raises LoopError if there was no tick since the last
+        failure.
+        """
         self._scribe.skip()
         tick = int(self._frame["tick"])
         if tick == self._failed_at:
-            raise LoopError(f"{what}, and again at once: the arm is commanded no more")
+            raise LoopError(f"{what}, and again in the next tick: the arm gets no more commands")
         self._failed_at = tick
         self._fail(what)
 
@@ -206,7 +209,7 @@ class Daemon:
     def _ticks(self) -> Iterator[Tick]:
         inbox: list[Event] = []
         stop_by: float | None = None
-        # a period of 1 ms has no time for it
+        # A period of 1 ms has no time to prepare the next tick.
         prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
         while True:
             index, self._late_ns = self._clock.wait(prepare)
@@ -223,18 +226,18 @@ class Daemon:
                 inbox.append(self._own.popleft())
             if self._stop.is_set():
                 if stop_by is None:
-                    stop_by = time.monotonic() + STOP_TIMEOUT_S
+                    stop_by = time.monotonic() + REST_TIMEOUT_S
                 elif not self._frame["joint_velocities"].any():
                     return
                 elif time.monotonic() > stop_by:
-                    log.error("the arm has not come to rest in %g s; it is commanded no more", STOP_TIMEOUT_S)
+                    log.error("the arm did not come to rest within %g s; it gets no more commands", REST_TIMEOUT_S)
                     return
                 inbox.append(order("hold"))  # last, so that no other request overrides it
             yield Tick(index, tuple(inbox))
 
     def _warm_up(self) -> None:
-        """Takes a copy through a likely next tick, from samples in bytes to what comes of them in
-        bytes, so that code and data are in the caches.
+        """Run a copy of the controller on a likely next tick, from received to published bytes, so
+        that code and data are in the processor's caches.
         """
         newest = tuple(self._streams.newest.values())
         for event in newest:
@@ -265,7 +268,7 @@ class Daemon:
             before = at
         if 0 in frame["hand_ages"].tolist():
             latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
-            if 0 <= latency_ms < LONGEST_LATENCY_MS:
+            if 0 <= latency_ms < MAX_LATENCY_MS:
                 self._latency.add(latency_ms)
             else:
                 latency_ms = 0.0
@@ -286,7 +289,7 @@ class Daemon:
     # --- beside the loop ---
 
     def _open(self, announce: Callable[[Daemon], None]) -> None:
-        """Answers requests once the loop takes them."""
+        """Answer requests from the loop's first tick on."""
         while not self._is_open and not self._ended.wait(FIRST_TICK_S):
             if self._frame["tick"] >= 0:
                 self._is_open = True
@@ -296,8 +299,8 @@ class Daemon:
                 announce(self)
 
     def _report(self, announce: Callable[[Daemon], None]) -> None:
-        """Publishes the status, logs what changed, keeps the scribe alive: ten times a second, and
-        the status also where a request changed it.
+        """Publish the status, log changes, and supervise the scribe ten times a second. A status is
+        also published after a request that changed it.
         """
         run_beside_real_time()
         self._open(announce)
@@ -314,7 +317,7 @@ class Daemon:
             try:
                 self._saved_stage.keep(self._controller.skill, status.stage, status.stage_belief)
             except OSError as error:
-                errors.append(f"the stage of the task cannot be kept over a restart: {in_words(error)}")
+                errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
             if is_due:
                 due_s = time.monotonic() + STATUS_S
@@ -324,10 +327,10 @@ class Daemon:
                 self._objects.poll()
                 try:
                     self._scribe.supervise()
-                except OSError as error:  # a lack of descriptors or memory may pass
+                except OSError as error:  # a lack of descriptors or memory may be temporary
                     errors.append(f"the scribe cannot be supervised: {in_words(error)}")
             else:
-                self._ended.wait(PAUSE_S)
+                self._ended.wait(MIN_STATUS_INTERVAL_S)
             for error_text in errors:
                 if error_text not in logged_errors:
                     logged_errors.append(error_text)
@@ -339,9 +342,9 @@ class Daemon:
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
 
     def _status_now(self) -> Status:
-        """The status at this moment."""
+        """The present status."""
         clock = self._clock
-        for _ in range(MOMENT_TRIES):  # the loop may be amid a tick: a frame goes with the state that it left
+        for _ in range(STATUS_TRIES):  # during a tick, the frame and the state are of different ticks
             frame, state = self._frame, self._controller.state
             if frame["tick"] == state["tick"]:
                 break
@@ -349,7 +352,7 @@ class Daemon:
         now_s = time.monotonic()
         sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)
-        late_ms = self._lateness.largest(round(WINDOW_S * self._settings.rate_hz)) / 1e3
+        late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
         machine = self._machine
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
         known = self._failure, inside, machine.at_stop
@@ -373,9 +376,9 @@ class Daemon:
 
 
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
-    """The skill in a file, with the via-points taught to it before.
+    """The skill in a file, with the via-points that were taught to it before.
 
-    Raises SkillError, also where the arm does not reach most of the places to which it leads.
+    Raises SkillError, also if the arm does not reach most of the skill's tool positions.
     """
     skill, saved = skill_of(path), SavedViaPoints(settings)
 
@@ -383,10 +386,10 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
         if points == skill.via_points:
             return skill
         adapted = skill_of(skill.file, points, tolerance, settings.tool.max_gain)
-        names = ", ".join(point.name for point in points) or "the skill's own were removed"
+        names = ", ".join(point.name for point in points) or "none, the skill's own were removed"
         log.info(
             "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand via-points remove "
-            "NAME` removes one, `thirdhand via-points clear` all",
+            "NAME` removes one, `thirdhand via-points clear` removes all",
             len(points),
             names,
             saved.path(skill),
@@ -408,17 +411,17 @@ def serve(
     *,
     skills: Path,
     scribe: Scribe,
-    start: Start,
+    start: Startup,
     announce: Callable[[Daemon], None],
 ) -> str:
-    """Runs a daemon from start to end; returns what the recordings lack, in words.
+    """Run a daemon and return a message on ticks that were not recorded (empty: none).
 
-    Once it is ready, SIGINT, SIGTERM and SIGHUP ask it to stop. Raises SkillError before it starts,
-    LoopError where it ends by itself.
+    Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
+    LoopError if the control loop cannot continue.
     """
     skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
     try:
-        skill_worker.start()  # here, as to start a process would delay the loop
+        skill_worker.start()  # before the loop, which the start of a process would delay
         with start.counting():
             skill = load_skill(skill_path, settings)
             daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start)

@@ -25,9 +25,9 @@ from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
 from service.daemon.cell_streams import Arrivals
 from service.settings.config import JointSettings, Settings
 
-WINDOW_S = 1.0  # rates and clocks are taken over this time
+RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
 COUNTS_EVERY_S = 10.0  # interval of the log lines that count further rejections
-KEYS = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
+KEY_OF_SOURCE = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
 
 
 class _History:
@@ -48,8 +48,8 @@ class InputMonitor:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         measured = settings.arm.source == "state"
-        self.arrivals = {KEYS[source]: Arrivals() for source in SOURCES if measured or source != "arm"}
-        self._histories = {source: _History() for source in SOURCES if KEYS[source] in self.arrivals}
+        self.arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES if measured or source != "arm"}
+        self._histories = {source: _History() for source in SOURCES if KEY_OF_SOURCE[source] in self.arrivals}
         self._counted_s = 0.0
 
     def update(self, controller: Controller, state: Record, now_s: float) -> dict[str, Source]:
@@ -57,13 +57,13 @@ class InputMonitor:
         return {source: self._source(source, controller, state, now_s) for source in self._histories}
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
-        history, arrivals, index = self._histories[source], self.arrivals[KEYS[source]], SOURCES.index(source)
+        history, arrivals, index = self._histories[source], self.arrivals[KEY_OF_SOURCE[source]], SOURCES.index(source)
         if history.counts and history.counts[-1][1] != arrivals.count and arrivals.newest is not None:
             history.clocks.append((now_s, (arrivals.at_ns - arrivals.newest.stamp_ns) / 1e6))
         history.counts.append((now_s, arrivals.count))
-        while history.counts[0][0] < now_s - WINDOW_S - 0.05:
+        while history.counts[0][0] < now_s - RATE_WINDOW_S - 0.05:
             history.counts.popleft()
-        while history.clocks and history.clocks[0][0] < now_s - WINDOW_S:
+        while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
             history.clocks.popleft()
         (since_s, before), intake = history.counts[0], controller.intake
         rejected = {word(cause): int(n) for cause, n in zip(Cause, intake.rejected[index], strict=True) if n}
@@ -76,7 +76,7 @@ class InputMonitor:
                 seen_of = evidence(refused, self._settings, arrivals)
                 history.found[cause] = explained(refused.cause, seen_of)
             history.cause, history.refused_s = cause, now_s
-        history.seen, lately = rejected, now_s - history.refused_s <= WINDOW_S
+        history.seen, lately = rejected, now_s - history.refused_s <= RATE_WINDOW_S
         newest = history.found[history.cause] if lately else None
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings

@@ -1,5 +1,5 @@
-"""A daemon as a process of its own, on a free port and with its files in one folder: for the demo,
-experiments and tests.
+"""Start of a daemon as a process of its own, on a free port and with its files in one folder, for
+the demo, experiments and tests.
 """
 
 from __future__ import annotations
@@ -24,23 +24,24 @@ from service.contract.requests import STARTING
 from service.process.child import python
 from service.settings.config import Settings
 
-STUCK_S, LOOK_S = 60.0, 0.1  # a start that tells of nothing new for so long; how often that is looked for
+START_STALL_S = 60.0  # a start without a new report for this time has stalled
+START_POLL_S = 0.1
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
-ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # of the bench; the first that is installed is taken
+ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # physics of the bench; the first installed one is the default
 
 
 class LaunchError(ExplainedError, RuntimeError):
-    """A daemon did not start or did not end; the message has its output."""
+    """A daemon or the bench did not start or end; the message has its output."""
 
 
 def engine_of(wanted: str | None = None) -> str:
-    """The bench's engine: the one that is wanted, or else the first of those installed.
+    """The physics engine of the bench: `wanted`, or else the first of ENGINES that is installed.
 
-    Raises LaunchError where it is not.
+    Raises LaunchError if it is not installed.
     """
     for name in (wanted,) if wanted else ENGINES:
-        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules on purpose
+        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules
             if importlib.util.find_spec(name) is not None:
                 return name
     needed = f"{ENGINES[wanted]}, which is not" if wanted else f"{' or '.join(ENGINES.values())}, none of which is"
@@ -51,7 +52,7 @@ def engine_of(wanted: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class Launched:
-    """A running daemon: its process, its configuration, where it listens, and its log."""
+    """A running daemon: its process, its configuration, its endpoint, and its log."""
 
     process: subprocess.Popen[str]
     config: Path
@@ -59,16 +60,16 @@ class Launched:
     log: Path
 
     def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> int:
-        """The exit code, after being asked to stop. Raises LaunchError where that takes longer."""
+        """Stop the daemon and return its exit code. Raises LaunchError after `timeout_s` [s]."""
         self.process.terminate()
         try:
             return self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            raise LaunchError(f"the service did not end within {timeout_s:g} s of being asked to") from None
+            raise LaunchError(f"the service did not end within {timeout_s:g} s after SIGTERM") from None
 
     def missing(self) -> str:
-        """What its recordings lack, by the last line of its log; empty: nothing."""
-        from service.scribe.scribe import NOT_RECORDED  # heavy, and launching is to begin at once
+        """A message on ticks that were not recorded, from the end of the log; empty if none."""
+        from service.scribe.scribe import NOT_RECORDED  # its import is slow, and a launch must begin at once
 
         last_lines = self.log.read_text().splitlines()[-1:]
         return "".join(line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED))
@@ -88,10 +89,9 @@ def launched(
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
-    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, drawn
-    too if `rerun`, and its skills in `skills`, where given. Arm, tool and all that describes the
-    cell are those of `settings`; `network` is the section [network] of its configuration. Raises
-    LaunchError.
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, with
+    drawings if `rerun`, and its skills in `skills`. The cell is described by `settings`; `network`
+    is the section [network] of its configuration. Raises LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
@@ -114,13 +114,13 @@ def launched(
 
 
 def described(settings: Settings) -> str:
-    """As TOML what settings say of a cell, but for its name, network and files."""
+    """The settings that differ from the defaults as TOML, without name, network and files."""
     given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
-    told = {name: given[name] for name in given if given[name] != usual[name]}
-    rate = f"rate_hz = {told['rate_hz']}\n" if "rate_hz" in told else ""
+    changed = {name: given[name] for name in given if given[name] != usual[name]}
+    rate = f"rate_hz = {changed['rate_hz']}\n" if "rate_hz" in changed else ""
     return rate + "".join(
         f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in section.items())
-        for name, section in told.items()
+        for name, section in changed.items()
         if isinstance(section, dict) and name not in ("network", "files")
     )
 
@@ -134,14 +134,16 @@ def _toml(value: Any) -> str:
 
 
 def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], None]) -> str:
-    """The endpoint at which a daemon listens, by its output; what its log tells of its start is
-    passed on, and it is waited for as long as that goes on. Raises LaunchError.
+    """The endpoint at which a daemon listens, read from its output.
+
+    `say` is called with the progress of the start. Waiting continues while there is progress.
+    Raises LaunchError.
     """
     assert process.stdout is not None
     moved_s, last = time.monotonic(), "nothing"
     with log.open() as lines:
-        while time.monotonic() - moved_s < STUCK_S:
-            if select.select([process.stdout], [], [], LOOK_S)[0]:
+        while time.monotonic() - moved_s < START_STALL_S:
+            if select.select([process.stdout], [], [], START_POLL_S)[0]:
                 line = process.stdout.readline()
                 if line.startswith("listening on "):
                     return line.split()[2].rstrip(",")
@@ -152,13 +154,13 @@ def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], No
                     moved_s, last = time.monotonic(), line.partition(STARTING)[2].strip()
                     say(f"  {STARTING}{last}")
     raise LaunchError(
-        f"the service has got no further for {STUCK_S:g} s. Start it again on a machine with a free core: what it has "
-        f"compiled is kept. It said last: {last}"
+        f"the start of the service has made no progress for {START_STALL_S:g} s. Start it again on a machine with a "
+        f"free core; compiled functions are kept. Its last report: {last}"
     )
 
 
 def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda line: None) -> str:
-    """The report of one run of the bench (`python -m sim` with the arguments) as JSON; `say` is
+    """The report in JSON of one run of the bench (`python -m sim` with the arguments); `say` is
     called with its progress. Raises LaunchError.
     """
     at = ("--connect", endpoint, "--cell", "thirdhand")
@@ -186,7 +188,7 @@ def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda l
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on."""
+    """A free TCP port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,4 +1,4 @@
-"""Clients' requests: validated on other threads, carried out through the loop's inbox."""
+"""Clients' requests, validated on other threads and executed through the loop's inbox."""
 
 from __future__ import annotations
 
@@ -43,31 +43,31 @@ from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
 from service.settings.config import Settings
 
-ADOPTION_TIMEOUT_S = 2.0
-POLL_S = 0.001  # while waiting for the tick that took a request
-MOST_POINTS = 400  # of all via-points that are not the task's, with the points of their neighbourhoods
-MOST_WAITING = 16  # requests in a queue ...
-MOST_ORDERS = 1024  # ... of orders, of which one tick takes all
-LONGEST_LIST = 100  # bytes
+ADOPTION_TIMEOUT_S = 2.0  # the loop must take an event within this time
+TICK_POLL_S = 0.001
+MAX_TAUGHT_POINTS = 400  # limit of via-points that are not the task's, with the points of their neighbourhoods
+MAX_WAITING_REQUESTS = 16
+MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
+MAX_LIST_BYTES = 100  # a longer request is not a `list`
 TEXT = zenoh.Encoding.TEXT_PLAIN
-ORDERS = ("hold", "resume", "reset")
-TOGETHER = (*ORDERS, "status")  # one answer is that of all that wait
-COMPUTED = "teaching"  # the queue of requests for which the skill worker computes
+ORDER_KEYS = ("hold", "resume", "reset")
+TOGETHER = (*ORDER_KEYS, "status")  # all waiting requests on one of these keys get the same answer
+COMPUTED = "teaching"  # name of the queue of requests for which the skill worker computes
 
 
-Order = Callable[[str], Reply | RequestError]  # carries out hold, resume or reset
+Order = Callable[[str], Reply | RequestError]  # executes hold, resume or reset
 
 
 class Requested(Protocol):
-    """Makes a status that is newer than its call, and publishes it where that is wanted."""
+    """A function that makes a status newer than its call, and publishes it if `published`."""
 
     def __call__(self, *, published: bool) -> bytes: ...
 
 
 class PendingEvent:
-    """An event on its way into the loop, and the tick that took it.
+    """An event that waits for the loop, and the tick that took it.
 
-    Either the loop takes it or the requesting thread withdraws it, never both.
+    Either the loop takes the event or the requesting thread withdraws it, never both.
     """
 
     def __init__(self, event: Event) -> None:
@@ -75,47 +75,54 @@ class PendingEvent:
         self._tick: Future[int] = Future()
 
     def claimed(self, tick: int) -> Event | None:
-        """The event, consumed by this tick, or None where it was withdrawn. Called by the loop."""
+        """The event, taken by this tick; None if it was withdrawn. For the loop."""
         if not self._tick.set_running_or_notify_cancel():
             return None
         self._tick.set_result(tick)
         return self._event
 
     def wait(self) -> int:
-        """The tick that consumed it. Raises RequestError where none does, nor ever will."""
+        """The tick that took the event. If none does in time, withdraw it and raise
+        RequestError.
+        """
         try:
             return self._tick.result(ADOPTION_TIMEOUT_S)
         except TimeoutError:
             if self._tick.cancel():
-                raise RequestError("the loop did not take the request: it is starting, ending or stalled") from None
+                raise RequestError(
+                    "the loop did not take the request: it is starting, ending or stalled; try again"
+                ) from None
             return self._tick.result()
 
 
 class RequestQueue:
-    """Requests that wait for a thread of their own; one beyond `most` is refused.
+    """A bounded queue of requests with a thread that answers them.
 
-    `answer` takes those of TOGETHER as many as wait, and other requests one by one.
+    `answer` is called with all waiting requests on one of TOGETHER, and with other requests one by
+    one.
     """
 
     def __init__(
         self, name: str, answer: Callable[[list[tuple[str, zenoh.Query]]], None], failed: Callable[[str], None]
     ) -> None:
         self._name, self._answer = name, answer
-        self._most, self._together = (MOST_ORDERS, MOST_ORDERS) if name in TOGETHER else (MOST_WAITING, 1)
+        self._most, self._together = (
+            (MAX_WAITING_ORDERS, MAX_WAITING_ORDERS) if name in TOGETHER else (MAX_WAITING_REQUESTS, 1)
+        )
         self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(self._most)
         self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
 
     def enqueue(self, suffix: str, query: zenoh.Query) -> None:
-        """Never waits."""
+        """Add a request, or refuse it if the queue is full. Never waits."""
         try:
             self._waiting.put_nowait((suffix, query))
         except queue.Full:
             with query:
-                refusal = f"busy: {self._most} {self._name} requests wait already; try again later"
+                refusal = f"busy: {self._most} {self._name} requests are waiting; try again later"
                 query.reply_err(refusal.encode(), encoding=TEXT)
 
     def close(self) -> None:
-        """Ends the thread; waiting requests are answered first."""
+        """Answer the waiting requests and end the thread."""
         self._waiting.put(None)
         self._thread.join(ADOPTION_TIMEOUT_S + 1)
 
@@ -128,16 +135,15 @@ class RequestQueue:
                 taken.append(self._waiting.get())
             ended = taken[-1] is None
             self._answer([item for item in taken if item is not None])
-            taken.clear()  # a client's query ends once its last reference is gone
+            taken.clear()  # a client's query ends with its last reference
 
 
 class Queryables:
-    """The queryables of one cell, which answer once they are open.
+    """The queryables of one cell, which answer from `open` on.
 
-    Each of TOGETHER has a queue of its own, and the requests for which the skill worker computes
-    have one: no kind waits behind another. The via-points in force are listed at once. `status` is
-    to return a status that is newer than its call; a request that changed something is answered
-    once a status that shows it is published.
+    Each key of TOGETHER has its own queue, and the requests for which the skill worker computes
+    have one, so that no kind waits for another. `list` is answered at once. A request that changed
+    something is answered after a status that shows the change was published.
     """
 
     def __init__(
@@ -168,11 +174,11 @@ class Queryables:
         self._queryables: list[zenoh.Queryable[None]] = []
 
     def open(self, session: zenoh.Session) -> None:
-        """Answers requests from now on."""
+        """Answer requests from now on."""
         self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
-        local = threading.local()  # Zenoh calls from a thread of its own for each queryable
+        local = threading.local()  # Zenoh has a thread for each queryable
 
         def receive(query: zenoh.Query) -> None:
             try:
@@ -189,7 +195,7 @@ class Queryables:
         return session.declare_queryable(channels.key(self._settings.cell, suffix), receive)
 
     def close(self) -> None:
-        """Ends all threads; requests still waiting are answered first."""
+        """Answer the waiting requests and end all threads."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         for waiting in self._queues.values():
@@ -197,27 +203,25 @@ class Queryables:
 
     @staticmethod
     def _is_list(suffix: str, query: zenoh.Query) -> bool:
-        if suffix != "via_points" or query.payload is None or len(query.payload) > LONGEST_LIST:
+        if suffix != "via_points" or query.payload is None or len(query.payload) > MAX_LIST_BYTES:
             return False
         try:
             return isinstance(channels.BY_KEY[suffix].codec.decode(query.payload.to_bytes()), List)
         except RequestError:
             return False
 
-    def _reply_together(self, asked: Sequence[tuple[str, zenoh.Query]]) -> None:
-        """Replies to requests once a status shows what they changed; equal orders go through the
-        loop once.
-        """
+    def _reply_together(self, requests: Sequence[tuple[str, zenoh.Query]]) -> None:
+        """Reply to requests that wait together; equal orders pass through the loop once."""
         order_once, status_once = functools.cache(self._order), functools.cache(self._status)
-        for suffix, query in asked:
+        for suffix, query in requests:
             self._reply(suffix, query, order_once, status_once)
 
     def _reply(self, suffix: str, query: zenoh.Query, order: Order, status: Requested) -> None:
         key = channels.key(self._settings.cell, suffix)
-        with query:  # its end tells the client that no more replies come
+        with query:  # its end shows the client that there are no more replies
             try:
                 if str(query.key_expr) != key and suffix != "status":
-                    raise RequestError(f"{query.key_expr} asks many at once; {key} by its own name needed")
+                    raise RequestError(f"{query.key_expr} matches several cells; the key {key} needed")
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 if (size := len(payload)) > channels.LARGEST_REQUEST:
                     raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
@@ -231,7 +235,7 @@ class Queryables:
             except (RequestError, SkillError) as error:
                 self._note(f"{suffix} refused: {error}")
                 query.reply_err(str(error).encode(), encoding=TEXT)
-            except Exception as error:  # one request that fails must not end the thread
+            except Exception as error:  # a request that fails must not end the thread
                 self._note(f"{suffix} failed: {error!r}")
                 query.reply_err(f"{type(error).__name__}: {error}".encode(), encoding=TEXT)
             else:
@@ -253,10 +257,10 @@ class Queryables:
                 if isinstance(reply := order(suffix), RequestError):
                     raise reply
                 return reply
-        raise RequestError(f"nothing is done with a request on {suffix}")
+        raise RequestError(f"requests on {suffix} are not supported")
 
     def _order(self, suffix: str) -> Reply | RequestError:
-        """The reply to hold, resume or reset, with the mode that resulted, or why there is none."""
+        """The reply to hold, resume or reset with the resulting mode, or the error."""
         before, _ = outcome(self._frame())
         try:
             tick = self._through_the_loop(order(suffix))
@@ -269,7 +273,7 @@ class Queryables:
         elif suffix == "resume" and before is Mode.FOLLOW:
             note = "there was no hold to end"
         elif suffix == "resume" and mode is Mode.FAULT:
-            note = "a fault is ended by reset, not by resume"
+            note = "resume does not end a fault, reset does"
         return Reply(tick, mode=word(mode), reason=word(reason), note=note)
 
     def _set_stage(self, name: str) -> Reply:
@@ -281,44 +285,46 @@ class Queryables:
         return Reply(tick, mode=word(mode), reason=word(reason))
 
     def _through_the_loop(self, event: Event) -> int:
-        """The tick that took an event, once that has decided."""
+        """Send an event through the loop; returns the tick that took it, after its frame."""
         pending = PendingEvent(event)
         self.inbox.append(pending)
         tick, end = pending.wait(), time.monotonic() + ADOPTION_TIMEOUT_S
         while int(self._frame()["tick"]) < tick and time.monotonic() < end:
-            time.sleep(POLL_S)
+            time.sleep(TICK_POLL_S)
         return tick
 
-    def _adopt(self, skill: StoredSkill, *, is_loaded: bool = False) -> Reply:
-        """Raises RequestError for a loaded skill most of whose places the arm does not reach."""
+    def _adopt(self, skill: StoredSkill, *, is_loaded: bool = False, remark: str = "") -> Reply:
+        """Have the loop adopt a skill, and save its via-points.
+
+        Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
+        """
         distances_m = self._skill_worker.beyond_m(self._settings, skill.tool_positions)
         found = out_of_reach(skill, distances_m, self._settings)
         if is_loaded and found.is_refused:
             raise RequestError(found.text)
         self._keep(skill.file)
-        draft = self._saved.draft(skill)  # first: what cannot be saved is not taught
+        draft = self._saved.draft(skill)  # written first, because via-points that cannot be saved are not adopted
         try:
             tick = self._through_the_loop(Event("skill", skill.file, skill.for_loop()))
             draft.replace(self._saved.path(skill))
         finally:
             draft.unlink(missing_ok=True)
         before, self._skill, self._in_force = self._skill, skill, in_force(skill)
-        warnings = warnings_of(before, skill)
-        return Reply(tick, self._in_force, (found.text, *warnings) if found.text else warnings)
+        return Reply(tick, self._in_force, (*filter(None, (remark, found.text)), *warnings_of(before, skill)))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
         files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
-        found = {path.stem: path for path in files}  # without links to files elsewhere
+        found = {path.stem: path for path in files}  # links to files elsewhere are ignored
         path = found.get(name.removesuffix(".npz"))
         if path is None:
             names = ", ".join(found) or "none"
-            raise RequestError(f"$.name: no skill {name!r} in the skill folder. There are: {names}")
-        skill = self._skill_worker.load(path)
-        if saved := self._saved.read(skill):  # its via-points were taught before
+            raise RequestError(f"$.name: no skill {name!r} in the skill folder; its skills: {names}")
+        skill, remark = self._skill_worker.load(path), ""
+        if saved := self._saved.read(skill):
             points, tolerance = saved
-            skill = self._skill_worker.adapt(skill, points, tolerance=tolerance)
-        return self._adopt(skill, is_loaded=True)
+            skill, remark = self._skill_worker.adapt(skill, points, tolerance=tolerance), self._saved.remark
+        return self._adopt(skill, is_loaded=True, remark=remark)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:
         points = {point.name: point for point in self._skill.via_points}
@@ -329,10 +335,10 @@ class Queryables:
             case Remove(names):
                 for i, name in enumerate(names):
                     if name in names[:i]:
-                        raise RequestError(f"$.names[{i}]: {name!r} given twice, names once each needed")
+                        raise RequestError(f"$.names[{i}]: {name!r} given twice; each name once needed")
                     if name not in points:
                         known = ", ".join(points) or "none"
-                        raise RequestError(f"$.names[{i}]: no via-point {name!r}. There are: {known}")
+                        raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {known}")
                 points = {name: point for name, point in points.items() if name not in names}
             case Add(added, tolerance):
                 self._check(added)
@@ -340,19 +346,22 @@ class Queryables:
         return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
 
     def _check(self, added: Sequence[ViaPoint]) -> None:
-        """Raises RequestError for too many via-points, and for those out of reach."""
+        """Raise RequestError for too many via-points, and for those outside the skill's
+        workspace.
+        """
         all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
         total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
-        if total > MOST_POINTS:
+        if total > MAX_TAUGHT_POINTS:
             raise RequestError(
-                f"$.points: {total} via-points beside the task's, 13 each with a radius; at most {MOST_POINTS} accepted"
+                f"$.points: {total} via-points beside the task's, where one with a radius counts as 13; at most "
+                f"{MAX_TAUGHT_POINTS} accepted"
             )
         low, high = self._skill.workspace
-        beyond_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
-        for i, (point, distance_m) in enumerate(zip(added, beyond_m, strict=True)):
-            at, given = np.array(point.tool), f"$.points[{i}].tool: {list(point.tool)}"
-            if not ((low <= at) & (at <= high)).all():
+        distances_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
+        for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
+            given = f"$.points[{i}].tool: {list(point.tool)}"
+            if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
-                raise RequestError(f"{given} outside the skill's box, {corners} m accepted")
+                raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")
             if distance_m > 0.0:
                 raise RequestError(f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")

@@ -1,6 +1,6 @@
-"""A cell as a ROS 2 node of rmw_zenoh: its outputs are published on a thread beside the loop.
+"""A cell as a ROS 2 node of rmw_zenoh, whose outputs are published on a thread beside the loop.
 
-Its inputs come in by CellStreams, like those of other clients.
+CellStreams receives its inputs, like those of other clients.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from service.daemon.clock import run_beside_real_time
 from service.settings.arm_description import description
 from service.settings.config import Settings, urdf_path
 
-MOST_WAITING = 256  # messages: half a second of commands
+MAX_WAITING_MESSAGES = 256  # half a second of commands
 CLOSED_WITHIN_S = 2.0
-HEARTBEAT_S = 0.5  # as rmw_zenoh has it, after which who missed something latched notices
-LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # of diagnostic_msgs: OK, WARN, ERROR
+HEARTBEAT_S = 0.5  # as in rmw_zenoh: after this time a subscriber notices that it missed a latched message
+DIAGNOSTIC_LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # OK, WARN and ERROR of diagnostic_msgs
 DIAGNOSED = (
     *("mode", "reason", "flags", "tick", "rate_hz", "missed", "realtime", "lateness_us", "work_us", "latency_ms"),
     *("hand_age_ms", "hand_distance_m", "rejected", "received", "skill", "stage", "version"),
@@ -56,10 +56,10 @@ def _as_diagnostics(payload: bytes, names: tuple[str, ...], period_ns: int) -> b
             values[f"{name}.{part}".rstrip(".")] = text
     what = in_brief(status["mode"], status["reason"]) + in_full(status["because"], status["remedy"])
     name = f"{status['cell']}: {ros2.NODE}"
-    return cdr.encode_diagnostics(status["time_ns"], LEVELS[status["mode"]], name, what, values)
+    return cdr.encode_diagnostics(status["time_ns"], DIAGNOSTIC_LEVELS[status["mode"]], name, what, values)
 
 
-_MADE = {  # how a topic's message is made of the channel's, by channel and the topic's type; others are it as it is
+_CONVERSIONS = {  # from a channel's message to a topic's, by channel and type of the topic; other topics have none
     ("joints/command", "std_msgs/msg/Float64MultiArray"): _as_numbers,
     ("joints/command", "trajectory_msgs/msg/JointTrajectory"): _as_trajectory,
     ("status", "std_msgs/msg/String"): _as_string,
@@ -71,8 +71,8 @@ class Ros2Domain:
     """The topics of a cell in a ROS 2 domain, its own and those of the arm's controllers, with the
     liveliness tokens by which tools list them.
 
-    `publish` is for the loop and never waits: beyond MOST_WAITING messages are dropped. `failed` is
-    called with what ends the thread's work.
+    `publish` is for the loop and never waits: beyond MAX_WAITING_MESSAGES it drops messages.
+    `failed` is called with the message of an error on the thread.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Ros2Domain:
         self._topics = [topic for topic in topics if not topic.heard]
         self._publishers = {topic.name: _publisher(session, ros2.key(domain, topic), topic) for topic in self._topics}
         self._gids = {topic.name: ros2.gid(tokens[topic.name]) for topic in self._topics}
-        self._sent, self._come = Counter[str](), Counter[str]()
+        self._sent, self._received = Counter[str](), Counter[str]()
         self._tokens = [session.liveliness().declare_token(token) for token in tokens.values()]
         self._waiting: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
         self._thread = supervised_thread.start("ROS 2 thread", self._serve, failed)
@@ -97,19 +97,19 @@ class Ros2Domain:
             self.publish("/tf_static", cdr.encode_transforms(time.time_ns(), self._frames.fixed))
 
     def show(self, frame: Frame, state: Record) -> None:
-        """Publishes where everything is: the joints as measured, as commanded without an arm."""
+        """Publish all frames, for the measured joints or, without an arm, the commanded ones."""
         if self._frames is not None:
             joints = state["measured"] if state["arm_tick"] >= 0 else frame["joints"]
             frames = self._frames.moving(frame, joints.tolist())
             self.publish("/tf", cdr.encode_transforms(time.time_ns(), frames))
 
     def publish(self, suffix: str, payload: bytes) -> None:
-        """Publishes a message of a channel on its ROS 2 topics."""
-        if self._waiting.qsize() < MOST_WAITING:
+        """Publish a message of a channel on its ROS 2 topics."""
+        if self._waiting.qsize() < MAX_WAITING_MESSAGES:
             self._waiting.put((suffix, payload))
 
     def close(self) -> None:
-        """Ends the thread, once all that waits is published, and undeclares the tokens."""
+        """Publish the waiting messages, end the thread, and undeclare the tokens."""
         self._waiting.put(None)
         self._thread.join(CLOSED_WITHIN_S)
         for token in self._tokens:
@@ -120,18 +120,20 @@ class Ros2Domain:
         while (item := self._waiting.get()) is not None:
             suffix, payload = item
             for topic in (one for one in self._topics if one.channel == suffix):
-                self._come[topic.name] += 1
-                if self._come[topic.name] % topic.every:
+                self._received[topic.name] += 1
+                if self._received[topic.name] % topic.every:
                     continue
                 self._sent[topic.name] += 1
                 attachment = ros2.encode_attachment(self._sent[topic.name], time.time_ns(), self._gids[topic.name])
-                made = _MADE.get((suffix, topic.type))
-                message = made(payload, self._names, self._period_ns) if made else payload
+                convert = _CONVERSIONS.get((suffix, topic.type))
+                message = convert(payload, self._names, self._period_ns) if convert else payload
                 self._publishers[topic.name].put(message, attachment=attachment)
 
 
 def _publisher(session: zenoh.Session, key: str, topic: ros2.Topic) -> zenoh.Publisher | ext.AdvancedPublisher:
-    """One that keeps its last message for those who come later, where the topic is latched."""
+    """A publisher on a topic; for a latched topic it stores the last message for later
+    subscribers.
+    """
     drop = zenoh.CongestionControl.DROP
     if not topic.latched:
         return session.declare_publisher(key, encoding=ENCODINGS["cdr"], congestion_control=drop, express=True)

@@ -1,4 +1,4 @@
-"""Files that a daemon reads as it starts: none of them, however damaged, keeps it from starting."""
+"""Reading of files at the start of a daemon, which continues without a damaged one."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from service.settings.file_content import content
 
 log = logging.getLogger("thirdhand")
 NOT_OURS = "it is damaged, or was not written by this service"
-LARGEST_BYTES = 32_000_000
-T = TypeVar("T")
+MAX_STATE_BYTES = 32_000_000
+Restored = TypeVar("Restored")
 
 
-def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str) -> T:
-    """The value that `read` makes of a file's content; `otherwise` where there is no file.
+def restored(path: Path, read: Callable[[bytes], Restored], otherwise: Restored, *, what: str) -> Restored:
+    """The value that `read` returns for a file's content; `otherwise` if there is no file.
 
-    A file that cannot be read, or of which `read` makes an exception of whatever kind, is set aside
-    under another name, which the log reports, and `otherwise` is returned.
+    If the file cannot be read, or `read` raises any exception, the file is renamed, which the log
+    reports, and `otherwise` is returned.
     """
     try:
-        return read(content(path, LARGEST_BYTES))
+        return read(content(path, MAX_STATE_BYTES))
     except (FileNotFoundError, NotADirectoryError):
         return otherwise
     except Exception as error:
@@ -37,6 +37,6 @@ def restored(path: Path, read: Callable[[bytes], T], otherwise: T, *, what: str)
         else:
             where = f"is kept as {aside}"
         log.warning(
-            "%s in %s cannot be used: %s; the file %s, and the daemon goes on without it", what, path, reason, where
+            "%s in %s cannot be used: %s; the file %s, and the daemon continues without it", what, path, reason, where
         )
         return otherwise

@@ -1,4 +1,4 @@
-"""Via-points that survive a restart: a file for each skill that was taught to each arm."""
+"""Saved via-points, with a file for each skill and each arm that it was taught to."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from service.settings.file_content import UnusableError
 from service.settings.urdf import Urdf
 
 log = logging.getLogger("thirdhand")
-T = TypeVar("T")
+Made = TypeVar("Made")
 WHAT = "the taught via-points"
 
 
@@ -37,40 +37,43 @@ def _checksum(saved: dict[str, Any]) -> str:
 
 
 def _identity(settings: Settings) -> str:
-    """What tells an arm from others: its joints, and where they sit to a centimetre, so that it
-    stays the same when it is calibrated.
+    """A text that identifies an arm: its joints and their positions to a centimetre, so that a
+    calibration does not change it.
     """
     chain = Urdf(robot_description(settings)).chain(settings.arm.plate)
     return "; ".join(" ".join([one.name, *(f"{round(v, 2) + 0.0:.2f}" for v in one.translation)]) for one in chain)
 
 
 class SavedViaPoints:
-    """The via-points taught to each skill of an arm, on disk; written atomically.
+    """The via-points taught to each skill of an arm, in files that are written atomically.
 
-    Those that the arm does not reach, as it is now, are set aside.
+    Via-points that the arm does not reach are set aside in another file.
     """
 
     def __init__(self, settings: Settings, distances_m: Callable[[Settings, Vector], Vector] = beyond_m) -> None:
         self._folder, self._settings, self._distances_m = state_folder(settings), settings, distances_m
         self._arm, self._shipped_arm = _identity(settings), _identity(Settings())
+        self.remark = ""  # message on via-points that were set aside by the last reading
 
     def path(self, skill: Skill) -> Path:
-        """The file for this skill and arm, named by the hash of what the skill was learned from."""
-        arm = "" if self._arm == self._shipped_arm else self._arm  # as before there were others
+        """The file for this skill and arm, named by a hash of the skill's demonstrations."""
+        arm = "" if self._arm == self._shipped_arm else self._arm  # as files of earlier versions were named
         digest = hashlib.blake2b((skill.learned_from + arm).encode(), digest_size=6).hexdigest()
         return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
-        """Via-points and tolerance taught to this skill of this arm, or None."""
+        """The via-points and the tolerance taught to this skill of this arm; None if there are
+        none. `remark` names those that the arm does not reach.
+        """
         found = restored(self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT)
         return found and self._reached(skill, *found)
 
-    def restored(self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], T], otherwise: T) -> T:
-        """The value that `make` makes of the via-points and the tolerance taught to this skill of
-        this arm; `otherwise` where none were, or where that fails.
+    def restored(self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], Made], otherwise: Made) -> Made:
+        """The value that `make` returns for the via-points and the tolerance taught to this skill
+        of this arm; `otherwise` if there are none, or if that fails.
         """
 
-        def made(content: bytes) -> T:
+        def made(content: bytes) -> Made:
             found = self._decoded(content, skill)
             return otherwise if found is None else make(*self._reached(skill, *found))
 
@@ -79,11 +82,12 @@ class SavedViaPoints:
     def _reached(
         self, skill: Skill, points: tuple[ViaPoint, ...], tolerance: float
     ) -> tuple[tuple[ViaPoint, ...], float]:
-        """The via-points whose tool positions the arm reaches. Others are kept in a file that
-        `thirdhand via-points add --file` takes, which the log reports.
+        """The via-points whose tool positions the arm reaches. The others are written to a file for
+        `thirdhand via-points add --file`, which log and remark name.
         """
         distances_m = self._distances_m(self._settings, np.reshape([point.tool for point in points], (-1, 3)))
         beyond_m = {point.name: m for point, m in zip(points, distances_m.tolist(), strict=True) if m > 0.0}
+        self.remark = ""
         if not beyond_m:
             return points, tolerance
         content = encode_json(Add(tuple(point for point in points if point.name in beyond_m), tolerance))
@@ -93,24 +97,27 @@ class SavedViaPoints:
             self._written(content).replace(aside)
             where = f"are set aside: once the arm reaches them, teach them by thirdhand via-points add --file {aside}"
         except (OSError, SkillError) as error:
-            where = f"are not in force, and lost once others are taught: they cannot be set aside ({in_words(error)})"
+            where = (
+                f"are not in force, and the next teaching deletes them: they cannot be set aside ({in_words(error)})"
+            )
         names = ", ".join(f"{name!r} by {m:.3f} m" for name, m in beyond_m.items())
-        log.warning("via-points of skill %r are out of the arm's reach, %s; they %s", skill.name, names, where)
+        self.remark = f"via-points of skill {skill.name!r} are out of the arm's reach, {names}; they {where}"
+        log.warning("%s", self.remark)
         return tuple(point for point in points if point.name not in beyond_m), tolerance
 
     def _decoded(self, content: bytes, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
-        """None where they belong to another skill or arm."""
+        """The via-points and the tolerance in a file; None if they are of another skill or arm."""
         saved = json.loads(content)
         if saved.pop("checksum", None) != _checksum(saved):
-            raise UnusableError("the checksum is wrong: the file was changed since; teach them again")
+            raise UnusableError("the checksum is wrong, so the file was edited; teach the via-points again")
         request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
         if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
             return None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
     def draft(self, skill: Skill) -> Path:
-        """A temporary file, flushed to disk, with this skill's via-points, to be renamed over the
-        old one. Raises SkillError.
+        """A temporary file on disk with this skill's via-points, to replace the old file. Raises
+        SkillError.
         """
         request = None
         if skill.via_points:
@@ -119,7 +126,7 @@ class SavedViaPoints:
         return self._written(json.dumps(saved | {"checksum": _checksum(saved)}, indent=1).encode())
 
     def _written(self, content: bytes) -> Path:
-        """A temporary file of this content, flushed to disk. Raises SkillError."""
+        """A temporary file on disk with this content. Raises SkillError."""
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".new", delete=False) as file:

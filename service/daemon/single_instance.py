@@ -1,4 +1,4 @@
-"""One daemon to a cell, and bounds on what it accepts from the network."""
+"""The lock by which a cell has one daemon, and the bounds on its network connections."""
 
 from __future__ import annotations
 
@@ -22,45 +22,40 @@ from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.settings.config import Settings
 
-MOST_SESSIONS = 64
-MOST_DESCRIPTORS = 65536
-MOST_HANDSHAKES = 16  # at once: those that time out are closed together, which delays the others
+MAX_SESSIONS = 64
+MAX_DESCRIPTORS = 65536
+MAX_HANDSHAKES = 16  # pending handshakes: those that time out are closed together, which delays others
 HANDSHAKE_TIMEOUT_MS = 2000
-ENVELOPE = 1024  # bytes of key, attachment and Zenoh's headers around the largest request
+ENVELOPE_BYTES = 1024  # key, attachment and Zenoh's headers around the largest request
 
-BOUNDS: dict[str, Any] = {
-    "transport/unicast/max_sessions": MOST_SESSIONS,
-    "transport/unicast/accept_pending": MOST_HANDSHAKES,
+NETWORK_BOUNDS: dict[str, Any] = {
+    "transport/unicast/max_sessions": MAX_SESSIONS,
+    "transport/unicast/accept_pending": MAX_HANDSHAKES,
     "transport/unicast/accept_timeout": HANDSHAKE_TIMEOUT_MS,
-    "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE,
-    # an answer takes this from its query: to a client that does not read, it is dropped
+    "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE_BYTES,
+    # A reply takes this from its query: it is dropped if the client does not read.
     "qos/network": [
-        {
-            "messages": ["query"],
-            "key_exprs": ["**"],
-            "flows": ["ingress"],
-            "overwrite": {"congestion_control": "drop"},
-        }
+        {"messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
     ],
 }
-MOST_READ = 4096  # bytes of what a lock's holder wrote
+MAX_HOLDER_BYTES = 4096  # limit of what is read from a lock file
 log = logging.getLogger("thirdhand")
 
 
 def state_folder(settings: Settings) -> Path:
-    """The folder of what a cell keeps over a restart."""
+    """The folder of the files that a cell keeps over a restart."""
     return Path(settings.files.state).expanduser() / settings.cell
 
 
 class OccupiedError(ExplainedError, RuntimeError):
-    """Another daemon serves the cell already."""
+    """Another daemon already serves the cell."""
 
 
 class Lock:
-    """The lock of a cell's state folder, held by one daemon at a time, also of two that do not see
-    each other by Zenoh. The operating system releases it however the process ends.
+    """The lock of a cell's state folder, which one daemon holds at a time, also if two daemons do
+    not see each other through Zenoh. The operating system releases it at the end of the process.
 
-    Raises OccupiedError where another process holds it, with what that one wrote of itself.
+    Raises OccupiedError if another process holds it; the message describes that process.
     """
 
     def __init__(self, folder: Path, cell: str) -> None:
@@ -77,17 +72,17 @@ class Lock:
             holder = _holder(self._descriptor)
             self.close()
             raise OccupiedError(
-                f"cell {cell} is served already on this machine ({holder}; {path} is locked): stop that daemon, or "
-                "give this one another --cell, or [files] state"
+                f"cell {cell} is already served on this machine ({holder}; {path} is locked): stop that daemon, or "
+                "give this one another --cell or [files] state"
             ) from None
         except OSError as error:
-            log.warning("%s: %s; a second daemon of this cell is only noticed by Zenoh", path, error.strerror)
+            log.warning("%s: %s; a second daemon of this cell is only detected through Zenoh", path, error.strerror)
             self.close()
         else:
             self.announce(())
 
     def announce(self, endpoints: Iterable[str]) -> None:
-        """Writes where this process listens, for the error of a second daemon."""
+        """Write the endpoints of this process, for the error message of a second daemon."""
         if self._descriptor is not None:
             content = json.dumps({"pid": os.getpid(), "endpoints": list(endpoints)}).encode()
             with contextlib.suppress(OSError):
@@ -95,25 +90,25 @@ class Lock:
                 os.pwrite(self._descriptor, content, 0)
 
     def close(self) -> None:
-        """Releases it."""
+        """Release the lock."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
 
 
 def _holder(descriptor: int | None) -> str:
-    """The holder of a lock, by what it wrote of itself."""
+    """A description of the holder of a lock, from the lock file."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        found = json.loads(os.pread(descriptor, MOST_READ, 0))  # type: ignore[arg-type]
+        found = json.loads(os.pread(descriptor, MAX_HOLDER_BYTES, 0))  # type: ignore[arg-type]
         where = f"listening on {', '.join(found['endpoints'])}" if found["endpoints"] else "not listening, or not yet"
         return f"process {found['pid']}, {where}"
     return "a process that did not write its number"
 
 
 def allow_descriptors() -> None:
-    """Raises the limit of open files, so that a burst of connections does not reach it."""
+    """Raise the limit of open files, so that a burst of connections does not reach it."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
@@ -121,8 +116,8 @@ def allow_descriptors() -> None:
 def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     """The liveliness token by which this session's daemon serves the cell.
 
-    Raises OccupiedError where another daemon on this network does. Of two that start at once, both
-    may be refused.
+    Raises OccupiedError if another daemon on this network serves it. If two daemons start at once,
+    both may be refused.
     """
     own = str(session.zid())
     token = session.liveliness().declare_token(channels.presence(cell, own))
@@ -134,4 +129,4 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     with contextlib.suppress(UnreachableError, RefusedError):
         found = Client(session, cell, timeout_s=2.0).status()
         holder += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"
-    raise OccupiedError(f"cell {cell} is served already ({holder}): stop that daemon, or give this one another --cell")
+    raise OccupiedError(f"cell {cell} is already served ({holder}): stop that daemon, or give this one another --cell")

@@ -1,8 +1,8 @@
-"""The skill worker: another process that computes for requests, and looks for ways out, so that the
-control process need not.
+"""The skill worker: a process that loads and adapts skills and searches for ways out, so that the
+control process does not have to compute for requests.
 
-A skill is returned as a small pickle with its arrays in shared memory, so that the control process
-copies and solves nothing.
+It returns a skill as a small pickle with its arrays in shared memory, so that the control process
+neither copies nor solves anything.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from service.settings.config import Settings, robot_description
 from service.settings.file_content import UnusableError, content
 
 MODULE = "service.daemon.skill_worker"
-TIMEOUT_S = 25.0  # shorter than a client waits
-HUNG_S = 5.0  # without progress
-POLL_S = 0.1
-STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
+WORK_TIMEOUT_S = 25.0  # shorter than a client's timeout
+HUNG_S = 5.0  # the process hangs if it makes no progress for this time
+WORKER_POLL_S = 0.1
+STILL_STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
 
 
 class SkillWorker:
-    """Another process that loads and adapts skills.
+    """The control process's end of the skill worker.
 
-    Methods may be called from any thread; it works on one request at a time.
+    Methods may be called from any thread; the worker processes one request at a time.
     """
 
     def __init__(self, *, max_gain: float = MAX_GAIN) -> None:
@@ -49,39 +49,43 @@ class SkillWorker:
         self._child: child.Child | None = None
 
     def start(self) -> child.Child:
-        """The process, started where it is not there. Never waits."""
+        """The process, which is started if it does not run. Never waits."""
         if self._child is None or self._child.poll() is not None:
             self._end()
             self._child = child.start("skill worker", MODULE, socket.SOCK_STREAM)
         return self._child
 
-    def load(self, path: Path, *, timeout_s: float = TIMEOUT_S) -> StoredSkill:
+    def load(self, path: Path, *, timeout_s: float = WORK_TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
         loaded: StoredSkill = self._ask(timeout_s, skill_of, path)
         return loaded
 
     def adapt(
-        self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = TIMEOUT_S
+        self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = WORK_TIMEOUT_S
     ) -> StoredSkill:
-        """The skill that goes through these via-points and no others.
+        """The skill with these via-points and no others.
 
         Raises SkillError, also after `timeout_s` [s].
         """
         made: StoredSkill = self._ask(timeout_s, skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
         return made
 
-    def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = TIMEOUT_S) -> list[Vector]:
-        """As `WayOut.find` of the cell. Raises SkillError, also after `timeout_s` [s]."""
+    def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> list[Vector]:
+        """The result of `WayOut.find` for the cell. Raises SkillError, also after `timeout_s`
+        [s].
+        """
         found: list[Vector] = self._ask(timeout_s, way_out_of, settings, *arguments)
         return found
 
-    def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = TIMEOUT_S) -> Vector:
-        """As `learning.reach.beyond_m`. Raises SkillError, also after `timeout_s` [s]."""
+    def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = WORK_TIMEOUT_S) -> Vector:
+        """Distances (M,) [m] of positions (M, 3) beyond the reach, see `learning.reach.beyond_m`.
+        Raises SkillError, also after `timeout_s` [s].
+        """
         distances: Vector = self._ask(timeout_s, beyond_m, settings, positions)
         return distances
 
     def close(self) -> None:
-        """Ends the process, also while it works."""
+        """End the process, also while it works."""
         if (running := self._child) is not None and running.has_begun():
             running.kill()
         with self._busy:
@@ -90,27 +94,27 @@ class SkillWorker:
     def _end(self) -> None:
         if self._child is not None:
             self._child.socket.close()
-            if self._child.pid is not None:  # else it ends once it has begun
+            if self._child.pid is not None:  # else it ends at its start, with the closed socket
                 self._child.kill()
                 self._child.wait()
             self._child = None
 
     def _ask(self, timeout_s: float, work: Callable[..., Any], *arguments: Any) -> Any:
-        """The value of `work(*arguments)`, a function of a module that the process has imported."""
+        """The value of `work(*arguments)` in the worker, for a function of an imported module."""
         with self._busy:
             working, end_s = self.start(), time.monotonic() + timeout_s
             progress = child.Progress(working)
             try:
-                while not working.has_begun(POLL_S):
-                    if working.returncode is not None or progress.is_hung(TIMEOUT_S):
+                while not working.has_begun(WORKER_POLL_S):
+                    if working.returncode is not None or progress.is_hung(WORK_TIMEOUT_S):
                         working.kill()
                         raise EOFError
-                    if time.monotonic() > end_s:  # what it has imported stays: it is waited for again
-                        raise SkillError(STARTING)
+                    if time.monotonic() > end_s:  # its imports continue for the next request
+                        raise SkillError(STILL_STARTING)
                 _send(working.socket, pickle.dumps((work, *arguments)))
                 poll = select.poll()
                 poll.register(working.socket, select.POLLIN)
-                while not poll.poll(1000 * POLL_S):
+                while not poll.poll(1000 * WORKER_POLL_S):
                     if progress.is_hung(HUNG_S, busy_s=math.inf):
                         raise TimeoutError(f"made no progress for {HUNG_S:g} s")
                     if time.monotonic() > end_s:
@@ -128,7 +132,7 @@ class SkillWorker:
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:
-    """Sends one message: its parts in shared memory, only the descriptor through the socket."""
+    """Send one message: the parts in shared memory, and its descriptor through the socket."""
     fd = child.in_memory(*parts)
     try:
         socket.send_fds(channel, [b"\0"], [fd])
@@ -137,7 +141,7 @@ def _send(channel: socket.socket, *parts: Any) -> None:
 
 
 def _receive(channel: socket.socket) -> Any:
-    """One message, its arrays left in the shared memory that it came in."""
+    """Receive one message, whose arrays remain in its shared memory."""
     _, descriptors, _, _ = socket.recv_fds(channel, 1, 1)
     if not descriptors:
         raise EOFError
@@ -146,14 +150,14 @@ def _receive(channel: socket.socket) -> Any:
 
 
 def way_out_of(settings: Settings, *arguments: Vector) -> list[Vector]:
-    """As `WayOut.find` of the cell."""
+    """The result of `WayOut.find` for the cell."""
     return WayOut(settings, robot_description(settings)).find(*arguments)
 
 
 def skill_of(
     source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
-    """The skill in a file, or the one in force (the bytes of its file) through these via-points.
+    """The skill in a file, or the skill in force (the bytes of its file) with these via-points.
 
     Raises SkillError.
     """
@@ -167,13 +171,13 @@ def skill_of(
         except (OSError, UnusableError) as error:
             raise SkillError(f"cannot read skill {source}: {in_words(error, named=False)}") from None
     hands = skill.hands[0].reshape(2, 3)
-    skill.predict(hands, 0 * hands, 0 * hands)  # what is computed once is computed here
+    skill.predict(hands, 0 * hands, 0 * hands)  # computes and caches everything that is computed once
     _ = skill.tool_positions
     return skill
 
 
 def run(channel: socket.socket) -> None:
-    """The child: one request after the other until the other end closes."""
+    """Process requests in the child until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     child.end_with_parent()
     while True:
@@ -184,7 +188,7 @@ def run(channel: socket.socket) -> None:
         buffers: list[pickle.PickleBuffer] = []
         try:
             answer = work(*arguments)
-        except Exception as error:  # any failure is an answer to the client
+        except Exception as error:  # the client gets any failure as an answer
             answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
         skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
         try:

@@ -1,6 +1,4 @@
-"""The start of a daemon: takes its cell, and says for it what it does and how far it is, before
-anything heavy is imported.
-"""
+"""The start of a daemon: it occupies the cell and reports its progress before slow imports."""
 
 from __future__ import annotations
 
@@ -22,45 +20,46 @@ from service.contract import channels, ros2
 from service.contract.printable import CLEAR
 from service.contract.requests import STARTING
 from service.contract.roles import access_control
-from service.daemon.single_instance import BOUNDS, Lock, allow_descriptors, occupy, state_folder
+from service.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
 from service.settings.config import Settings
 
 log = logging.getLogger("thirdhand")
-TELL_EVERY_S, LOG_EVERY_S = 1.0, 20.0
+REPORT_EVERY_S = 1.0  # interval of reports on a terminal
+LOG_EVERY_S = 20.0  # interval of reports in the log
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
-LOOPED = ("kmp.", "service.core.")  # modules of what the loop runs
+LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 
 
-class Start:
-    """Until it is `over`, each request to a cell is refused with what is done and how far it is.
+class Startup:
+    """The progress of a start. Until `over`, each request to the cell is refused with the progress.
 
-    On a terminal one line shows it, written anew in place; elsewhere the log reports the beginning,
-    each quarter of the functions, and every LOG_EVERY_S that something changes.
+    On a terminal one line shows it in place. Elsewhere the log reports the begin, each quarter of
+    the compiled functions, and changes every LOG_EVERY_S.
     """
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
         self.lock, self.session = lock, session
-        self._compiled: list[str] = []  # what is being compiled, callers first; no names of what libraries have
-        self._functions: list[Any] = []  # all that the loop may call, once they are imported
+        self._compiled: list[str] = []  # functions in compilation, callers first; empty for a library's functions
+        self._functions: list[Any] = []  # all compiled functions that the loop may call, once they are imported
         self._is_over, self._begun_s = threading.Event(), time.monotonic()
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
         self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
-        self._teller = threading.Thread(target=self._tell, name="start", daemon=True)
-        self._teller.start()
+        self._reporter = threading.Thread(target=self._report, name="start", daemon=True)
+        self._reporter.start()
 
     @property
     def age_s(self) -> float:
-        """The time since it began [s]."""
+        """Time since the start [s]."""
         return time.monotonic() - self._begun_s
 
     @property
-    def told(self) -> str:
-        """What is done, and how far it is."""
+    def progress(self) -> str:
+        """A message on the present step and its progress."""
         if not self._functions:
             return f"{STARTING}importing, {len(sys.modules)} modules so far"
         named = [name for name in self._compiled.copy() if name]
-        doing = f"compiling {named[-1]}" if named else "loading what is compiled"
-        return f"{STARTING}{doing}, {self._ready} of {len(self._functions)} functions are there"
+        doing = f"compiling {named[-1]}" if named else "loading compiled functions"
+        return f"{STARTING}{doing}, {self._ready} of {len(self._functions)} functions are ready"
 
     @property
     def _ready(self) -> int:
@@ -68,8 +67,10 @@ class Start:
 
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
-        """Within it functions that the loop may call, imported by now, are counted as they come."""
-        from numba.core import dispatcher, event  # heavy, which is why this has begun before
+        """A context that counts compiled functions, of those that the loop may call and that are
+        imported by now.
+        """
+        from numba.core import dispatcher, event  # its import is slow, so the start reports before it
 
         compiled = self._compiled
 
@@ -89,35 +90,35 @@ class Start:
             yield
 
     def over(self) -> None:
-        """Ends the refusals, so that others can answer; may be repeated."""
+        """End the refusals, so that the daemon can answer; may be repeated."""
         self._is_over.set()
-        self._teller.join()
+        self._reporter.join()
         while self._queryables:
             self._queryables.pop().undeclare()  # type: ignore[no-untyped-call]
 
     def _refuse(self, query: zenoh.Query) -> None:
-        with query:  # its end tells the client that no more replies come
-            query.reply_err(self.told.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
+        with query:  # its end shows the client that there are no more replies
+            query.reply_err(self.progress.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
 
-    def _tell(self) -> None:
-        said, said_s, quarter, terminal = "", -math.inf, -1, sys.stderr.isatty()
+    def _report(self) -> None:
+        logged, logged_s, quarter, terminal = "", -math.inf, -1, sys.stderr.isatty()
         while not self._is_over.is_set():
-            told, now_s = self.told, time.monotonic()
+            progress, now_s = self.progress, time.monotonic()
             now_in = 4 * self._ready // len(self._functions) if self._functions else -1
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
-                print(f"{CLEAR}{told[:width]}", end="", file=sys.stderr, flush=True)
-            elif told != said and (now_in > quarter or now_s - said_s >= LOG_EVERY_S):
-                log.info("%s", told)
-                said, said_s, quarter = told, now_s, now_in
-            self._is_over.wait(TELL_EVERY_S)
+                print(f"{CLEAR}{progress[:width]}", end="", file=sys.stderr, flush=True)
+            elif progress != logged and (now_in > quarter or now_s - logged_s >= LOG_EVERY_S):
+                log.info("%s", progress)
+                logged, logged_s, quarter = progress, now_s, now_in
+            self._is_over.wait(REPORT_EVERY_S)
         if terminal:
             print(CLEAR, end="", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
-def starting(settings: Settings) -> Iterator[Start]:
-    """The start of the daemon of a cell, which is taken as long as the context lasts.
+def starting(settings: Settings) -> Iterator[Startup]:
+    """The start of a cell's daemon, which occupies the cell until the context ends.
 
     Raises OccupiedError, UnreachableError.
     """
@@ -131,11 +132,11 @@ def starting(settings: Settings) -> Iterator[Start]:
                 listen=network.listen,
                 certificate=network.certificate,
                 zenoh_config=network.zenoh_config,
-                more=BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
+                more=NETWORK_BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
             )
         with session:
-            token = occupy(session, settings.cell)  # noqa: F841  # the cell is free once it is gone
-            start = Start(lock, session, settings.cell)
+            token = occupy(session, settings.cell)  # noqa: F841  # the cell is free when the token is deleted
+            start = Startup(lock, session, settings.cell)
             try:
                 yield start
             finally:
@@ -144,10 +145,10 @@ def starting(settings: Settings) -> Iterator[Start]:
 
 @contextlib.contextmanager
 def _ahead_of_others() -> Iterator[None]:
-    """Threads started within it run before those of other processes, if that is granted.
+    """A context in which new threads get a higher weight than other processes, if granted.
 
-    It is for the network's threads, which else wait up to 100 ms on a busy machine. They get no
-    real-time scheduling, or a flood of messages could use up the real-time share.
+    It is for the network's threads, which otherwise wait up to 100 ms on a busy machine. They get
+    no real-time scheduling, because a flood of messages could use up the real-time share.
     """
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):

@@ -22,10 +22,10 @@ from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
-from service.daemon.input_monitor import KEYS, frames
+from service.daemon.input_monitor import KEY_OF_SOURCE, frames
 from service.settings.config import Settings
 
-OLDEST_S = 0.2  # the tool is measured by joint states up to this age
+MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
 AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
 
 
@@ -145,11 +145,11 @@ class CellStatus(NamedTuple):
 
 
 class MeasuredArm:
-    """The arm at the joints measured last."""
+    """The pose of the arm at the joints that were measured last."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
         self._period_s, self._names = settings.period_s, settings.joints.names
-        # objects of its own: those of the loop are in use at the same time
+        # Own copies, because the loop uses its arm and separation at the same time.
         self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
 
     def inside(self, state: Record) -> Inside | None:
@@ -163,8 +163,8 @@ class MeasuredArm:
         return Inside(self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m)
 
     def position(self, state: Record) -> Vector3 | None:
-        """The tool's position [m] in frame `base`; None if joint states are older than that."""
-        if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= OLDEST_S:
+        """The tool's position [m] in frame `base`; None if the measured joints are too old."""
+        if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= MAX_MEASURED_AGE_S:
             return None
         return _point(self._arm.at(state["measured"].copy()).position)
 
@@ -179,7 +179,7 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
     counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():
-            counts[f"{MALFORMED} {KEYS[name]}" if cause == MALFORMED else cause] += count
+            counts[f"{MALFORMED} {KEY_OF_SOURCE[name]}" if cause == MALFORMED else cause] += count
     return counts
 
 

@@ -1,4 +1,4 @@
-"""Threads of the service that are restarted, and the failure reported, after an exception."""
+"""Threads of the service that report an exception and restart."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import time
 from collections.abc import Callable
 
 log = logging.getLogger("thirdhand")
-PAUSE_S = 0.1
+RESTART_PAUSE_S = 0.1
 
 
-def supervised(name: str, work: Callable[[], None], failed: Callable[[str], None], *, pause_s: float = PAUSE_S) -> None:
-    """Runs `work` to its end.
+def supervised(
+    name: str, work: Callable[[], None], failed: Callable[[str], None], *, pause_s: float = RESTART_PAUSE_S
+) -> None:
+    """Run `work` to its end.
 
-    Where an exception ends it, that is logged, `failed` is called with it, and after `pause_s` [s]
-    it starts again. An exception that `failed` raises ends it for good.
+    An exception is logged and passed to `failed`, and after `pause_s` [s] `work` starts again. An
+    exception in `failed` is raised.
     """
     while True:
         try:
@@ -27,7 +29,7 @@ def supervised(name: str, work: Callable[[], None], failed: Callable[[str], None
 
 
 def start(name: str, work: Callable[[], None], failed: Callable[[str], None]) -> threading.Thread:
-    """A started thread of `supervised` work."""
+    """Start a thread that runs `work` supervised."""
     thread = threading.Thread(target=supervised, args=(name, work, failed), name=name, daemon=True)
     thread.start()
     return thread

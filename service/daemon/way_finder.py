@@ -1,4 +1,4 @@
-"""Looks for a way out where the tool is stuck, beside the loop, and hands it to the loop."""
+"""Search for a way out of a stuck posture, beside the loop."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from service.daemon.skill_worker import SkillWorker
 from service.learning.skill_file import SkillError
 from service.settings.config import Settings
 
-AGAIN_S = 2.0  # after which it is looked for once more, as what was in the way may have gone
+AGAIN_S = 2.0  # the search is repeated after this time, because obstacles may have moved
 
 
 class WayFinder:
-    """One search at a time, in the skill worker."""
+    """A search for ways out in the skill worker, one at a time; it sends the result to the loop."""
 
     def __init__(
         self, settings: Settings, worker: SkillWorker, send: Callable[[Event], object], say: Callable[[str], None]
@@ -28,7 +28,7 @@ class WayFinder:
         self._next_s = 0.0
 
     def poll(self, frame: Frame, state: Record) -> None:
-        """Begins a search where the arm is stuck and on no way out. Never waits."""
+        """Begin a search if the arm is stuck without a way out. Never waits."""
         searching = self._search is not None and self._search.is_alive()
         if not state["stuck"] or state["way_count"] or searching or time.monotonic() < self._next_s:
             return
@@ -42,7 +42,7 @@ class WayFinder:
         try:
             found = self._worker.way_out(self._settings, *arguments)
         except SkillError as error:
-            self._say(f"no way out was looked for: {error}")
+            self._say(f"the search for a way out failed: {error}")
             return
         finally:
             self._next_s = time.monotonic() + AGAIN_S

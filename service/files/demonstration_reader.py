@@ -1,4 +1,4 @@
-"""Reads and writes demonstrations; they are brought to frame `base` and to common stamps."""
+"""Reading and writing of demonstrations, with all poses in frame `base` and at common stamps."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
 from service.core.intake.stage import UNIT_M
 from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+from service.files.hands_and_tool import chosen
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.files.mcap_reader import Messages, full_name, next_whole
-from service.files.pose_streams import ENDINGS, GRIPPER_STATE, PLACES, PoseTopic, Recorded, chosen
+from service.files.pose_streams import ENDINGS, GRIPPER_STATE, PLACES_TOPIC, PoseRecording, PoseTopic
 from service.files.track import Track
 from service.files.track_check import LEAST_PIECE_S, Checked, checked, sound
 from service.files.track_clocks import by_one_clock
@@ -30,16 +31,17 @@ from service.learning.demonstration import Demonstration
 from service.settings.config import HandSettings, Settings
 
 _STREAMS = tuple(ENDINGS.values())
-ENOUGH = 0.5  # a take is refused if less than this share of it can be learned from
-HARDLY_SEEN = 0.1  # a hand that is seen for a smaller share of a take is not one of those that conduct
-MOST_NAMED = 10  # stretches of a take
-UNUSUAL = 5.0  # a tool that is reported rarely is out of sight after as many times its usual interval
+MIN_USABLE_SHARE = 0.5  # takes with a smaller usable share are refused
+MIN_SEEN_SHARE = 0.1  # a hand that is seen for a smaller share of the time does not lead the tool
+MAX_NAMED_STRETCHES = 10  # a message names at most this many bad stretches
+UNSEEN_INTERVALS = 5.0  # a tool with a low rate is out of sight after this many of its usual intervals
 
 
 def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
-    """Writes a demonstration in frame `base`.
+    """Write a demonstration in frame `base`.
 
-    The same arrays give the same bytes. Raises ValueError.
+    Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
+    finite.
     """
     stamps_ns, left, right, tool = demonstration[:4]
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
@@ -53,9 +55,9 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         if stream.shape != shape or not np.isfinite(stream).all():
             raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
     with McapFile(Path(path), joints=0, attached=False) as file:
-        told = {"hands": demonstration.conducts, "person": demonstration.person}
-        if told := {name: word for name, word in told.items() if word not in ("both", "")}:
-            file.writer.add_metadata("thirdhand", told)
+        about = {"hands": demonstration.conducts, "person": demonstration.person}
+        if about := {name: word for name, word in about.items() if word not in ("both", "")}:
+            file.writer.add_metadata("thirdhand", about)
         streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
         for i, (stamp, *rows) in enumerate(
             zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for _, stream in streams), strict=True)
@@ -68,7 +70,7 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
                 file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
-            file.put(topic(cell, PLACES), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+            file.put(topic(cell, PLACES_TOPIC), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
 
 
 def read_demonstration(
@@ -81,16 +83,17 @@ def read_demonstration(
     """The demonstration in a recording: hands and tool in frame `base` at the tool's stamps, over
     the time that all three cover.
 
-    Reads MCAP files, ours and others', and bags. Topics are those in `topics` (by left, right,
-    tool). Without these they are found by the ends of their names, in any cell, or where only one
-    fits. Hands are brought to `base` as in the daemon, by `settings` or else those in the file.
-    Hands stamped at other times than the tool are interpolated linearly. Where the stamps are of
-    different clocks, the times of recording are used instead.
+    Reads MCAP files and bags of this and other systems. `topics` has the topics of `left`, `right`
+    and `tool`; those not given are found by the ends of their names, in any cell, or by words in
+    their names. Hands are transformed to `base` as in the daemon, by `settings` or else those in
+    the file, and interpolated linearly at the tool's stamps. If the stamps come from different
+    clocks, the times of recording are used instead.
 
-    Raises RecordingError, also for a damaged file: the missing part may lie within a motion. A file
-    that was cut ends early. `say` is called with that, and with what was found or assumed.
+    Raises RecordingError, also for a damaged file, because the missing part may lie within a
+    motion. A file that was cut ends early. `say` is called with remarks on what was found, assumed
+    or left out.
     """
-    recorded = Recorded(path)
+    recorded = PoseRecording(path)
     if settings is None and recorded.settings is None and recorded.is_ours:
         raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
     settings = settings or recorded.settings or Settings()
@@ -100,18 +103,18 @@ def read_demonstration(
         raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
     found = chosen(recorded, topics or {}, settings)
     for fault in recorded.faults:
-        there = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
-        say(f"{path}: {fault}; {there} are there")
+        read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
+        say(f"{path}: {fault}; {read} were read")
     one_clock = by_one_clock(found.tracks)
     tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
     tracks = [_near(recorded, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
-    remarks = [*found.guessed, *_none_in(tracks), *mapped]
+    remarks = [*found.guessed, *_invalid_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
     if one_clock.remark:
         say(f"{path}: {one_clock.remark}")
     tracks = [_in_order(path, track) for track in tracks]
-    seen = Seen.of(path, tracks, found.conducts, settings)
+    seen = CommonPart.of(path, tracks, found.conducts, settings)
     for line in seen.remarks:
         say(f"{path}: {line}")
     left, right, tool = (_resampled(seen.stamps_ns, track.stamps_ns, track.poses) for track in seen.tracks)
@@ -120,23 +123,16 @@ def read_demonstration(
         say(f"{path}: {line}")
     seen.stamps_ns.setflags(write=False)
     return Demonstration(
-        seen.stamps_ns,
-        left,
-        right,
-        tool,
-        BASE,
-        recorded.places,
-        closure,
-        seen.conducts,
-        recorded.person,
-        seen.begins,
+        seen.stamps_ns, left, right, tool, BASE, recorded.places, closure, seen.conducts, recorded.person, seen.begins
     )
 
 
-class Seen(NamedTuple):
-    """The part that hands and tool have in common: their trusted samples; the stamps of the tool at
-    which all are seen; the indices at which a new part begins behind a stretch that is left out;
-    and the remarks on it.
+class CommonPart(NamedTuple):
+    """The part of a take in which hands and tool are all seen.
+
+    It has the tracks of left hand, right hand and tool with their trusted samples, the hands that
+    lead the tool, the tool's stamps [ns], the indices of the first stamps after stretches that are
+    left out, and remarks.
     """
 
     tracks: list[Track]
@@ -146,28 +142,28 @@ class Seen(NamedTuple):
     remarks: list[str]
 
     @staticmethod
-    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> Seen:
-        """Of the tracks of left hand, right hand and tool.
+    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> CommonPart:
+        """The common part of the tracks of left hand, right hand and tool.
 
-        Raises RecordingError where too little is left.
+        Raises RecordingError if too little is left.
         """
         unseen_s = settings.hands.unseen_ms / 1000
-        tool_s = max(unseen_s, UNUSUAL * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
+        tool_s = max(unseen_s, UNSEEN_INTERVALS * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
         hands = checked(tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s)
         (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
         remarks: list[str] = []
         if conducts == "both":
             shares = [one.seen_share for one in hands]
-            if min(shares) < HARDLY_SEEN <= max(shares):
+            if min(shares) < MIN_SEEN_SHARE <= max(shares):
                 side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
                 hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
-                remarks.append(f"the {side} hand conducts alone: the other is seen for {min(shares):.0%} of the time")
+                remarks.append(f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the time")
         rows = [*hands, tool]
         start_ns, end_ns = max(one.start_ns for one in rows), min(one.end_ns for one in rows)
         if start_ns >= end_ns:
             raise RecordingError(
-                f"{path}: hands and tool have less than two stamps of the tool in common: "
-                "by which clocks were they stamped?"
+                f"{path}: hands and tool have fewer than two stamps of the tool in common: "
+                "were they stamped by different clocks?"
             )
         named = [one for row in rows for one in row.stretches if one.begin_ns < end_ns and one.end_ns > start_ns]
         remarks += [one.remark for one in rows if one.remark]
@@ -175,22 +171,22 @@ class Seen(NamedTuple):
         kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
         origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
         named.sort(key=lambda one: one.begin_ns)
-        bad = "; ".join(one.text(origin_ns) for one in named[:MOST_NAMED])
-        bad += f"; and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
-        if kept_s < ENOUGH * span_s:
+        bad = "; ".join(one.text(origin_ns) for one in named[:MAX_NAMED_STRETCHES])
+        bad += f"; and {len(named) - MAX_NAMED_STRETCHES} more" * (len(named) > MAX_NAMED_STRETCHES)
+        if kept_s < MIN_USABLE_SHARE * span_s:
             raise RecordingError(
-                f"{path}: {kept_s:.1f} of {span_s:.1f} s can be learned from, {ENOUGH:.0%} needed"
-                f"{f': {bad}' if bad else ''}. Record it anew, or cut it by thirdhand record --trim"
+                f"{path}: {kept_s:.1f} of {span_s:.1f} s are usable, {MIN_USABLE_SHARE:.0%} needed"
+                f"{f': {bad}' if bad else ''}. Record it again, or cut it with thirdhand record --trim"
             )
         if bad:
             remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
         both = [hands[0].track, hands[-1].track, tool.track]
-        return Seen(both, conducts, stamps, tuple(begins), remarks)
+        return CommonPart(both, conducts, stamps, tuple(begins), remarks)
 
 
 def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
-    """The tool's stamps at which all are seen, but for pieces that are too short; and the indices
-    of the first ones behind stretches at which they are not.
+    """The tool's stamps [ns] at which all tracks are seen, without pieces that are too short, and
+    the indices of the first stamps after the stretches that are left out.
     """
     start_ns = max((int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows)
     end_ns = min((int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows)
@@ -208,34 +204,39 @@ def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArra
     return np.concatenate(pieces) if pieces else stamps[:0], begins
 
 
-def _near(recorded: Recorded, track: Track, before: Track, hands: HandSettings) -> Track:
-    """The track with NaN for poses that are too far away. Raises RecordingError where all are;
-    `before`: as published.
+def _near(recorded: PoseRecording, track: Track, before: Track, hands: HandSettings) -> Track:
+    """The track with NaN for poses that are too far away; `before` is the track as published.
+
+    Raises RecordingError if all poses are too far away.
     """
     with np.errstate(all="ignore"):
         is_far = np.linalg.norm(track.poses[:, :3], axis=1) > MAX_HAND_DISTANCE_M
     if len(is_far) and is_far.all():
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
         if recorded.is_captured:
-            rule = "the unit that the file names counts, whatever [hands] unit says"
-            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that it names"
-        raise RecordingError(f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far, the first {why}")
+            rule = "the unit in the file is used, and [hands] unit is ignored"
+            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that the file names"
+        raise RecordingError(
+            f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far away; the first is {why}"
+        )
     poses = track.poses.copy()
     poses[is_far] = np.nan
     return track._replace(poses=poses)
 
 
-def _none_in(tracks: Sequence[Track]) -> list[str]:
-    """In words, how many poses of the tracks are NaN; nothing where none is."""
+def _invalid_in(tracks: Sequence[Track]) -> list[str]:
+    """A remark on the number of poses of the tracks that are NaN; empty if none is."""
     none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
     count = sum(len(track.poses) for track in tracks)
     return (
-        [f"{none} of {count} poses are none, or farther than {MAX_HAND_DISTANCE_M:g} m, and left out"] if none else []
+        [f"{none} of {count} poses are invalid or farther than {MAX_HAND_DISTANCE_M:g} m, and are left out"]
+        if none
+        else []
     )
 
 
 def _in_order(path: str | Path, track: Track) -> Track:
-    """The track in the order of its stamps, each of them once. Raises RecordingError."""
+    """The track sorted by its stamps, without repeated stamps. Raises RecordingError."""
     stamps, first = np.unique(track.stamps_ns, return_index=True)
     if len(stamps) < 2:
         raise RecordingError(
@@ -245,8 +246,8 @@ def _in_order(path: str | Path, track: Track) -> Track:
 
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
-    """Whether the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
-    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # as in the daemon
+    """True if the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # the daemon has the same rule
     return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in tracker_frames)
 
 
@@ -257,31 +258,32 @@ def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
 
 
 def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
-    """Words and remedy for a stream's position, as published, that is too far away."""
+    """Message and remedy for a stream's position, as published, that is too far away."""
     if is_by_tracker(name, frame, hands):
         return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
-    rule = f"{name} in frame {BASE!r} is in metres, whatever [hands] unit says"
-    also = ", or name the tracker's frame in it and in [hands] frame: what it names is in [hands] unit"
+    rule = f"{name} in frame {BASE!r} is always in metres, and [hands] unit is ignored"
+    also = ", or with the tracker's frame of [hands] frame, in which positions are in [hands] unit"
     return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
 
 
 def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
-    """Words and remedy for a stream in a frame of which nothing is known; empty for others."""
+    """Message and remedy for a stream in an unknown frame; empty for known frames."""
     if frame in ("", BASE, hands.frame):
         return ""
-    known = "" if hands.frame == BASE else f", or {hands.frame!r} as [hands] frame says,"
+    known = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
     return (
-        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) whose [hands] frame "
-        "names it and says by base_from_tracker where it is"
+        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) with this [hands] frame "
+        "and its pose, [hands] base_from_tracker"
     )
 
 
 def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
-    """Tracks of left hand, right hand and tool in frame `base`, and in words which of them were
+    """Tracks of left hand, right hand and tool in frame `base`, and a remark on which of them were
     transformed.
 
-    As in the daemon the hands are, except those in `base` where the tracker has a frame of its own.
-    The tool is only where it names that frame. Raises RecordingError for other frames.
+    As in the daemon, hands are transformed unless they are in `base` and the tracker has a frame of
+    its own. The tool is transformed only if it names the tracker's frame. Raises RecordingError for
+    other frames.
     """
     for track in tracks:
         if problem := unknown_frame(track.name, track.frame, hands):
@@ -298,7 +300,7 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
                 poses[some, 3:] = (turn * Rotation.from_quat(track.poses[some, 3:])).as_quat()
             out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
-    remark = f"{', '.join(mapped)} brought to frame {BASE} by [hands] unit and base_from_tracker"
+    remark = f"{', '.join(mapped)} transformed to frame {BASE} by [hands] unit and base_from_tracker"
     return out, [remark] if mapped else []
 
 
@@ -321,11 +323,11 @@ def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[
 def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
     """Log time [ns], side and CDR bytes of every hand sample, in order of time.
 
-    Reads demonstrations, recordings and other ROS 2 recordings; a file that was cut up to its cut,
-    in the order of writing. Raises RecordingError.
+    Reads demonstrations, recordings and other ROS 2 recordings. A file that was cut is read up to
+    its cut, in the order of writing. Raises RecordingError.
     """
     path = existing(path)
-    found: dict[str, str] = {}  # topics by stream, one each
+    found: dict[str, str] = {}  # topic by stream
     seen: set[str] = set()
     with path.open("rb") as stream:
         messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()

@@ -1,4 +1,4 @@
-"""What a take tells of the places of its task: those it never reached, and rests at no place."""
+"""Remarks on the via-points of a take: via-points never reached, and rests far from all of them."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from service.learning.demonstration import Demonstration
 from service.learning.division import FAR_M, FOLLOW, off_via_point
 
-REST_M = 0.015  # [m] motion of hands and tool at rest: trackers are noisy, and hands tremble
-DWELL_S = 0.5  # a shorter rest is a pause on the way
-GRID_S = 0.02
+REST_M = 0.015  # noise and tremor move hands and tool by up to this at rest
+DWELL_S = 0.5  # a shorter rest is a pause in a motion
+GRID_S = 0.02  # positions are compared at this interval
 
 
 def remarks_on_places(demonstration: Demonstration) -> list[str]:
-    """In words, which told places the tool never came near, and where all rested far from any."""
+    """Remarks on via-points that the tool never reached, and on rests far from all via-points."""
     points = demonstration.places
     if not points:
         return []
     off = np.array([off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points])
     remarks = [
-        f"place {point.name!r} was never reached: the tool came no nearer to it than {1000 * least:.0f} mm "
-        f"({1000 * FAR_M:.0f} needed)"
+        f"via-point {point.name!r} was never reached: the tool's smallest distance was {1000 * least:.0f} mm, "
+        f"{1000 * FAR_M:.0f} mm needed"
         for point, least in zip(points, off.min(axis=1).tolist(), strict=True)
         if least > FAR_M
     ]
@@ -33,19 +33,21 @@ def remarks_on_places(demonstration: Demonstration) -> list[str]:
         if near.min() > FAR_M:
             remarks.append(
                 f"hands and tool rest from {begin_s:.1f} to {end_s:.1f} s, {1000 * near.min():.0f} mm from the nearest "
-                f"place, {points[int(near.argmin())].name!r}: is this a place that is not named?"
+                f"via-point, {points[int(near.argmin())].name!r}: is a via-point missing here?"
             )
     return remarks
 
 
 def dwells(demonstration: Demonstration) -> Iterator[tuple[float, float]]:
-    """From when to when [s] both hands and the tool rest for DWELL_S at least."""
+    """Begin and end [s] of each rest of both hands and the tool that lasts at least DWELL_S."""
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
     at = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
     grid = np.arange(0.0, float(seconds[-1]), GRID_S)
     path = np.stack([np.interp(grid, seconds, column) for column in at.T], axis=1)
     for begin in demonstration.begins:
-        path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = np.nan  # nothing is known of what is left out
+        path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = (
+            np.nan
+        )  # motion is unknown where a part is left out
     count = round(DWELL_S / GRID_S)
     if len(path) <= count:
         return

@@ -1,4 +1,6 @@
-"""Writes MCAP files: profile `ros2`, small checked chunks, whole records also on a full disk."""
+"""Writing of MCAP files: profile `ros2`, small chunks with checksums, whole records on a full
+disk.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +22,16 @@ from service.core.frame import definitions
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
 _BYTES = "application/octet-stream"
-CHUNK_BYTES = 128 * 1024  # a kill loses at most this between two flushes; a reader holds at most this
+CHUNK_BYTES = 128 * 1024  # between two flushes a kill loses at most this, and a reader holds at most this
 
 
 class RecordingError(ExplainedError, ValueError):
-    """A file is not the recording that is needed; the message says why, and what would be."""
+    """A file is not the required kind of recording; the message has the cause and the remedy."""
 
 
 @functools.cache
 def machine() -> dict[str, str]:
-    """Versions, CPU and BLAS: what the result of a tick may depend on besides its input."""
+    """Versions, CPU and BLAS of this machine, on which the result of a tick may depend."""
     found = {
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -50,9 +52,9 @@ def machine() -> dict[str, str]:
 
 
 class _WholeWrites:
-    """A file that holds whole writes only: one that does not fit is taken back.
+    """A file of whole writes: a write that does not fit is undone.
 
-    Unbuffered: written data is with the system at once, and an error is raised by its own write.
+    It is unbuffered: the system has written data at once, and each write raises its own error.
     """
 
     def __init__(self, path: Path) -> None:
@@ -77,7 +79,7 @@ class _WholeWrites:
         return self._size
 
     def flush(self) -> None:
-        """Does nothing: all data is written already."""
+        """Do nothing: all data is written already."""
 
     def close(self) -> None:
         if not self.closed:
@@ -88,16 +90,16 @@ class _WholeWrites:
 class McapFile:
     """An MCAP file that is being written: profile `ros2`, zstd, small chunks.
 
-    Channels are made at their first message. A chunk ends only at a call of `part_ends`, so the
-    messages of one tick are kept or lost together. Errors of the file system are raised; the file
-    then holds what was written before.
+    A channel is made at its first message. A chunk ends only at a call of `part_ends`, so the
+    messages of one tick are kept or lost together. Raises OSError for errors of the file system;
+    the file then holds everything written before.
     """
 
     def __init__(self, path: Path, *, joints: int, attached: bool = True, compressed: bool = True) -> None:
         """`joints` is the arm's number of joints, on which the schemas depend.
 
-        Without attachments and metadata (`attached` False) the file has no index of them: its
-        summary would list groups that are empty.
+        A file without attachments and metadata (`attached` False) has no index of them, because its
+        summary would list empty groups.
         """
         self.path = path
         self._stream = _WholeWrites(path)
@@ -116,16 +118,16 @@ class McapFile:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing more can be written."""
+        """True once nothing more can be written."""
         return self._stream.closed
 
     @property
     def size(self) -> int:
-        """Bytes written so far."""
+        """Number of written bytes."""
         return self._stream.tell()
 
     def put(self, topic: str, kind: str, data: bytes, time_ns: int, sequence: int, *, qos: str = "") -> None:
-        """Writes one CDR message of the type `kind`."""
+        """Write one CDR message of the type `kind`."""
         channel = self._channels.get(topic)
         if channel is None:
             if kind not in self._schemas:
@@ -138,21 +140,21 @@ class McapFile:
         self._unflushed += len(data)
 
     def attach(self, name: str, data: bytes, time_ns: int) -> None:
-        """Attaches a file; its name's ending says of which media type."""
+        """Attach a file; its media type follows from the suffix of its name."""
         self.writer.add_attachment(time_ns, time_ns, name, _MEDIA.get(Path(name).suffix, _BYTES), data)
 
     def part_ends(self) -> None:
-        """Lets a chunk end here."""
+        """End the chunk here if it is large enough."""
         if self._unflushed >= CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
-        """Ends the chunk in progress: what was written so far survives a kill of the process."""
+        """End the chunk in progress; data written so far survives a kill of the process."""
         self.writer.flush()  # type: ignore[no-untyped-call]
         self._unflushed = 0
 
     def lost_name(self) -> str:
-        """Empty while the file is at its path; else `removed`, or `moved` to another name."""
+        """Empty while the file is at its path, else `removed` or `moved`."""
         own_file = os.fstat(self._stream.descriptor)
         with contextlib.suppress(OSError):
             if os.path.samestat(self.path.stat(), own_file):
@@ -160,7 +162,7 @@ class McapFile:
         return "moved" if own_file.st_nlink else "removed"
 
     def close(self) -> None:
-        """Ends the file; it is closed even if that fails. A second call does nothing."""
+        """End and close the file, also after an error. A second call does nothing."""
         if not self.closed:
             try:
                 self.flush()
@@ -169,7 +171,7 @@ class McapFile:
                 self.abandon()
 
     def abandon(self) -> None:
-        """Closes the file as it is, without what is not flushed, and without a summary."""
+        """Close the file without unflushed data and without a summary."""
         self._stream.close()
 
     def __enter__(self) -> Self:
@@ -181,7 +183,7 @@ class McapFile:
 
 @contextlib.contextmanager
 def whole_file(path: Path, *, joints: int) -> Iterator[McapFile]:
-    """An MCAP file that is at `path` once it is complete, and before that beside it."""
+    """A context with an MCAP file that is moved to `path` once it is complete."""
     part = path.with_name(f".{path.name}.part")
     file = McapFile(part, joints=joints)
     try:
@@ -203,7 +205,7 @@ def existing(path: str | Path) -> Path:
         raise RecordingError(f"{path} is a folder, a recording needed")
     if not path.is_file():
         found = sorted(other.name for other in path.parent.glob("*.mcap"))
-        names = f" There are: {', '.join(found)}." if found else ""
+        names = f" Its folder has: {', '.join(found)}." if found else ""
         raise RecordingError(f"no recording {path}.{names}")
     with path.open("rb") as stream:
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -212,7 +214,7 @@ def existing(path: str | Path) -> Path:
 
 
 def ends_early(path: Path) -> bool:
-    """Whether an MCAP file was cut: its closing bytes are missing."""
+    """True if an MCAP file was cut: its closing bytes are missing."""
     with path.open("rb") as stream:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - len(MCAP0_MAGIC)))

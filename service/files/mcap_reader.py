@@ -1,4 +1,6 @@
-"""Reads MCAP files: verifies every checksum, reads up to a cut, continues behind damage."""
+"""Reading of MCAP files: it verifies every checksum, reads up to a cut, and continues after
+damage.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,10 @@ from mcap.writer import MCAP0_MAGIC
 from service.files.mcap_file import RecordingError
 
 Found = tuple[Schema | None, Channel, Message]
-_HEAD = struct.Struct("<BQ")  # opcode, bytes that follow
+_HEAD = struct.Struct("<BQ")  # opcode, number of the following bytes
 _FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
 _COMPRESSION = re.compile(b"\x04\0\0\0zstd|\x03\0\0\0lz4")
-_BEFORE_COMPRESSION = _HEAD.size + 28  # bytes of a chunk
+_BEFORE_COMPRESSION = _HEAD.size + 28  # [bytes] offset of the name of the compression in a chunk
 _BLOCK = 1 << 20
 _NAMING = {
     int(kind): record
@@ -36,9 +38,9 @@ _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, LookupError
 
 
 class FileFault(NamedTuple):
-    """A part of a file that cannot be read: first byte, size, cause.
+    """A part of a file that cannot be read: first byte, size [bytes], cause.
 
-    `cut`: the end of the file is missing. Else the file continues behind the damage.
+    If `cut`, the end of the file is missing; else the file continues after the damage.
     """
 
     cut: bool
@@ -53,10 +55,10 @@ class FileFault(NamedTuple):
 
 
 class Messages:
-    """The schema, channel and message of every message of an MCAP file in file order.
+    """An iterable over schema, channel and message of every message of an MCAP file in file order.
 
-    `faults`, `attachments` and `metadata` are those met so far. A fault that is new when a message
-    comes lies before that message. Attachments with a wrong checksum are left out.
+    `faults`, `attachments` and `metadata` hold those read so far. A new fault lies before the next
+    message. Attachments with a wrong checksum are left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,7 +80,7 @@ class Messages:
                         yield schemas.get(channel.schema_id), channel, record
                     elif not unnamed:
                         unnamed = True
-                        why = f"messages on channel {record.channel_id}, whose name is not there"
+                        why = f"messages on channel {record.channel_id}, whose name is missing"
                         self.faults.append(FileFault(False, stream.tell(), 0, why))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
@@ -96,7 +98,7 @@ class _Reading:
     def __init__(self, stream: IO[bytes], faults: list[FileFault]) -> None:
         self._stream, self._faults = stream, faults
         self._size = stream.seek(0, 2)
-        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None once it cannot be known
+        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None after damage
         self._chunked = False
         closing = self._size - len(MCAP0_MAGIC)
         self._closed = closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
@@ -105,8 +107,8 @@ class _Reading:
         self._closed = self._closed and self._footer[:9] == _HEAD.pack(Opcode.FOOTER, _FOOTER.size - _HEAD.size)
 
     def named_in_summary(self) -> Iterator[McapRecord]:
-        """The schemas and channels that the file's end repeats, if it has one that is whole: so the
-        chunk that held them first may be damaged.
+        """The schemas and channels in the file's summary, if that is intact: they are needed if the
+        chunk that first held them is damaged.
         """
         at = self._summary() if self._closed else 0
         while 0 < at < self._footer_at:
@@ -124,7 +126,7 @@ class _Reading:
         return int(start) if zlib.crc32(covered) == checksum else 0
 
     def records(self) -> Iterator[McapRecord]:
-        """The records of the data section, those in chunks one by one."""
+        """The records of the data section, with those in chunks one by one."""
         at = len(MCAP0_MAGIC)
         while True:
             end = None
@@ -156,9 +158,9 @@ class _Reading:
             raise ValueError("the file ends before the recording does")
         opcode, length = _HEAD.unpack(self._bytes(at, _HEAD.size))
         if not Opcode.HEADER <= opcode <= Opcode.DATA_END and opcode < 0x80:
-            raise ValueError(f"no record of MCAP has the type {opcode}")
+            raise ValueError(f"MCAP has no record of type {opcode}")
         if at + _HEAD.size + length > self._size:
-            raise ValueError(f"a record of {length} bytes reaches over the end of the file")
+            raise ValueError(f"a record of {length} bytes reaches beyond the end of the file")
         return opcode, at + _HEAD.size + length
 
     def _parsed(self, opcode: int, content: bytes) -> list[McapRecord]:
@@ -168,7 +170,7 @@ class _Reading:
             self._chunked = True
             return breakup_chunk(Chunk.read(stream), validate_crc=True)
         if _COMPRESSION.match(content, 28):
-            raise ValueError(f"a chunk by its content, of type {opcode} by its head")
+            raise ValueError(f"the content is a chunk, the head has type {opcode}")
         if opcode == Opcode.MESSAGE:
             if self._chunked:
                 raise ValueError("a message outside the chunks")
@@ -181,7 +183,7 @@ class _Reading:
         if opcode == Opcode.DATA_END:
             recorded = DataEnd.read(stream).data_section_crc
             if recorded and self._checksum is not None and recorded != self._checksum:
-                why = "the checksum over all data is wrong, outside of what has one of its own"
+                why = "the checksum over all data is wrong, and those of chunks and attachments are right"
                 self._faults.append(FileFault(False, 0, self._stream.tell(), why))
             return []
         if opcode not in _NAMING:
@@ -189,8 +191,8 @@ class _Reading:
         return [_NAMING[opcode].read(stream)]
 
     def _resume_at(self, at: int, end: int | None) -> int | None:
-        """The byte at which reading continues behind a broken record: its end if a record begins
-        there, else the next whole chunk; None where there is none.
+        """The byte at which reading continues after a broken record: its end if a record begins
+        there, else the next whole chunk; None if there is none.
         """
         if end is not None:
             with contextlib.suppress(ValueError):
@@ -214,7 +216,7 @@ class _Reading:
         return opcode == Opcode.CHUNK
 
     def _end(self, at: int) -> None:
-        """Verifies what follows the data section."""
+        """Verify the part after the data section."""
         if self._closed:
             _, _, start, _, checksum = _FOOTER.unpack(self._footer)
             if checksum and start and not self._summary():
@@ -233,15 +235,17 @@ class _Reading:
 
 
 def full_name(schema: Schema | None) -> str:
-    """`geometry_msgs/PoseStamped` as `geometry_msgs/msg/PoseStamped`; empty without a schema."""
+    """The full name of a type, `geometry_msgs/msg/PoseStamped` also for
+    `geometry_msgs/PoseStamped`; empty without a schema.
+    """
     kind = "" if schema is None else schema.name
     return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
 
 
 def next_whole(messages: Iterator[Found], path: Path) -> Found | None:
-    """The next message of an indexed file, None at its end.
+    """The next message of an indexed file; None at its end.
 
-    Raises RecordingError where the file is damaged.
+    Raises RecordingError for a damaged file.
     """
     try:
         return next(messages, None)

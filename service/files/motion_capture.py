@@ -1,6 +1,6 @@
-"""Read files of motion capture: CSV as Motive exports it, and C3D.
+"""Reading of motion capture files: CSV as Motive exports it, and C3D.
 
-Poses are in metres in the axes of the capture system; markers are not turned.
+Poses are in metres in the axes of the capture system; markers have no rotation.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from service.contract.explain import in_words
 from service.core.frame import Vector
 from service.files.mcap_file import RecordingError
 
-FRAME = "motion capture"
+CAPTURE_FRAME = "motion capture"
 UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "m": 1.0, "cm": 0.01, "mm": 0.001}
-POSED = ("Rigid Body", "Bone", "Marker")  # of the types of columns; markers of a body are part of it
-COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(("Rotation", axis) for axis in "XYZW")
-UNTURNED = (0.0, 0.0, 0.0, 1.0)
-BIG_ENDIAN = 86  # the processor that a C3D file names
-LATEST_S = 1e9  # a frame may be this long after the start of its take: 30 years
+POSED_TYPES = ("Rigid Body", "Bone", "Marker")  # columns of these types are read; markers of a body are ignored
+POSE_COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(("Rotation", axis) for axis in "XYZW")
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+BIG_ENDIAN = 86  # number of the processor type in a C3D file with this byte order
+MAX_FRAME_TIME_S = 1e9  # 30 years: a later frame is a mistake in the file
 
 Captured = dict[str, tuple[list[int], Vector]]
-"""Stamps (N,) [ns] and poses (N, 7) [m] by the name of a body or marker; NaN: it is not seen."""
+"""Stamps (N,) [ns] and poses (N, 7) [m] by the name of a body or marker; NaN if it is not seen."""
 
 
 def read_motive(path: Path) -> Captured:
@@ -52,7 +52,7 @@ def read_motive(path: Path) -> Captured:
     types, names = labelled.get("Type", rows[1]), labelled.get("Name", rows[2])
     columns: dict[str, dict[tuple[str, str], int]] = {}
     for i, head in enumerate(zip(types, names, rows[axes_at - 1], rows[axes_at], strict=False)):
-        if head[0] in POSED and head[2:] in COLUMNS:
+        if head[0] in POSED_TYPES and head[2:] in POSE_COLUMNS:
             columns.setdefault(head[1], {})[head[2:]] = i
     table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
     for values, row in zip(table, rows[axes_at + 1 :], strict=True):
@@ -62,9 +62,9 @@ def read_motive(path: Path) -> Captured:
             raise RecordingError(f"{path}: frame {row[0]}: {error}; numbers and empty cells needed") from None
     stamps, out = _stamps(path, table[:, 1]), Captured()
     for name, found in columns.items():
-        if all(one in found for one in COLUMNS[:3]):
-            poses = np.tile([np.nan] * 3 + list(UNTURNED), (len(table), 1))
-            for k, one in enumerate(COLUMNS):
+        if all(one in found for one in POSE_COLUMNS[:3]):
+            poses = np.tile([np.nan] * 3 + list(NO_ROTATION), (len(table), 1))
+            for k, one in enumerate(POSE_COLUMNS):
                 if one in found:
                     poses[:, k] = table[:, found[one]] * (UNITS_M[unit] if k < 3 else 1.0)
             out[name] = stamps, poses
@@ -73,29 +73,32 @@ def read_motive(path: Path) -> Captured:
 
 def read_c3d(path: Path) -> Captured:
     """The markers of a C3D file. Raises RecordingError."""
-    import ezc3d  # heavy, and few recordings need it
+    import ezc3d  # its import is slow, and few recordings need it
 
     try:
         found = ezc3d.c3d(str(path))
         about = found["parameters"]["POINT"]
         labels, units = about["LABELS"]["value"], about["UNITS"]["value"]
         rate_hz, points = float(about["RATE"]["value"][0]), np.asarray(found["data"]["points"], np.float64)
-    except Exception as error:  # the library raises exceptions of many kinds
+    except Exception as error:  # the library raises many kinds of exceptions
         raise RecordingError(f"{path} is not a C3D file that can be read: {in_words(error, named=False)}") from None
     unit = str(units[0]).strip().lower() if units else ""
     if unit not in UNITS_M or not rate_hz > 0:
         raise RecordingError(f"{path}: unit {unit!r}, {rate_hz:g} Hz; m, cm or mm needed, and a rate above 0")
     raw = path.read_bytes()
     order = ">u2" if raw[512 * (raw[0] - 1) + 3] == BIG_ENDIAN else "<u2"
-    head = np.frombuffer(raw[:10], order)  # words 4 and 5 of a file number its first and last frame
+    head = np.frombuffer(raw[:10], order)  # words 4 and 5 are the numbers of the first and last frame
     announced = int(head[4]) - int(head[3]) + 1
     if announced > points.shape[2]:
-        raise RecordingError(f"{path}: cut: {points.shape[2]} of {announced} frames are there; copy or export it again")
+        raise RecordingError(
+            f"{path} was cut: it holds {points.shape[2]} of {announced} frames; copy or export it again"
+        )
     stamps = _stamps(path, np.arange(points.shape[2]) / rate_hz)
-    turned = np.tile(UNTURNED, (points.shape[2], 1))
+    turned = np.tile(NO_ROTATION, (points.shape[2], 1))
     names = [str(label).strip() for label in labels[: points.shape[1]]]
     return {
-        # of two that have one name, none is it
+        # Names that occur several times are numbered, so that none of them is found by its bare
+        # name.
         f"{name} {names[:i].count(name) + 1}" if names.count(name) > 1 else name: (
             stamps,
             np.hstack([UNITS_M[unit] * points[:3, i].T, turned]),
@@ -108,10 +111,10 @@ def _stamps(path: Path, seconds: Vector) -> list[int]:
     """Stamps [ns] of the times (N,) [s] of a take's frames. Raises RecordingError."""
     if not len(seconds):
         raise RecordingError(f"{path} holds no frame, 2 needed: export the take again, over all its frames")
-    for i in np.flatnonzero(~(np.abs(seconds) <= LATEST_S))[:1]:
+    for i in np.flatnonzero(~(np.abs(seconds) <= MAX_FRAME_TIME_S))[:1]:
         raise RecordingError(
-            f"{path}: frame {i + 1} of {len(seconds)} is at {seconds[i]:g} s, up to {LATEST_S:g} s needed: export the "
-            "take again"
+            f"{path}: frame {i + 1} of {len(seconds)} is at {seconds[i]:g} s, up to {MAX_FRAME_TIME_S:g} s needed: "
+            "export the take again"
         )
     for i in np.flatnonzero(np.diff(seconds) < 0)[:1]:
         raise RecordingError(

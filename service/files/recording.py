@@ -1,9 +1,9 @@
-"""Recordings as MCAP files: a Recorder writes what each tick consumed and decided, a Recording
-reads it.
+"""Recordings as MCAP files: a Recorder writes the input and the decision of each tick, a Recording
+reads them.
 
-All channels are ROS 2 messages in CDR, so that ROS 2 tools, Rerun and Foxglove read a recording as
-it is. Settings, skill and URDF are attachments; then follow, tick by tick, `tick`, its events,
-`frame`, `timing` and `state`. What is stored only for other tools is ignored on reading.
+All channels are ROS 2 messages in CDR, so ROS 2 tools, Rerun and Foxglove can read a recording.
+Settings, skill and URDF are attachments. Each tick has the messages `tick`, its events, `frame`,
+`timing` and sometimes `state`. Messages that only other tools need are ignored on reading.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from service.files.steps import REPLAYED, Gap, Step, steps
 from service.files.urdf_markers import with_markers
 from service.settings.config import Settings, robot_description
 
-OBJECTS = "objects"
-CHECKSUMS = "checksums.u32"  # for each tick number since 0, little endian
-FORMAT = "2"  # of State and Frame too: another format cannot be replayed
-_LATCHED = (
+OBJECTS_NOTE = "objects"
+CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
+FORMAT = "2"  # a recording with another layout of State or Frame cannot be replayed
+_LATCHED_QOS = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
     "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
 )
@@ -44,8 +44,8 @@ _LATCHED = (
 class Recorder(McapFile):
     """A recording that is being written; `flush` bounds what a kill can lose.
 
-    With `checksums` (4 bytes each tick number) frames may be left out. Such a file is not
-    compressed, so that a history that packs it stores only what differs from the one before.
+    With `checksums` (4 bytes for each tick number) frames may be left out. Such a file is not
+    compressed, so that a version control system can store the differences of its versions.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Recorder(McapFile):
         checksums: bytes = b"",
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
-        self._settings, self.skill, self._state = settings, skill, state  # the skill in force, a file
+        self._settings, self.skill, self._state = settings, skill, state  # `skill` is the file of the skill in force
         self._begun, self._sequence = False, 0
         self._frames = Frames(settings, self._urdf)
         self._topics = {
@@ -69,7 +69,7 @@ class Recorder(McapFile):
         }
         super().__init__(Path(path), joints=len(settings.joints.names), compressed=not checksums)
         about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
-        self.kept = self.pending = 0  # ticks in the file, ticks that wait for the end of their chunk
+        self.kept = self.pending = 0  # number of ticks in the file, and in the unfinished chunk
         try:
             self.writer.add_metadata("thirdhand", about)
             self.attach("settings.json", msgspec.json.encode(settings), time_ns)
@@ -82,14 +82,16 @@ class Recorder(McapFile):
             raise
 
     def _begin(self, time_ns: int) -> None:
-        """Writes the robot's description and the initial state, timed as the first message."""
+        """Write the robot's description and the initial state, with the time of the first
+        message.
+        """
         self._begun = True
-        self._put("/robot_description", cdr.encode_string(with_markers(self._urdf)), time_ns, qos=_LATCHED)
+        self._put("/robot_description", cdr.encode_string(with_markers(self._urdf)), time_ns, qos=_LATCHED_QOS)
         if self._state is not None:
             self._put("state", encode(self._state), time_ns)
 
     def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
-        """Writes one message on a channel, in the type in which its events are kept."""
+        """Write one message on a channel, in the type in which its events are recorded."""
         self.put(self._topics[key], channels.BY_KEY[key].kept_as.type, data, time_ns, self._sequence, qos=qos)
 
     def write(
@@ -104,10 +106,10 @@ class Recorder(McapFile):
         lost: int = 0,
         outputs: Outputs = (),
     ) -> None:
-        """Writes a tick, its frame, and what it published by key.
+        """Write a tick, its frame, and its published messages by key.
 
-        After `lost` ticks that could not be recorded, `state` (after this tick) and `skill` (in
-        force) let a replay continue. The skill is written only if it differs from the last one.
+        After `lost` ticks that could not be recorded, a replay continues from `state` (after this
+        tick) and `skill` (in force). The skill is written only if it differs from the last one.
         """
         if not self._begun:
             self._begin(time_ns)
@@ -138,14 +140,14 @@ class Recorder(McapFile):
         self.part_ends()
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Writes a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects given
-        as JSON under `objects`; replay ignores it.
+        """Write a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects in JSON
+        under `objects`. A replay ignores it.
         """
         if key in REPLAYED:
-            raise ValueError(f"a note under {key!r}: that topic holds what a replay needs")
+            raise ValueError(f"a note under {key!r}: this topic is reserved for the data of a replay")
         if not self._begun:
             self._begin(time_ns)
-        if key == OBJECTS:
+        if key == OBJECTS_NOTE:
             objects = msgspec.json.decode(text, type=tuple[SceneObject, ...])
             return self._put(key, channels.BY_KEY[key].codec.encode(time_ns, objects), time_ns)
         topic = channels.topic(self._settings.cell, key)
@@ -163,7 +165,7 @@ class Recorder(McapFile):
 
 
 def _take_hint(path: Path) -> str:
-    """For the error on a file that is a take: that it is one, and the command that shows it."""
+    """The end of an error message for a file that is a take: the command that shows it."""
     topics: list[str] = []
     with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
         contents = make_reader(stream).get_summary()
@@ -175,14 +177,14 @@ def _take_hint(path: Path) -> str:
 
 
 class Recording:
-    """A recording on disk: its settings, its skill, and its steps, which are read one by one."""
+    """A recording on disk: its settings, its skill, and its steps."""
 
     def __init__(self, path: Path, settings: Settings, attached: Mapping[str, bytes], metadata: dict[str, str]) -> None:
         self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, ends_early(path)
         self.skill, self.urdf = attached["skill.npz"], attached.get("arm.urdf", b"").decode(errors="replace")
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
-        self.faults: list[FileFault] = []  # known once all steps are read
+        self.faults: list[FileFault] = []  # complete once all steps are read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -197,7 +199,7 @@ class Recording:
                 raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
             if messages.faults:
                 raise RecordingError(
-                    f"{path} lacks settings, skill or arm, which a replay starts from: "
+                    f"{path} lacks settings, skill or arm, which a replay needs: "
                     + "; ".join(map(str, messages.faults))
                 )
             raise RecordingError(
@@ -206,16 +208,16 @@ class Recording:
             )
         if about.get("format") != FORMAT:
             raise RecordingError(
-                f"{path} has format {about.get('format')}, {FORMAT} is understood: was it made by another version?"
+                f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by another version?"
             )
         try:
             settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
         except (msgspec.DecodeError, InvalidError) as error:
-            raise RecordingError(f"the settings in {path} are not understood: {in_words(error, named=False)}") from None
+            raise RecordingError(f"the settings in {path} are not valid: {in_words(error, named=False)}") from None
         return cls(path, settings, parts, about)
 
     def ticks(self) -> int | None:
-        """The number of ticks by the file's summary; None where the summary is missing."""
+        """The number of ticks in the file's summary; None if the summary is missing."""
         topic = channels.key(self.settings.cell, "tick")
         with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
             contents = make_reader(stream).get_summary()
@@ -227,14 +229,14 @@ class Recording:
     def steps(self, *, outputs: bool = True, whole: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.
 
-        Without `outputs` only the inputs: so recordings of versions with other frames and states
-        can be read. Raises RecordingError on what cannot be decoded, and where not all frames are
-        there as a `whole`.
+        Without `outputs` only the inputs are read, also from versions with other frames and states.
+        Raises RecordingError for messages that cannot be decoded, and if `whole` frames are
+        required and the recording has checksums instead.
         """
         if outputs and whole and self.checksums:
             raise RecordingError(
-                f"{self.path} keeps checksums of its frames: thirdhand replay {shlex.quote(str(self.path))} "
-                "--output whole.mcap writes a recording with all of them"
+                f"{self.path} has checksums instead of frames: thirdhand replay {shlex.quote(str(self.path))} "
+                "--output whole.mcap writes a recording with all frames"
             )
         messages = Messages(self.path)
         yield from steps(messages, self.settings, outputs=outputs, whole=not self.checksums)
@@ -242,17 +244,17 @@ class Recording:
         self.truncated = any(fault.cut for fault in messages.faults)
 
     def unreported(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
-        """The faults that no gap names, as text, once all steps are read up to tick `last`."""
+        """Messages on the faults that no gap names, once all steps are read up to tick `last`."""
         reported = "".join(gap.why for gap in gaps)
         read = "no tick was read" if last is None else f"the last tick read is {last}"
         return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported]
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
-        """Key, text and time [ns] of the notes under the keys, in order; objects as JSON."""
+        """Key, text and time [ns] of the notes under these keys, in order; objects as JSON."""
         topics = channels.keys_by_topic(self.settings.cell, keys)
         for _, channel, message in Messages(self.path):
             key = topics.get(channel.topic)
-            if key == OBJECTS:
+            if key == OBJECTS_NOTE:
                 objects = channels.BY_KEY[key].codec.decode(message.data)
                 yield key, msgspec.json.encode(objects).decode(), message.log_time
             elif key is not None:

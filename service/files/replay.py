@@ -1,5 +1,5 @@
-"""Replay: the core run on one recording or on several that follow each other, compared frame by
-frame with what it decided then.
+"""Replay: run the core on one recording, or on several that follow each other, and compare each
+frame with the recorded one.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from service.files.recording import Recorder, Recording
 from service.files.steps import Gap, Step, checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 
-TOLERANCE = 1e-5  # [m, rad] between machines, where the last bits differ
-POSITIONS = ("hands", "target", "setpoint", "tool", "joints")
+REPLAY_TOLERANCE = 1e-5  # [m, rad] other machines may differ by this, because their last bits differ
+POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
 
 
 @dataclass
-class Pause(Gap):
-    """A gap, and the tick from whose state the replay continued."""
+class ReplayGap(Gap):
+    """A gap of a recording, and the tick from whose state the replay continued."""
 
     resumed: int | None = None
 
     def __str__(self) -> str:
-        continued = "nothing behind it is compared" if self.resumed is None else f"goes on after tick {self.resumed}"
-        return f"{super().__str__()}; {continued}"
+        if self.resumed is None:
+            return f"{super().__str__()}; nothing after it is compared"
+        return f"{super().__str__()}; the replay continues after tick {self.resumed}"
 
 
 @dataclass
 class Replay:
-    """The result of a replay: how many frames were compared and are identical, where and by how
-    much others differ, and what is missing.
+    """The result of a replay: numbers of compared and of identical frames, the first and the
+    largest differences, and the missing ticks.
     """
 
     ticks: int = 0
     identical: int = 0
-    missing: list[Pause] = field(default_factory=list)
+    missing: list[ReplayGap] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     truncated: bool = False
     joined: int = 0
@@ -55,14 +56,14 @@ class Replay:
 
     @property
     def exact(self) -> bool:
-        """Whether nothing is missing and every frame is identical, bit for bit."""
+        """True if nothing is missing and every frame is identical, bit for bit."""
         complete = not (self.missing or self.faults or self.truncated)
         return self.ticks > 0 and self.identical == self.ticks and complete
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether no recorded position differs by more than 10 µm or 10 µrad."""
-        return self.ticks > 0 and all(self.largest.get(name, 0.0) <= TOLERANCE for name in POSITIONS)
+        """True if all recorded positions are within 10 µm and 10 µrad."""
+        return self.ticks > 0 and all(self.largest.get(name, 0.0) <= REPLAY_TOLERANCE for name in POSITION_FIELDS)
 
     def text(self) -> str:
         """The result for people to read."""
@@ -71,11 +72,11 @@ class Replay:
             lines.append(f"{self.joined + 1} recordings join without a gap")
         lines += [*map(str, self.missing), *self.faults]
         if not self.ticks:
-            lines.append("nothing to compare: the recording holds no state to start from")
+            lines.append("nothing was compared: the recording has no state to start from")
         if self.first_difference:
             lines.append(self.first_difference)
             largest = ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
-            lines.append(f"largest differences: {largest or 'none in a frame that is kept as a whole'}")
+            lines.append(f"largest differences: {largest or 'none in the frames that are recorded completely'}")
             if self.recorded_on != self.here:
                 lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
         return "\n".join(lines)
@@ -88,17 +89,17 @@ def replay(
     progress: Callable[[int], None] | None = None,
     output: Path | None = None,
 ) -> Replay:
-    """Runs the core on a recording, and on those that follow it, and compares every frame.
+    """Run the core on a recording, and on those that follow it, and compare every frame.
 
-    What is decided now is written to `output`, which is for one recording without gaps.
+    The new frames of a single recording without gaps can be written to `output`.
 
-    It starts from the first state or, with `after`, from the first one at or after that tick, and
-    again from the state behind each gap. Two recordings join without a gap where the second begins
-    with the state in which the first ends. Raises RecordingError.
+    The replay starts from the first state or, with `after`, from the first state at or after that
+    tick, and again from the state after each gap. Two recordings join without a gap if the second
+    begins with the last state of the first. Raises RecordingError.
     """
     recordings = [Recording.open(path) for path in (first, *more)]
     if output is not None and (more or output.resolve() == Path(first).resolve()):
-        raise RecordingError(f"{output} is to hold what one other recording becomes: not several, nor itself")
+        raise RecordingError(f"--output {output}: a file other than the recording, and a single recording, needed")
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
     before: Step | None = None
     with threadpool_limits(1):
@@ -110,25 +111,25 @@ def replay(
 
 
 class _Skills:
-    """The skills of a recording by digest, as far as it has been read."""
+    """The skills by digest in the part of a recording that was read."""
 
     def __init__(self, recording: Recording) -> None:
         self._found: dict[bytes, StoredSkill] = {}
         self.decoded(recording.skill)
 
     def decoded(self, data: bytes) -> StoredSkill:
-        """The skill in the bytes of its file; the same object each time. Raises SkillError."""
+        """The skill in the bytes of its file, always the same object. Raises SkillError."""
         skill = decoded(data, origin="the recording", recorded=True)
         return self._found.setdefault(skill.digest, skill)
 
     def events(self, step: Step) -> tuple[Event, ...]:
-        """The events of a step, as the core takes them. Raises RecordingError."""
+        """The events of a step as input of the core. Raises RecordingError."""
         if step.skill:
             self.decoded(step.skill)
         return tuple(self._event(kind, payload) for kind, payload in step.events)
 
     def in_force(self, start: Step) -> StoredSkill | None:
-        """The skill in force after a step with a state; None where it has not been read."""
+        """The skill in force after a step with a state; None if it was not read."""
         assert start.state is not None
         return self._found.get(start.state["skill"].tobytes())
 
@@ -139,18 +140,18 @@ class _Skills:
                 return Event(kind, payload, self.decoded(payload))
             return Event(kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None)
         except (WireError, SkillError) as error:
-            raise RecordingError(f"an event of kind {kind!r} is not understood: {error}") from None
+            raise RecordingError(f"an event of kind {kind!r} is not readable: {error}") from None
 
 
 @dataclass
 class _Comparison:
-    """Compares a recording from gap to gap; each part is run by a controller of its own."""
+    """The comparison of a recording, in which each part between gaps has its own controller."""
 
     recording: Recording
     result: Replay
     after: int | None
-    last: Step | None  # that was read
-    follows: bool  # another recording
+    last: Step | None  # the last step that was read
+    follows: bool  # True if another recording precedes this one
     progress: Callable[[int], None] | None
     output: Path | None
     recorder: Recorder | None = None
@@ -160,7 +161,7 @@ class _Comparison:
         self._skills, self._steps = _Skills(self.recording), self.recording.steps(whole=False)
 
     def _anew(self, skill: StoredSkill, start: Step) -> contextlib.AbstractContextManager[Recorder | None]:
-        """What takes down what is decided now, if that is asked for."""
+        """A context with the recorder of the new frames; None if they are not recorded."""
         if self.output is None:
             return contextlib.nullcontext()
         if self.result.missing:
@@ -169,7 +170,7 @@ class _Comparison:
         return Recorder(self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf)
 
     def compared(self) -> Step | None:
-        """The last step, once all are compared."""
+        """Compare all steps and return the last one."""
         start = next(self._steps, None)
         if start is not None and not self._begins(start):
             start = self._next_start(start)
@@ -184,7 +185,7 @@ class _Comparison:
         return self.last
 
     def _begins(self, start: Step) -> bool:
-        """Whether the first step has a state to start from; notes what is missing before it."""
+        """True if the replay can start from the first step; notes the ticks missing before it."""
         before, result = self.last, self.result
         self._skills.events(start)
         joins = (
@@ -196,27 +197,27 @@ class _Comparison:
         if joins:
             result.joined += 1
         elif self.follows or start.lost or start.damage:
-            why = "" if start.lost else start.damage or f"{self.recording.path.name} begins anew"
+            why = "" if start.lost else start.damage or f"{self.recording.path.name} does not continue the one before"
             self._note(start, why)
         return start.state is not None and self.after is None and self._resumes(start)
 
     def _note(self, step: Step, why: str) -> None:
         before = None if self.last is None else self.last.tick
-        self.result.missing.append(Pause(before, step.tick, step.lost, why))
+        self.result.missing.append(ReplayGap(before, step.tick, step.lost, why))
 
     def _resumes(self, step: Step) -> bool:
-        """Whether a controller can continue from the state of a step."""
+        """True if a controller can continue from the state of a step."""
         skill = self._skills.in_force(step)
         for gap in reversed(self.result.missing):
             if gap.resumed is not None:
                 break
             if skill is None and "skill" not in gap.why:
-                gap.why += "; the skill then in force is not there"
+                gap.why += "; the skill then in force is not recorded"
             gap.resumed = None if skill is None else step.tick
         return skill is not None
 
     def _next_start(self, step: Step | None) -> Step | None:
-        """The next step, `step` or later, from whose state a controller can continue."""
+        """The first step, from `step` on, from whose state a controller can continue."""
         while step is not None:
             self._skills.events(step)
             self.last = step
@@ -245,7 +246,7 @@ class _Comparison:
             yield Tick(step.tick, events)
 
     def compare(self, tick: Tick, frame: Frame) -> None:
-        """Compares the newest tick's frame, and the state after it, with what was recorded."""
+        """Compare the newest tick's frame, and the state after it, with the recorded ones."""
         step, result, checksums = self.last, self.result, self.recording.checksums
         assert step is not None
         different = {} if step.frame is None else differences(step.frame, frame)
@@ -268,7 +269,7 @@ class _Comparison:
 
 
 def ticks(recording: Recording) -> Iterator[Tick]:
-    """The ticks of a recording, as the core takes them."""
+    """The ticks of a recording as input of the core."""
     skills = _Skills(recording)
     for step in recording.steps(outputs=False):
         yield Tick(step.tick, skills.events(step))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from service.learning.skill_file import StoredSkill
 
 SHIPPED_SKILL = "soldering.npz"
-ARMS = ("wam", "franka", "ur5")  # that cells are shipped with
+ARMS = ("wam", "franka", "ur5")  # arms of the shipped cells
 
 
 def recordings() -> Path:
@@ -25,20 +25,20 @@ def recordings() -> Path:
 
 
 def skills_folder(settings: Settings) -> Path:
-    """The folder of a cell's skills and of the demonstrations that they were learned from."""
+    """The folder of a cell's skills and demonstrations."""
     return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
 
 
 def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
-    from service.learning.skill_file import decoded  # heavy, and most commands do without
+    from service.learning.skill_file import decoded  # its import is slow, and most commands do not need it
 
     path = recordings() / SHIPPED_SKILL
     return decoded(path.read_bytes(), origin=str(path))
 
 
 def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
-    """The settings of a shipped cell, by its arm, or those in a file; with `rate_hz`, at that rate.
+    """The settings of the shipped cell of an arm, or those in a file, with the given rate.
 
     Raises SettingsError.
     """

@@ -1,5 +1,5 @@
-"""The steps of a recording, assembled from its messages: what each tick consumed, what it decided,
-and where ticks are missing.
+"""The steps of a recording, assembled from its messages: the input and the decision of each tick,
+and the gaps.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
 class Step(NamedTuple):
-    """One recorded tick: what it consumed, what it decided, and the state after it if recorded.
+    """One recorded tick: its events, its frame, and the state after it if recorded.
 
-    A step without `frame` holds only a state: before the first tick, or the first behind damage;
-    or of its frame a checksum is kept.
-    Where ticks were `lost` before this one, replay continues from its `state` with the skill in
-    force, which is recorded again where it may have changed. `damage` says why what was recorded
-    before this step cannot be read; empty: it can.
+    A step without `frame` holds only a state, before the first tick or after damage; or the
+    recording has a checksum of the frame. If ticks were `lost` before this one, a replay continues
+    from its `state` with the skill in force, which is recorded again if it may have changed.
+    `damage` is the reason why messages before this step cannot be read; empty if all were read.
     """
 
     tick: int
@@ -43,8 +42,8 @@ class Step(NamedTuple):
 
 @dataclass
 class Gap:
-    """Missing ticks: the ticks around them (None: the beginning, the end), how many were counted as
-    lost, and why.
+    """Missing ticks: the ticks before and after them (None: the begin or end of the recording), the
+    number counted as lost, and the reason.
     """
 
     after: int | None
@@ -61,7 +60,7 @@ class Gap:
 
 
 def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
-    """A number (32 bits) for what a tick decided and published, and for the state after it if
+    """A checksum (32 bits) of a tick's frame and published messages, and of the state after it if
     given.
     """
     parts = (encode(frame), *(payload for _, payload in outputs), b"" if state is None else encode(state))
@@ -69,9 +68,10 @@ def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
 
 
 def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
-    """Every complete tick, in order, after the initial state if there is one; without `outputs`
-    only its inputs; with a frame each where all are there as a `whole`. Raises RecordingError on
-    what cannot be decoded.
+    """Every complete tick in order, after the initial state if there is one.
+
+    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. Raises
+    RecordingError for messages that cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
@@ -80,7 +80,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
     seen, damage = 0, ""
 
     def finished() -> Iterator[Step]:
-        """The step in progress, unless its rest is damaged or cut."""
+        """The step in progress, unless a part of it is damaged or cut."""
         if step is None:
             return
         numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]

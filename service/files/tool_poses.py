@@ -1,4 +1,4 @@
-"""Tool poses by forward kinematics, for demonstrations in which nobody tracks the tool."""
+"""Tool poses by forward kinematics, for demonstrations without a tracked tool."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from service.core.arm.stage import Arm
 from service.core.frame import Vector
 from service.settings.config import Settings
 
-MOST_HZ = 100  # of poses; arms publish their joints more often than a demonstration needs
+MOST_HZ = 100  # arms publish their joints more often than a demonstration needs poses
 
 
 def tool_poses(
     settings: Settings, urdf: str, stamps_ns: NDArray[np.int64], joints: Vector
 ) -> tuple[Vector, NDArray[np.int64]]:
-    """The tool's poses (M, 7), x y z [m] and quaternion x y z w in frame `base`, for joints (N, J)
-    [rad] stamped `stamps_ns` (N,); and the indices (M,) of these, at most MOST_HZ a second.
+    """Poses of the tool (M, 7), x y z [m] and quaternion x y z w in frame `base`, for joints (N, J)
+    [rad] at `stamps_ns` (N,), and the indices (M,) of the used joints, at most MOST_HZ a second.
     """
     lasts_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
     step = max(1, int(len(stamps_ns) / lasts_s / MOST_HZ + 0.01)) if lasts_s else 1

@@ -1,4 +1,4 @@
-"""A track: the poses of one hand, or of the tool, as recorded."""
+"""Tracks, which are the recorded poses of one hand or of the tool."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from service.core.frame import Vector
 from service.core.intake.tuning import MAX_LATE_S
 
-WINDOW = 3  # stamps that are compared with as many before them
+WINDOW = 3  # a restart of a clock is found by comparing three stamps with the three before
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.intp]
@@ -29,14 +29,15 @@ class Track(NamedTuple):
     frame: str
 
     def at(self, rows: Rows | NDArray[np.bool_]) -> Track:
-        """The track with these of its poses only."""
+        """The track with only these of its poses, by index or mask."""
         return self._replace(stamps_ns=self.stamps_ns[rows], logged_ns=self.logged_ns[rows], poses=self.poses[rows])
 
 
 def clock_parts(stamps: Stamps) -> list[Rows]:
-    """The indices of stamps (N,) [ns], in the order of recording, divided where their clock begins
-    anew: where three of them are older than the three before by more than any delay. A single stamp
-    that is wrong divides nothing.
+    """The indices of stamps (N,) [ns], in the order of recording, split where their clock restarts.
+
+    A clock restarts where three stamps are older than the three before by more than the largest
+    delay. A single wrong stamp does not split them.
     """
     if len(stamps) < 2 * WINDOW:
         return [np.arange(len(stamps))]

@@ -1,24 +1,23 @@
-"""Find the stretches of recorded tracks that the daemon would reject or hold for.
+"""Detection of the stretches of recorded tracks that the daemon would reject or hold for.
 
-The daemon's own intake takes the samples of a take, each in the tick of its stamp. In addition to
-what the intake rejects at that moment, a take shows what follows: a track that has jumped away and
-comes back is wrong in between, however long it stayed there.
+The daemon's own intake processes the samples of a take, each in the tick of its stamp. A take also
+shows the samples after that tick: a track that jumps away and returns is wrong in between, whatever
+the duration.
 
-1. The samples of a track are divided into runs: where the intake begins or ceases to reject them,
-   or believed a jump in the end, and the step is one that it rejects.
-2. A run can follow one before the last if a hand can move from the last sample of that to its own
-   first sample in the time between.
-3. The sequence of runs that can follow each other and holds the most samples is kept.
-4. What of it is displaced by a few centimetres for a while is found by `track_offsets`.
+1. The samples of a track are divided into runs, at steps that no hand can make and at which the
+   intake begins or ends to reject samples or restarts its filter.
+2. Run B can follow run A if a hand can move from A's last to B's first sample in the time between.
+3. The sequence of runs that can follow each other and has the most samples is retained.
+4. `track_offsets` finds the parts of it that are displaced by a few centimetres.
 
-A pose that is repeated bit by bit, and from which the track then leaps, is that of a tracker that
-has lost the hand.
+A pose that is repeated bit by bit before a leap shows that the tracker had lost the hand.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import NamedTuple
 
 import msgspec
@@ -35,51 +34,53 @@ from service.files.track import Track
 from service.files.track_offsets import STEP_M, displaced
 from service.settings.config import HandSettings, Settings
 
-# Range, effect and measured sensitivity as in `track_offsets`.
-# [m/s²], 70 to 200: more misses jumps that last to the end of a take, less removes fast motion
+# `track_offsets` explains ranges and measured sensitivities.
+# [m/s²] A step with more acceleration is a leap. Range 70 to 200: larger values miss jumps that
+# last
+# to the end of a take, smaller ones remove fast motion.
 MAX_HAND_MPS2 = 100.0  # missed 0.5, 0.3, 1.2 %; removed 0.03, 0.31, 0.03 %
-# [s], 0.1 to 0.5: pieces between two stretches that are shorter are left out with them
+# [s] A shorter piece between two bad stretches is left out with them. Range 0.1 to 0.5.
 LEAST_PIECE_S = 0.3  # good time left out beside bad stretches 1.4, 1.4, 1.9 %
 
 Mask = NDArray[np.bool_]
 
-MOVED_AWAY, SWAPPED, LOST, CONTESTED, UNSEEN = (
-    "no motion that a hand could make",
-    "where the other hand was",
-    "one pose repeated, bit by bit, by a tracker that has lost the hand",
-    "reported by two sources",
-    "not seen",
-)
-CAUSES = {
-    Cause.REPEATED: "stamps that were there before",
-    Cause.OLDER: "stamps older than those before",
-    Cause.AHEAD: "stamps ahead of their time",
-    Cause.JUMPED: MOVED_AWAY,
-    Cause.SWAPPED: SWAPPED,
-}
+
+class Distrust(StrEnum):
+    """The reasons why a sample of a take is not trusted, in words; empty for trusted samples."""
+
+    NONE = ""
+    JUMPED = "a motion that no hand can make"
+    SWAPPED = "at the position of the other hand"
+    LOST = "one pose repeated bit by bit, by a tracker that has lost the hand"
+    CONTESTED = "reported by two sources"
+    UNSEEN = "not seen"
+    REPEATED = "repeated stamps"
+    OLDER = "stamps older than those before"
+    AHEAD = "stamps ahead of their time"
 
 
 class Stretch(NamedTuple):
-    """A stretch of a track without trusted samples: the stamps [ns] of the samples before and
-    behind it, and the reason.
+    """A stretch of a track without trusted samples: the stamps [ns] of the samples before and after
+    it, and the reason.
     """
 
     name: str
     begin_ns: int
     end_ns: int
-    why: str
+    why: Distrust
 
     def text(self, start_ns: int) -> str:
-        """The stretch in words, in seconds after the start of the take."""
+        """A message on the stretch, in seconds after the start of the take."""
         return (
             f"{self.name} {(self.begin_ns - start_ns) / 1e9:.2f} to {(self.end_ns - start_ns) / 1e9:.2f} s: {self.why}"
         )
 
 
 class Checked(NamedTuple):
-    """A track without the samples that were rejected, and the stretches without samples that are
-    too long to be bridged; the stamps [ns] of the first and last sample, and the number of poses,
-    before anything was rejected.
+    """A track without its rejected samples, and the stretches that are too long to be interpolated.
+
+    `start_ns` and `end_ns` [ns] are the first and last stamp, and `poses` the number of poses,
+    before samples were rejected.
     """
 
     track: Track
@@ -90,23 +91,22 @@ class Checked(NamedTuple):
 
     @property
     def seen_share(self) -> float:
-        """The share of the time in which the hand or tool is seen, 0 to 1."""
+        """Share of the time in which the hand or tool is seen, 0 to 1."""
         unseen_ns = sum(one.end_ns - one.begin_ns for one in self.stretches)
         return 1.0 - unseen_ns / max(self.end_ns - self.start_ns, 1)
 
     @property
     def remark(self) -> str:
-        """In words, how many samples were rejected; empty: none."""
+        """A remark on the number of rejected samples; empty if none was rejected."""
         rejected = self.poses - len(self.track.poses)
-        return f"{self.track.name}: {rejected} of {self.poses} poses are rejected by the rules of the daemon" * (
-            rejected > 0
-        )
+        return f"{self.track.name}: the rules of the daemon reject {rejected} of {self.poses} poses" * (rejected > 0)
 
 
 def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) -> list[Checked]:
-    """Tracks of one hand or of both, or of the tool, in frame `base`, with stamps that grow.
+    """The checked tracks of one or both hands, or of the tool, in frame `base`, with growing
+    stamps.
 
-    A stretch without trusted samples is named where it lasts longer than `longest_s` [s].
+    Stretches without trusted samples are listed if they last longer than `longest_s` [s].
     """
     out = []
     for track, verdict in zip(tracks, _intake_verdicts(tracks, settings), strict=True):
@@ -120,8 +120,8 @@ def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) ->
 
 
 def sound(track: Track) -> Track:
-    """The track with NaN for poses that are not finite or not turned by a rotation; one of which no
-    orientation is a rotation is taken to be unturned.
+    """The track with NaN for poses that are not finite or whose quaternion is not a rotation. A
+    track without any rotation is assumed to have the identity.
     """
     poses = track.poses.copy()
     with np.errstate(all="ignore"):
@@ -134,23 +134,23 @@ def sound(track: Track) -> Track:
 
 
 class _Verdict(NamedTuple):
-    """The intake's answer to each sample (N,) of a track: why it was rejected, empty: it was not;
-    and whether the filter began anew with it.
+    """The intake's decision on each sample (N,) of a track: the reason of its rejection, and a mask
+    of the samples with which the filter restarted.
     """
 
-    why: list[str]
+    why: list[Distrust]
     restarts: Mask
 
 
 def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdict]:
-    """Each track as `left` or `right` hand of one intake, in the order of the stamps."""
+    """The decisions on each track, as `left` or `right` hand of one intake, in order of stamps."""
     hands = msgspec.structs.replace(settings.hands, frame=BASE, unit="m", base_from_tracker=(0, 0, 0, 0, 0, 0, 1))
     settings = msgspec.structs.replace(settings, hands=hands)
     intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
     intake.begin(state)
     state["tick"] = 0
-    out = [_Verdict([""] * len(track.poses), np.zeros(len(track.poses), bool)) for track in tracks]
-    start_ns = min(int(track.stamps_ns[0]) for track in tracks) - 1  # a stamp of 0 is that of no sample
+    out = [_Verdict([Distrust.NONE] * len(track.poses), np.zeros(len(track.poses), bool)) for track in tracks]
+    start_ns = min(int(track.stamps_ns[0]) for track in tracks) - 1  # the intake takes a stamp of 0 for no stamp
     merged = sorted(
         (int(ns) - start_ns, side, i) for side, track in enumerate(tracks) for i, ns in enumerate(track.stamps_ns)
     )
@@ -164,7 +164,7 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
         intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
         causes = np.flatnonzero(intake.rejected[side] - rejected)
         if len(causes):
-            out[side].why[i] = CAUSES.get(Cause(causes[0]), UNSEEN)
+            out[side].why[i] = Distrust.__members__.get(Cause(causes[0]).name, Distrust.UNSEEN)
         else:
             out[side].restarts[i] = bool(state["kept_restarts"][side, state["kept_newest"][side]])
         is_disputed = bool(is_contested(as_array(state), bool(state["reason"] == Reason.TWO_SOURCES)))
@@ -175,23 +175,24 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
     for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
         mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * CONTESTED_MEMORY_S))
         for i in np.flatnonzero(mask).tolist():
-            verdict.why[i] = CONTESTED
+            verdict.why[i] = Distrust.CONTESTED
     return out
 
 
 def _is_before(stamps: NDArray[np.int64], times: NDArray[np.int64], most_ns: int) -> Mask:
-    """True for each stamp (N,) that one of these times follows within `most_ns`."""
+    """A mask (N,) of the stamps that one of the times follows within `most_ns` [ns]."""
     if not len(times):
         return np.zeros(len(stamps), bool)
     following = np.searchsorted(times, stamps)
     return np.asarray((following < len(times)) & (times[np.minimum(following, len(times) - 1)] - stamps <= most_ns))
 
 
-def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[str]:
-    """The reasons of `verdict`, and of the samples of a tracker that repeated the last pose.
+def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[Distrust]:
+    """The reasons of `verdict`, with `LOST` for the samples of a tracker that repeated its last
+    pose.
 
-    A track that mostly rests on one pose, bit by bit, and goes on from there, has no noise: it was
-    made, and tells nothing of a tracker that is lost.
+    Most repeated poses of a synthetic track, which has no noise, are rests from which it continues.
+    In such a track, repeated poses are not rejected.
     """
     why, poses, seconds = list(verdict.why), track.poses, (track.stamps_ns - track.stamps_ns[:1]) / 1e9
     changes = np.flatnonzero((np.diff(poses, axis=0) != 0).any(axis=1)) + 1
@@ -203,12 +204,12 @@ def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[str]:
         around = slice(max(begin - 1, 0), begin + 1)
         came_by_leap = _leaps(poses[around, :3], np.diff(seconds[around]), hands).any()
         first = begin if came_by_leap else begin + 1
-        why[first:end] = [LOST] * (end - first)
+        why[first:end] = [Distrust.LOST] * (end - first)
     return why
 
 
 def _is_lost(poses: Vector, seconds: Vector, begin: int, end: int) -> bool:
-    """True for a pose, repeated from `begin` to `end`, from which the track goes on elsewhere."""
+    """True if the track leaps after a pose that is repeated from index `begin` to `end`."""
     if end + 1 >= len(poses):
         return False
     speed = _distance(poses, end, end + 1) / float(seconds[end + 1] - seconds[end])
@@ -219,9 +220,10 @@ def _distance(poses: Vector, a: int, b: int) -> float:
     return float(np.linalg.norm(poses[a, :3] - poses[b, :3]))
 
 
-def _kept(track: Track, why: Sequence[str], restarts: Mask, hands: HandSettings) -> Mask:
-    """A mask (N,) of the samples in the sequence of runs that holds the most of them."""
-    usable = np.array([i for i, one in enumerate(why) if one in ("", MOVED_AWAY, SWAPPED)], np.intp)
+def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSettings) -> Mask:
+    """A mask (N,) of the samples in the sequence of runs that has the most of them."""
+    in_runs = (Distrust.NONE, Distrust.JUMPED, Distrust.SWAPPED)
+    usable = np.array([i for i, one in enumerate(why) if one in in_runs], np.intp)
     mask = np.zeros(len(why), bool)
     if not len(usable):
         return mask
@@ -253,20 +255,21 @@ def _kept(track: Track, why: Sequence[str], restarts: Mask, hands: HandSettings)
 
 
 def _leaps(at: Vector, pauses: Vector, hands: HandSettings) -> Mask:
-    """True where no hand can move from one position (N, 3) [m] to the next in the time given [s]:
-    it is a jump for the daemon, and takes too much acceleration at both.
+    """A mask (N - 1,) of the steps between positions (N, 3) [m] that no hand can make in the pauses
+    (N - 1,) [s]: the daemon rejects them as jumps, and they need too much acceleration at both
+    ends.
     """
     steps = np.diff(at, axis=0)
     off = np.linalg.norm(steps, axis=1)
     turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
     acceleration = np.minimum(np.concatenate([[np.inf], turns]), np.concatenate([turns, [np.inf]]))
-    is_too_hard: Mask = (off > hands.jump + hands.jump_speed * pauses) & (acceleration > MAX_HAND_MPS2)
-    return is_too_hard
+    is_leap: Mask = (off > hands.jump + hands.jump_speed * pauses) & (acceleration > MAX_HAND_MPS2)
+    return is_leap
 
 
-def _stretches(track: Track, kept: Mask, why: Sequence[str], longest_s: float) -> tuple[Stretch, ...]:
-    """The stretches between kept samples that last too long, also before the first and behind the
-    last of them.
+def _stretches(track: Track, kept: Mask, why: Sequence[Distrust], longest_s: float) -> tuple[Stretch, ...]:
+    """The stretches between retained samples that last longer than `longest_s` [s], and those
+    before the first and after the last retained sample.
     """
     rows, out = np.flatnonzero(kept), list[Stretch]()
     if not len(rows):
@@ -275,8 +278,8 @@ def _stretches(track: Track, kept: Mask, why: Sequence[str], longest_s: float) -
     ends, usual_ns = np.concatenate([[0], rows, [len(kept) - 1]]), float(np.median(np.diff(track.stamps_ns)))
     long = np.flatnonzero(np.diff(track.stamps_ns[ends]) > round(1e9 * longest_s))
     for a, b in zip(ends[long].tolist(), ends[long + 1].tolist(), strict=True):
-        between = Counter(why[i] or MOVED_AWAY for i in range(a, b + 1) if not kept[i])
+        between = Counter(why[i] or Distrust.JUMPED for i in range(a, b + 1) if not kept[i])
         is_sampled = sum(between.values()) * usual_ns > 0.5 * (track.stamps_ns[b] - track.stamps_ns[a])
-        reason = between.most_common(1)[0][0] if is_sampled else UNSEEN
+        reason = between.most_common(1)[0][0] if is_sampled else Distrust.UNSEEN
         out.append(Stretch(track.name, int(track.stamps_ns[a]), int(track.stamps_ns[b]), reason))
     return tuple(out)

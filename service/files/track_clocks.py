@@ -1,4 +1,4 @@
-"""Bring tracks to stamps of one clock, which does not begin anew meanwhile."""
+"""Stamps of one clock for several tracks, without a restart of the clock."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import numpy as np
 from service.core.intake.tuning import DELAY_WINDOW_S
 from service.files.track import Track, clock_parts
 
-LARGEST_DELAY_S = 0.2  # delays from stamp to recording may differ by this between streams of one clock
+LARGEST_DELAY_S = 0.2  # the delays from stamp to recording of streams with one clock may differ by this
 
 
 class OneClock(NamedTuple):
-    """Tracks with stamps of one clock: `logged` if these are the times of recording, `part` if they
-    are that part of each stream between two beginnings of its clock. `remark` says why; empty: the
-    stamps are used as they are.
+    """Tracks with stamps of one clock.
+
+    `logged` is True if the stamps are the times of recording. `part` is the number of the part that
+    is used if a clock restarts. `remark` has the reason; it is empty if the stamps are unchanged.
     """
 
     tracks: list[Track]
@@ -26,8 +27,8 @@ class OneClock(NamedTuple):
 
 
 def by_one_clock(tracks: Sequence[Track]) -> OneClock:
-    """The tracks by the times of recording where their stamps are of different clocks, or of one
-    that begins anew. Without such times, the part of them in which no clock begins anew.
+    """The tracks with the times of recording as stamps, if their stamps come from different clocks
+    or a clock restarts. If these times are not usable, the longest part without a restart.
     """
     if not all(len(track.poses) for track in tracks):
         return OneClock(list(tracks))
@@ -36,16 +37,16 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
     is_apart = max(ahead_s) - min(ahead_s) > LARGEST_DELAY_S
     if (anew or is_apart) and _are_usable(tracks):
         clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
-        why = f"stamps are of different clocks (against the recorder's {clocks})"
+        why = f"stamps come from different clocks (relative to the recorder: {clocks})"
         if anew:
-            why = f"the clock of {', '.join(anew)} begins anew meanwhile, or is set"
+            why = f"the clock of {', '.join(anew)} restarts or was set"
         logged = [track._replace(stamps_ns=track.logged_ns) for track in tracks]
-        return OneClock(logged, logged=True, remark=f"{why}: the times of recording count instead")
+        return OneClock(logged, logged=True, remark=f"{why}; the times of recording are used instead")
     parts = [clock_parts(track.stamps_ns) for track in tracks]
     counts = [len(one) for one in parts]
     if max(counts) == 1:
         return OneClock(list(tracks))
-    part = 0  # in the first one, the clocks of all streams are those with which the take began
+    part = 0  # in the first part, no clock has restarted
     if len(set(counts)) == 1:
         part = int(np.argmax([sum(len(one[i]) for one in parts) for i in range(counts[0])]))
     kept = [track.at(one[part]) for track, one in zip(tracks, parts, strict=True)]
@@ -53,15 +54,15 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
     whose = ", ".join(dict.fromkeys(track.name for track, count in zip(tracks, counts, strict=True) if count > 1))
     lasts_s = max(float(np.ptp(track.stamps_ns)) for track in kept) / 1e9
     remark = (
-        f"the clock of {whose} begins anew, and the times of recording with it: part {part + 1} of {max(counts)} is "
-        f"used, of {lasts_s:.1f} s; {left} poses are left out"
+        f"the clock of {whose} restarts, and the times of recording do too: part {part + 1} of {max(counts)} is "
+        f"used, which lasts {lasts_s:.1f} s; {left} poses are left out"
     )
     return OneClock(kept, part=part, remark=remark)
 
 
 def _is_steady(track: Track) -> bool:
-    """True if the least delay from stamp to recording agrees from second to second. A hold
-    up delays samples; it does not make any of them faster.
+    """True if the minimum delays from stamp to recording of all seconds agree. A hold-up delays
+    samples but makes none of them faster.
     """
     if not np.ptp(track.logged_ns):
         return True
@@ -73,5 +74,5 @@ def _is_steady(track: Track) -> bool:
 
 
 def _are_usable(tracks: Sequence[Track]) -> bool:
-    """True if the times of recording follow the times at which the samples were made."""
+    """True if the times of recording grow, so that they can replace the stamps."""
     return all(np.ptp(track.logged_ns) > 0 and len(clock_parts(track.logged_ns)) == 1 for track in tracks)

@@ -1,20 +1,20 @@
-"""Find the stretches of a track that are displaced by a few centimetres: a step and its return.
+"""Detection of the stretches of a track that are displaced by a few centimetres.
 
 A step d at the middle of 2n samples x(t) of an otherwise smooth motion is estimated by least
-squares, together with the line of the motion: x = a + b t + d h(t), h = -1/2 before and 1/2 behind
-the middle. With h' the part of h that no line a + b t explains, d = (h' . x) / (h' . h).
+squares, together with the line of the motion: x = a + b t + d h(t), with h = -1/2 before and 1/2
+after the middle. With h' the part of h that is orthogonal to all lines a + b t,
+d = (h' . x) / (h' . h).
 
-A stretch is displaced if it begins with a step and ends with the opposite one. Either must be
-larger than the steps that the track usually shows, by noise and by what is no line in its motion.
+A stretch is displaced if it begins with a step and ends with the opposite step. Both must be larger
+than the usual steps of the track, which are caused by noise and by the curvature of its motion. A
+step without a return is accepted, because a track does not show which side of it is right.
 
-A step that is never taken back stays: which side of it is right, a track does not show.
+The method finds jumps from 2 cm on of trackers with a noise of up to 1 mm per axis at 24 to 240 Hz.
+With a noise of 2 mm at 30 Hz, or for hands that swing at 1 m/s at 30 Hz, jumps below 5 cm cannot be
+distinguished from noise and motion.
 
-Found so are jumps of 2 cm and more of trackers whose noise is up to 1 mm an axis, at 24 to 240 Hz.
-In noise of 2 mm at 30 Hz, or where hands swing at 1 m/s at 30 Hz, jumps below 5 cm look like noise
-and motion.
-
-Beside each number stand its range, its effect, and its measured sensitivity: bad samples missed and
-clean samples removed, with the number as it is, halved and doubled, over the takes of
+Each number has its range, its effect, and its measured sensitivity: the shares of bad samples
+missed and of clean samples removed with the number as it is, halved and doubled, over the takes of
 `tests/files/test_track_sensitivity.py` and over recorded hands.
 """
 
@@ -26,27 +26,33 @@ from scipy.ndimage import maximum_filter, percentile_filter
 
 from service.core.frame import Vector
 
-# samples before a step and as many behind it, 3 to 5: fewer tell less of noise, more less of motion
+# n, the samples before and after a step. Range 3 to 5: smaller values average noise less, larger
+# ones
+# include more of the motion's curvature.
 HALF_WINDOW = 4  # missed 0.5, 6.7, 5.9 %; removed 0.03, 0.59, 0.11 %
-# [m], 0.008 to 0.02: smaller steps are none
+# [m] Smaller steps are ignored. Range 0.008 to 0.02.
 STEP_M = 0.01  # missed 0.5, 0.5, 0.7 %; removed 0.03, 0.37, 0.03 %
-# of the steps within USUAL_S on either side, 70 to 90 (here 60 and 90 beside it)
+# The usual step is this percentile within USUAL_S to both sides. Range 70 to 90 (measured: 60, 90).
 USUAL_PERCENTILE = 80  # missed 0.5, 0.5, 0.6 %; removed 0.03, 1.00, 0.00 %
-# [s], 0.7 to 2: shorter follows the motion sooner, longer contains less of the jump itself
+# [s] Range 0.7 to 2: smaller values follow the motion sooner, larger ones include less of the jump.
 USUAL_S = 1.5  # missed 0.5, 0.5, 0.5 %; removed 0.03, 0.03, 0.10 %
-# a step is unusual from so many times the usual one, 2 to 3.5: more misses small jumps
-UNUSUAL = 2.5  # missed 0.5, 0.5, 0.8 %; removed 0.03, 3.73, 0.00 %
-# what may be left of a step and its return, as a share of their difference, 0.15 to 0.35
-ALIKE = 0.25  # missed 0.5, 0.7, 0.5 %; removed 0.03, 0.03, 0.14 %
-# what may be left of the estimates beside a step, as a share of it, 0.25 to 0.5: more takes fast
-# motion for a step
-BESIDE = 0.35  # missed 0.5, 6.5, 0.5 %; removed 0.03, 0.00, 0.38 %
-# [s] from a step to its return, 3 to 6: longer, more pairs of steps look like a jump and its return
-LONGEST_S = 5.0  # missed 0.5, 8.1, 0.5 %; removed 0.03, 0.03, 0.03 %
+# A step is unusual from this multiple of the usual step on. Range 2 to 3.5: larger values miss
+# small
+# jumps.
+UNUSUAL_RATIO = 2.5  # missed 0.5, 0.5, 0.8 %; removed 0.03, 3.73, 0.00 %
+# |step + return| / |step - return| of a jump. Range 0.15 to 0.35.
+MAX_REMAINDER = 0.25  # missed 0.5, 0.7, 0.5 %; removed 0.03, 0.03, 0.14 %
+# Residual of the estimates beside a single step / step. Range 0.25 to 0.5: with larger values, fast
+# motion looks like a step.
+MAX_BESIDE = 0.35  # missed 0.5, 6.5, 0.5 %; removed 0.03, 0.00, 0.38 %
+# [s] Time from a step to its return. Range 3 to 6: with larger values, more pairs of steps look
+# like a
+# jump.
+MAX_JUMP_S = 5.0  # missed 0.5, 8.1, 0.5 %; removed 0.03, 0.03, 0.03 %
 
 
 def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
-    """A mask (N,) of the samples that are displaced, of positions (N, 3) [m] at times (N,) [s]."""
+    """A mask (N,) of the displaced samples among positions (N, 3) [m] at times (N,) [s]."""
     mask = np.zeros(len(seconds), bool)
     if len(seconds) < 2 * HALF_WINDOW:
         return mask
@@ -57,10 +63,10 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
         if begin < after:
             continue
         for end in rows[i + 1 :].tolist():
-            if seconds[end] - seconds[begin] > LONGEST_S:
+            if seconds[end] - seconds[begin] > MAX_JUMP_S:
                 break
             left, moved = steps[begin] + steps[end], steps[begin] - steps[end]
-            if np.linalg.norm(left) < ALIKE * np.linalg.norm(moved):
+            if np.linalg.norm(left) < MAX_REMAINDER * np.linalg.norm(moved):
                 mask[begin + 1 : end + 1] = True
                 after = end + 1
                 break
@@ -68,32 +74,34 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
 
 
 def _steps(seconds: Vector, positions: Vector) -> Vector:
-    """The step (N - 1, 3) [m] between each sample and the next; 0 where less than HALF_WINDOW
-    samples lie on either side, or where a pause hides it.
+    """The estimated steps (N - 1, 3) [m] between each sample and the next; 0 if one side has fewer
+    than HALF_WINDOW samples, or if a pause hides the step.
     """
     times = np.lib.stride_tricks.sliding_window_view(seconds, 2 * HALF_WINDOW)
     rest = _without_line(times - times.mean(axis=1, keepdims=True))
-    told = rest @ _side()
+    scale = rest @ _side()  # h' . h
     windows = np.lib.stride_tricks.sliding_window_view(positions, 2 * HALF_WINDOW, axis=0)
-    found = np.einsum("ij,ikj->ik", rest, windows) / told[:, None]
-    found[told < 0.5 * np.median(told)] = 0.0
+    found = np.einsum("ij,ikj->ik", rest, windows) / scale[:, None]
+    found[scale < 0.5 * np.median(scale)] = 0.0
     return np.pad(found, ((HALF_WINDOW - 1, HALF_WINDOW - 1), (0, 0)))
 
 
 def _side(beside: int = 0) -> Vector:
-    """A step of 1 in the middle of a window, or so many samples `beside` it."""
+    """A unit step h (2 HALF_WINDOW,) in the middle of a window, or `beside` samples after it."""
     return np.where(np.arange(2 * HALF_WINDOW) < HALF_WINDOW + beside, -0.5, 0.5)
 
 
 def _without_line(times: Vector) -> Vector:
-    """What no line explains of a step of 1 at times (M, 2 HALF_WINDOW), whose mean is 0."""
+    """The part h' of a unit step that is orthogonal to all lines, for times (M, 2 HALF_WINDOW) with
+    mean 0.
+    """
     out: Vector = _side() - times * (times @ _side() / np.einsum("ij,ij->i", times, times))[:, None]
     return out
 
 
 def _unusual(steps: Vector, around: int) -> NDArray[np.intp]:
-    """The indices of steps that are larger than usual and happen from one sample to the next: the
-    estimates beside them are what a single step leaves in their windows.
+    """The indices of steps that are larger than usual and happen between two samples: the estimates
+    beside them equal those that a single step causes there.
     """
     size = np.linalg.norm(steps, axis=1)
     usual = percentile_filter(size, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror")
@@ -102,4 +110,6 @@ def _unusual(steps: Vector, around: int) -> NDArray[np.intp]:
     share = (rest @ _side(1)) / (rest @ _side())
     padded = np.pad(steps, ((1, 1), (0, 0)))
     off = np.linalg.norm(0.5 * (padded[:-2] + padded[2:]) - share * steps, axis=1)
-    return np.flatnonzero((size > np.maximum(STEP_M, UNUSUAL * usual)) & (size >= largest) & (off < BESIDE * size))
+    return np.flatnonzero(
+        (size > np.maximum(STEP_M, UNUSUAL_RATIO * usual)) & (size >= largest) & (off < MAX_BESIDE * size)
+    )

@@ -1,7 +1,7 @@
-"""The arm's description as recordings store it: with a sphere each for hands, target and setpoint.
+"""The arm's description in recordings, with spheres for the hands, the target and the setpoint.
 
-Rerun, Foxglove and RViz draw a description by the frames in `/tf`, which hold hands and target
-too. So they show these without a plug-in or a setting.
+Rerun, Foxglove and RViz draw a description with the frames in `/tf`. These include hands and
+target, so viewers show them without a plug-in or a setting.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MARKERS = (
 def with_markers(urdf: str) -> str:
     """The URDF with a floating link for each marker.
 
-    Unchanged where it has no `</robot>`, or links of these names already.
+    It is unchanged if it has no `</robot>`, or already has links of these names.
     """
     head, end, tail = urdf.rpartition("</robot>")
     if not end or any(f'name="{frame}"' in urdf for frame, _, _ in MARKERS):

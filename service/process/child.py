@@ -1,9 +1,8 @@
-"""Child processes, each with a socket to it, and bytes handed over as memory that both map.
+"""Child processes, each with a socket to it, and bytes shared with them in memory.
 
-Children are forked from one process, the fork server, which imports what they need and does nothing
-else: what it has imported is there for every later child. So a child that was killed is replaced in
-the time of a fork. The fork server has one thread; libraries that start threads when they are
-imported are left to the children.
+Children are forked from one process, the fork server. It imports the modules that they need and
+does nothing else, so a child that was killed is replaced in the time of a fork. The fork server has
+one thread; the children themselves import the libraries that start threads.
 """
 
 from __future__ import annotations
@@ -31,20 +30,21 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-_LENGTH = struct.Struct("<Q")
+_PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
-_ALIGNED = 64  # bytes: so that arrays can stay where they arrive
-_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36  # of Linux; Python does not name them
-NICE = 5  # of all children
-POLL_S = 0.01
-LONGEST_REQUEST = 4096  # bytes, to the fork server
-NOT_STARTED = 255  # exit code of a child whose fork server ended before it was forked
+_ALIGNED = 64  # [bytes] parts begin at multiples of this, so that arrays are used without a copy
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36  # Linux defines them, Python does not
+CHILD_NICE = 5  # children yield to the control process
+CHILD_POLL_S = 0.01
+MAX_REQUEST_BYTES = 4096  # a request to the fork server is a few names
+NOT_STARTED = 255  # the exit code of a child whose fork server ended before it forked the child
 
 
 class Child:
     """A child process and this end of the socket to it.
 
-    What is sent before it exists waits in the socket. Methods may be called from any thread.
+    Messages that are sent before the process exists wait in the socket. Methods may be called from
+    any thread.
     """
 
     def __init__(self, own: socket.socket, server: subprocess.Popen[bytes]) -> None:
@@ -61,11 +61,11 @@ class Child:
                 poll = select.poll()  # select() knows no descriptor above 1023
                 poll.register(self.socket, select.POLLIN)
                 if poll.poll(1000 * timeout_s):
-                    told = b""
+                    received = b""
                     with contextlib.suppress(OSError):
-                        told = self.socket.recv(_PID.size)
-                    if told:
-                        (self.pid,) = _PID.unpack(told)
+                        received = self.socket.recv(_PID.size)
+                    if received:
+                        (self.pid,) = _PID.unpack(received)
                     else:
                         self.returncode = NOT_STARTED
             return self.pid is not None
@@ -88,11 +88,11 @@ class Child:
         while self.poll() is None:
             if time.monotonic() > end:
                 return False
-            time.sleep(POLL_S)
+            time.sleep(CHILD_POLL_S)
         return True
 
     def send_signal(self, number: int) -> None:
-        """Sends a signal to the process, or to the fork server where that has not forked it yet."""
+        """Send a signal to the process, or to the fork server if that has not forked it yet."""
         if self.poll() is None:
             with self._lock, contextlib.suppress(ProcessLookupError):
                 if self.pid is None:
@@ -101,21 +101,21 @@ class Child:
                     os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """Ends the process at once."""
+        """End the process at once."""
         self.send_signal(signal.SIGKILL)
 
     @property
     def working_pid(self) -> int:
-        """The process itself, or the fork server where that has not forked it yet."""
+        """The process itself, or the fork server if that has not forked it yet."""
         return self._server.pid if self.pid is None else self.pid
 
 
 class Progress:
-    """Tells a child that hangs from one that is slow.
+    """Distinguish a child that hangs from one that is slow.
 
-    A child hangs once it has done nothing for `limit_s` [s] without waiting for processor or disk,
-    or once it has used the processor for `limit_s` [s] without a report. Only its main thread
-    counts. `is_hung` is to be called several times within `limit_s`.
+    A child hangs if it did nothing for `limit_s` [s] without waiting for processor or disk, or if
+    it used `limit_s` [s] of processor time without a report. Only its main thread is measured. Call
+    `is_hung` several times within `limit_s`.
     """
 
     def __init__(self, child: Child) -> None:
@@ -123,14 +123,14 @@ class Progress:
         self.report()
 
     def report(self) -> None:
-        """The child has reported something."""
+        """Note that the child has reported something."""
         self._pid = self._child.working_pid
         _, self._used_s = _activity(self._pid)
         self._reported_s, self._moved_s = self._used_s, time.monotonic()
 
     def is_hung(self, limit_s: float, *, busy_s: float | None = None) -> bool:
         """True if the child makes no progress; `busy_s` replaces the limit of processor time."""
-        if self._child.working_pid != self._pid:  # it was forked since
+        if self._child.working_pid != self._pid:  # the child was forked after the last report
             self.report()
         (state, used_s), now_s = _activity(self._pid), time.monotonic()
         if used_s != self._used_s or state in "RD":
@@ -149,16 +149,16 @@ def _activity(pid: int) -> tuple[str, float]:
 
 
 class _ForkServer:
-    """This process's end of its fork server, which is started when it is first needed."""
+    """This process's end of its fork server, which starts at the first request."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
-        self._modules: dict[str, None] = {}  # in the order in which they were first wanted
+        self._modules: dict[str, None] = {}  # ordered by their first request
 
     def request(self, module: str, *more: str, descriptors: Iterable[int] = ()) -> subprocess.Popen[bytes]:
-        """Has a module imported, and with a descriptor a child forked that runs it."""
+        """Have the server import a module and, with a descriptor, fork a child that runs it."""
         with self._lock:
             self._modules[module] = None
             if self._process is None or self._process.poll() is not None:
@@ -177,7 +177,7 @@ class _ForkServer:
 
     def _begin(self) -> None:
         self._end()
-        # a child is forked twice, and adopted by this process once its parent has ended
+        # A child is forked twice; this process adopts it when its parent ends.
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command, environment = python("-m", "service.process.child", str(theirs.fileno()))
@@ -202,7 +202,7 @@ class _ForkServer:
         self._process = None
 
     def close(self) -> None:
-        """Ends the fork server; its children go on."""
+        """End the fork server; its children continue."""
         with self._lock:
             self._end()
 
@@ -219,7 +219,7 @@ def python(*arguments: str) -> tuple[list[str], dict[str, str]]:
 
 
 def preload(module: str) -> None:
-    """Has the fork server import a module, so that a child that runs it is there at once. Never
+    """Have the fork server import a module, so that a child that runs it starts at once. Never
     waits.
     """
     _server.request(module)
@@ -229,7 +229,7 @@ def start(name: str, module: str, kind: socket.SocketKind) -> Child:
     """A child that calls `run(socket)` of a module. Never waits.
 
     The operating system lists it under the first 15 characters of `name`. A terminal's Ctrl-C does
-    not reach it; it is to end when its socket closes.
+    not reach it: it must end when its socket closes.
     """
     own, theirs = socket.socketpair(socket.AF_UNIX, kind)
     with theirs:
@@ -242,20 +242,20 @@ def _serve(control: socket.socket) -> None:
     _set_name("fork server")
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(NICE)
+        os.nice(CHILD_NICE)
     while True:
-        request, descriptors, _, _ = socket.recv_fds(control, LONGEST_REQUEST, 1)
+        request, descriptors, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 1)
         if not request:
             return
         name, *more = request.decode().split("\0")
         module = importlib.import_module(name)
         if descriptors:
             gc.collect()
-            gc.freeze()  # children share the memory of what they leave untouched
+            gc.freeze()  # children share the memory pages that they do not write to
             with socket.socket(fileno=descriptors[0]) as channel:
                 try:
                     between = os.fork()
-                except OSError:  # of processes or memory; who waits for the child sees its socket close
+                except OSError:  # no process or memory is left: the socket closes, which the caller sees
                     traceback.print_exc()
                     continue
                 if between == 0:
@@ -265,7 +265,7 @@ def _serve(control: socket.socket) -> None:
 
 
 def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
-    """The child of the fork server, and the child's child, which is adopted when the first ends."""
+    """Fork the child's child, which runs the module and is adopted when this process ends."""
     code = 1
     try:
         between = os.getpid()
@@ -276,7 +276,7 @@ def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
             channel.send(_PID.pack(os.getpid()))
             module.run(channel)
         code = 0
-    except BrokenPipeError:  # nobody waits for it any more
+    except BrokenPipeError:  # the process that started it has ended
         pass
     except BaseException:
         traceback.print_exc()
@@ -285,24 +285,25 @@ def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
 
 
 def _set_name(name: str) -> None:
-    """Sets the name under which the operating system lists this process."""
+    """Set the name under which the operating system lists this process."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
 def _continue_with_parent() -> None:
-    """Has the kernel continue this process, where it was stopped, when its parent ends.
+    """Have the kernel continue this process, if it was stopped, when its parent ends.
 
-    The signal also comes when only the thread ends that started this process, so it is harmless.
+    The kernel also sends the signal when only the thread that started this process ends, so the
+    signal must be harmless.
     """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
 def end_with_parent(grace_s: float = 0.0) -> None:
-    """For the child: ends it `grace_s` [s] after its parent ended, whatever it does then; continues
-    it then where it was stopped.
+    """End this child `grace_s` [s] after its parent, also if it is stopped or busy.
 
-    Most end before, with their socket. The kernel's own signal for it (PR_SET_PDEATHSIG) goes by
-    the thread that started the child, which may end long before its process.
+    Most children end earlier, with their socket. The kernel's own signal (PR_SET_PDEATHSIG) cannot
+    end them: it depends on the thread that started the child, which may end long before its
+    process.
     """
 
     def wait(parent: int) -> None:
@@ -311,16 +312,16 @@ def end_with_parent(grace_s: float = 0.0) -> None:
         os._exit(1)
 
     _continue_with_parent()
-    with contextlib.suppress(OSError, AttributeError):  # an older kernel: then its socket must do
+    with contextlib.suppress(OSError, AttributeError):  # an older kernel: the closed socket must suffice
         threading.Thread(target=wait, args=(os.pidfd_open(os.getppid()),), name="parent", daemon=True).start()
 
 
 def in_memory(*parts: Any) -> int:
-    """The descriptor of a file in memory that holds the parts (anything with a buffer) in order."""
+    """The descriptor of a file in memory with these parts, any objects with a buffer, in order."""
     fd = os.memfd_create("thirdhand")
     with open(fd, "wb", closefd=False) as file:
         for view in (memoryview(part).cast("B") for part in parts):
-            file.write(_LENGTH.pack(len(view)))
+            file.write(_PART_LENGTH.pack(len(view)))
             file.write(bytes(-file.tell() % _ALIGNED))
             file.write(view)
             file.write(bytes(-file.tell() % _ALIGNED))
@@ -328,29 +329,29 @@ def in_memory(*parts: Any) -> int:
 
 
 def from_memory(fd: int) -> list[memoryview]:
-    """The parts that `in_memory` wrote, where they lie; the descriptor is closed.
+    """The parts that `in_memory` wrote, without a copy. The descriptor is closed.
 
-    Raises EOFError where it is damaged.
+    Raises EOFError for a damaged file.
     """
     try:
         size = os.fstat(fd).st_size
-        populate = getattr(mmap, "MAP_POPULATE", 0)  # now, not at a first touch in the loop
+        populate = getattr(mmap, "MAP_POPULATE", 0)  # map pages now, not at the first access in the loop
         view = memoryview(mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ))
     finally:
         os.close(fd)
     parts, at = [], 0
     while at < size:
-        (length,) = _LENGTH.unpack_from(view, at)
+        (length,) = _PART_LENGTH.unpack_from(view, at)
         at += _ALIGNED
         if at + length > size:
-            raise EOFError("a part ends behind the memory")
+            raise EOFError("a part reaches beyond the end of the file")
         parts.append(view[at : at + length])
         at += length + -length % _ALIGNED
     return parts
 
 
 def descriptors(ancillary: Iterable[tuple[int, int, bytes]]) -> list[int]:
-    """The descriptors among what came with a message of `recvmsg`."""
+    """The descriptors in the ancillary data of `recvmsg`."""
     found: list[int] = []
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:

@@ -1,8 +1,8 @@
 """Ctrl-C at any moment: one line and exit 130, never a traceback.
 
-A command without anything to clean up ends at once, also while it imports or waits in a library
-that keeps Python's own handler from running. One that started processes ends them first; a second
-Ctrl-C does not wait for that.
+A command without anything to clean up ends at once, also while it imports modules or waits in a
+library that blocks Python's own handler. A command that started processes ends them first; a second
+Ctrl-C ends the command at once.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _CLEANS_UP, _RAISED = threading.Event(), threading.Event()
 
 
 def end_at_once() -> NoReturn:
-    """Ends this process at once, with one line."""
+    """End this process at once, with one line."""
     with contextlib.suppress(OSError):
         os.write(2, b"\nthirdhand: interrupted\n" if os.isatty(2) else b"thirdhand: interrupted\n")
     os._exit(EXIT_CODE)
 
 
 def watch() -> None:
-    """Installs the handler of SIGINT; for the main thread, before all that takes time."""
+    """Install the handler of SIGINT. Call it in the main thread, before slow imports."""
     if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, signal.SIG_DFL):
-        return  # ignored, as in the background of a terminal, or handled by another
+        return  # a shell ignores it for background jobs, or another handler is installed
     signals, wakeup = os.pipe()
     os.set_blocking(wakeup, False)
     signal.signal(signal.SIGINT, _raise_to_clean_up)
@@ -39,7 +39,7 @@ def watch() -> None:
 
 @contextlib.contextmanager
 def clean_up_first() -> Iterator[None]:
-    """Within it the first SIGINT raises KeyboardInterrupt, so that the command can clean up."""
+    """A context in which the first SIGINT raises KeyboardInterrupt, for a command to clean up."""
     _CLEANS_UP.set()
     try:
         yield
@@ -48,13 +48,13 @@ def clean_up_first() -> Iterator[None]:
 
 
 def too_late() -> None:
-    """Ignores SIGINT from now on: the command is done, and its exit code decided."""
+    """Ignore SIGINT from now on: the command is done, and its exit code is decided."""
     if signal.getsignal(signal.SIGINT) is _raise_to_clean_up:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _raise_to_clean_up(number: int, frame: FrameType | None) -> None:
-    """Python's handler; that of all other cases is `_serve`, which waits for no bytecode."""
+    """Handle SIGINT in Python. `_serve` handles all other cases, without waiting for bytecode."""
     if _CLEANS_UP.is_set() and not _RAISED.is_set():
         _RAISED.set()
         raise KeyboardInterrupt

@@ -1,6 +1,6 @@
-"""Import this before NumPy: one BLAS thread, in this process and those that it starts.
+"""Import this before NumPy: it sets one BLAS thread for this process and its children.
 
-More would make results depend on how busy the machine is. Every entry point imports it first.
+With more threads, results depend on the load of the machine. Every entry point imports it first.
 """
 
 import os

@@ -1,5 +1,5 @@
-"""Shows a command's progress on standard error, once it takes longer than two seconds: a bar or a
-spinner on a terminal, else a line every ten seconds.
+"""Progress of a command on standard error, if it takes longer than two seconds: a bar or a spinner
+on a terminal, else a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator
 from service.contract.printable import CLEAR, printable_lines
 from service.contract.requests import STARTING
 
-AFTER_S, EVERY_S = 2.0, 10.0
+SHOWN_AFTER_S = 2.0  # shorter steps show no progress
+LINE_EVERY_S = 10.0  # interval of lines without a terminal
 
 
 def say(line: str) -> None:
-    """Print a message on standard error at once, without effects of what it quotes.
+    """Print a message on standard error at once, with control characters made printable.
 
-    On a terminal, what a daemon reports of its start is one line, written anew in place.
+    On a terminal, each report of a daemon's start overwrites the one before.
     """
     terminal = sys.stderr.isatty()
     in_place = terminal and line.lstrip().startswith(STARTING)
@@ -30,22 +31,29 @@ def say(line: str) -> None:
 
 @contextlib.contextmanager
 def progress(
-    what: str, *, total: int | None = None, unit: str = "ticks", after_s: float = AFTER_S, every_s: float = EVERY_S
+    what: str,
+    *,
+    total: int | None = None,
+    unit: str = "ticks",
+    after_s: float = SHOWN_AFTER_S,
+    every_s: float = LINE_EVERY_S,
 ) -> Iterator[Callable[[int], None]]:
-    """A function to call with the number of units done; `total` is known or None. A context."""
+    """A context with a function to call with the number of units done, out of `total` if known."""
     with contextlib.closing(_Shown(what, total, unit, after_s, every_s)) as shown:
         yield shown.done
 
 
 @contextlib.contextmanager
-def steps(what: str, *, after_s: float = AFTER_S, every_s: float = EVERY_S) -> Iterator[Callable[[str], None]]:
-    """A function to call with the name of each step as it begins; a context."""
+def steps(
+    what: str, *, after_s: float = SHOWN_AFTER_S, every_s: float = LINE_EVERY_S
+) -> Iterator[Callable[[str], None]]:
+    """A context with a function to call with the name of each step as it begins."""
     with contextlib.closing(_Shown(what, None, "", after_s, every_s)) as shown:
         yield shown.doing
 
 
 class _Shown:
-    """Shows the progress from a thread of its own, also while the command computes."""
+    """Show the progress from a thread of its own, also while the command computes."""
 
     def __init__(self, what: str, total: int | None, unit: str, after_s: float, every_s: float) -> None:
         self._what, self._total, self._unit = what, total, unit
@@ -71,11 +79,11 @@ class _Shown:
     def _draw(self) -> None:
         if self._ended.wait(self._after_s):
             return
-        from rich.console import Console  # slow to import, and most commands are quicker
+        from rich.console import Console  # its import is slow, and most commands end before
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         class Cursor(Console):
-            """Never hides the cursor: after Ctrl-C it would stay hidden."""
+            """A console that never hides the cursor, which would remain hidden after Ctrl-C."""
 
             def show_cursor(self, show: bool = True) -> bool:
                 return False
@@ -96,7 +104,7 @@ class _Shown:
         while not self._ended.wait(wait_s):
             wait_s = self._every_s
             passed_s = time.monotonic() - self._begun
-            if passed_s < self._after_s:  # a new step, which was printed as it began
+            if passed_s < self._after_s:  # a new step: its name was printed as it began
                 continue
             passed = f"{passed_s:.0f} s"
             if self._total:

@@ -21,7 +21,7 @@ from service.settings import palette
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
 LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
-MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.MODES.items()}
+MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.BY_MODE.items()}
 LETTER_SHARE = 0.011  # width of a letter / width of a plot
 POINTS = 1500  # most points of a curve
 LEAST_US, LEAST_MM = 10.0, 0.1  # smaller values are not shown

@@ -1,4 +1,6 @@
-"""The paths of a cell's recordings: names for the next ones; old ones beyond the limits."""
+"""The paths of a cell's recordings: names of new ones, and deletion of old ones beyond the
+limits.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,10 @@ MB = 1e6
 
 
 class RecordingPaths:
-    """The paths of one recording after another.
+    """The paths of successive recordings.
 
-    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, which sort by time. Else they are
-    `recording` and `rrd`, the later ones numbered.
+    In `folder` they are `<cell>-<UTC time>.mcap` and `.rrd`, which sort by time. Without a folder
+    they are `recording` and `rrd`, with a number from the second on.
     """
 
     def __init__(
@@ -29,12 +31,12 @@ class RecordingPaths:
         self._explicit = [None if path is None else Path(path) for path in (recording, rrd)]
         self._number = attempt
         self._newest = datetime.min.replace(tzinfo=UTC)
-        self._own: dict[str, bool] = {}  # whether a recording is this cell's, by its stem
+        self._own: dict[str, bool] = {}  # True for this cell's recordings, by stem
         self._cell = settings.cell.replace("/", "-")
-        self.keep_mb_left: float | None = None  # before the oldest are removed; None: no limit, or not known yet
+        self.keep_mb_left: float | None = None  # growth before the oldest are deleted; None: no limit, or not known yet
 
     def next(self) -> tuple[Path | None, Path | None]:
-        """Paths of the next recording and of the drawing beside it; None where it is not wanted."""
+        """Paths of the next recording and of its drawing; None for those not written."""
         if self._folder is None:
             while True:
                 number, self._number = self._number, self._number + 1
@@ -57,7 +59,9 @@ class RecordingPaths:
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
     def prune(self, writing: Path | None) -> list[Path]:
-        """The oldest recordings beyond the limits, now removed; never the one being written."""
+        """Delete the oldest recordings beyond the limits, except the one being written, and return
+        their paths.
+        """
         keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
         if self._folder is None or not (keep_bytes or keep_s):
             return []
@@ -85,9 +89,9 @@ class RecordingPaths:
         return removed
 
     def _is_own(self, path: Path) -> bool:
-        """Whether a recording, or the drawing beside it, is this cell's.
+        """True if a recording, or the recording of a drawing, is this cell's.
 
-        Another cell's name may be the same once its slashes are replaced.
+        With slashes replaced, another cell may have the same name.
         """
         if path.stem not in self._own:
             messages = Messages(path.with_suffix(".mcap"))

@@ -1,8 +1,8 @@
-"""The scribe's own process: reads messages from a socket, writes the recordings, feeds the viewer.
+"""The scribe's process: it reads messages from a socket, writes recordings, and feeds the viewer.
 
-It ends when the other side of the socket is closed or dead, once everything received is written. It
+It ends when the other side of the socket closes or dies, after writing everything received. It
 cannot outlive its daemon for long: the daemon's death continues a stopped scribe, and an alarm ends
-one that hangs. While the daemon lives it is the daemon that replaces a scribe that hangs.
+a scribe that hangs. A living daemon replaces a scribe that hangs.
 
 Recording does not wait for drawing: Rerun is imported on the drawing's own thread.
 """
@@ -27,32 +27,31 @@ from service.contract.explain import in_words
 from service.core.frame import state_layout
 from service.process import child
 from service.scribe.paths import RecordingPaths
-from service.scribe.protocol import LARGEST_MESSAGE, Note, ScribeReport, ScribeSetup, unpack
+from service.scribe.protocol import MAX_PACKET_BYTES, Note, ScribeReport, ScribeSetup, unpack
 from service.scribe.segments import Segments
 from service.settings.config import urdf_path
 
 if TYPE_CHECKING:
     from service.viewer.stream import Viewer
 
-CATCH_UP_NICE = 0  # of a recording that is behind: an ordinary process's weight, so that no arm's driver waits for it
-QUEUED = 10_000  # messages; then the socket fills, and then the loop keeps them, and then counts losses
-FLUSH_S = 0.5  # what a kill can lose
-DRAW_FLUSH_S = 10.0  # what a kill can lose of a drawing, which can be drawn again
-DRAW_END_S = 8.0
-DRAW_QUEUED = 5000  # ticks
-BEHIND = 500  # messages that wait to be recorded, beyond which nothing is drawn
-END_S = 60  # whole seconds for ending, after which it is killed
+CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that an arm's driver does not wait for it
+MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
+FLUSH_S = 0.5  # a kill loses at most this time of a recording
+DRAW_FLUSH_S = 10.0  # a kill loses at most this time of a drawing, which can be drawn again
+DRAW_END_S = 8.0  # a drawing that does not end within this time is abandoned
+MAX_WAITING_DRAWINGS = 5000  # [ticks] with more, the oldest is dropped
+BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
+MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
 # are dropped.
 RERUN_LOG = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
-POLL_S = 0.02  # it polls, because waking a blocked reader would cost the sender 25 µs a tick
+SOCKET_POLL_S = 0.02  # polling, because to wake a blocked reader costs the sender 25 µs per tick
 
 
 class DrawingThread:
-    """The viewer, made and used on a thread of its own.
+    """A thread that makes and uses the viewer, so that a slow viewer does not delay the recording.
 
-    Where it falls behind or hangs, the recording does not. While the recording is behind,
-    `is_paused` is to be set, and nothing is drawn.
+    Set `is_paused` while the recording is behind; nothing is drawn then.
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
@@ -67,23 +66,23 @@ class DrawingThread:
 
     @property
     def rrd(self) -> str | None:
-        """The file that is drawn into, or will be next."""
+        """The file of the present drawing, or of the next one if that is queued."""
         if self._wanted_file is None:
             return None if self.viewer is None else self.viewer.rrd
         return str(self._wanted_file)
 
     def put(self, act: Callable[[Viewer], object]) -> None:
-        """Queues a drawing; beyond DRAW_QUEUED the oldest is dropped."""
+        """Queue a drawing; beyond MAX_WAITING_DRAWINGS the oldest is dropped."""
         self._waiting.append(act)
-        if len(self._waiting) > DRAW_QUEUED:
+        if len(self._waiting) > MAX_WAITING_DRAWINGS:
             oldest = self._waiting.popleft()
-            if isinstance(oldest, Path) and self._waiting:  # the next file: what is drawn into it goes instead
+            if isinstance(oldest, Path) and self._waiting:  # keep the change of file, drop the drawing after it
                 self._waiting.popleft()
                 self._waiting.appendleft(oldest)
             self.dropped += 1
 
     def draw_into(self, rrd: Path) -> None:
-        """Ends the file; what is queued from now on is drawn into another."""
+        """End the file; everything queued from now on is drawn into another."""
         self._wanted_file = rrd
         self._waiting.append(rrd)
 
@@ -91,12 +90,12 @@ class DrawingThread:
         self._wait()
         try:
             viewer = self.viewer = make()
-        except Exception as error:  # without Rerun there is still a recording
+        except Exception as error:  # the recording continues without Rerun
             self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
             return
         flushed = time.monotonic()
-        while not (self._ended.wait(POLL_S) and not self._waiting):
+        while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
             while self._waiting:
                 self._wait()
                 next_ = self._waiting.popleft()
@@ -112,19 +111,19 @@ class DrawingThread:
         viewer.close()
 
     def _wait(self) -> None:
-        while self.is_paused and not self._ended.wait(POLL_S):
+        while self.is_paused and not self._ended.wait(SOCKET_POLL_S):
             pass
 
     def close(self) -> None:
-        """Ends the file and the live view, within DRAW_END_S at most."""
+        """End the file and the live view, within DRAW_END_S."""
         self._ended.set()
         self._thread.join(DRAW_END_S)
 
 
 class ScribeProcess:
-    """Writes and draws the messages that the process receives.
+    """Writer and drawer of the messages that the process receives.
 
-    A failure is reported, and ends only the part that failed.
+    A failure is reported and ends only the part that failed.
     """
 
     def __init__(self, setup: ScribeSetup, skill: bytes | None, source: socket.socket) -> None:
@@ -133,7 +132,7 @@ class ScribeProcess:
         self._errors: list[str] = []
         self._drawing: DrawingThread | None = None
         self._reported_dropped = self._reported_kept = 0
-        self._is_behind = True  # as it begins, so that it is there soon
+        self._is_behind = True  # at the start, with the higher weight
         is_drawn = setup.rrd is not None or (setup.folder is not None and setup.settings.files.rerun)
         if is_drawn or setup.live_port is not None:
             self._drawing = DrawingThread(lambda: _viewer(setup, skill))
@@ -150,14 +149,14 @@ class ScribeProcess:
         self._drawing.draw_into(rrd)
 
     def report(self) -> None:
-        """Sends a report: new errors, where files are written, and how many ticks are on disk."""
+        """Send a report: new errors, paths of files, and the number of ticks on disk."""
         viewer = None if self._drawing is None else self._drawing.viewer
         for problems in (drawn.problems for drawn in (self._drawing, viewer) if drawn is not None):
             while problems:
                 self._errors.append(problems.pop(0))
         if self._drawing is not None and self._drawing.dropped > 2 * self._reported_dropped:
             self._reported_dropped = self._drawing.dropped
-            self._errors.append(f"the drawing cannot keep up: {self._reported_dropped} of its entries dropped")
+            self._errors.append(f"the drawing is too slow: {self._reported_dropped} of its entries were dropped")
         segments = self._segments
         self._reported_kept = segments.kept
         report = ScribeReport(
@@ -178,12 +177,14 @@ class ScribeProcess:
             self._errors.clear()
 
     def report_kept(self) -> None:
-        """Sends a report if more is on disk: unreported ticks count as lost if it dies."""
+        """Send a report if more ticks are on disk, because unreported ones count as lost if this
+        process dies.
+        """
         if self._segments.kept != self._reported_kept:
             self.report()
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
-        """Writes and draws one message."""
+        """Write and draw one message."""
         received, drawing = unpack(message, skills, joints=self._joints), self._drawing
         if isinstance(received, Note):
             key, text, noted_ns = received.key, received.text, received.time_ns
@@ -203,20 +204,20 @@ class ScribeProcess:
         drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
 
     def catch_up(self, waiting: int) -> None:
-        """While the recording is behind, drawing pauses, and the process has an ordinary weight."""
-        if waiting <= BEHIND / 10 if self._is_behind else waiting > BEHIND:
+        """Pause the drawing and raise the process's weight while the recording is behind."""
+        if waiting <= BEHIND_MESSAGES / 10 if self._is_behind else waiting > BEHIND_MESSAGES:
             self._is_behind = not self._is_behind
-            _run_with(CATCH_UP_NICE if self._is_behind else child.NICE)
+            _run_with(CATCH_UP_NICE if self._is_behind else child.CHILD_NICE)
             if self._drawing is not None:
                 self._drawing.is_paused = self._is_behind
 
     def flush(self) -> None:
-        """Hands what was recorded to the operating system, and reports it."""
+        """Pass the recorded data to the operating system and report it."""
         self._segments.flush()
         self.report()
 
     def close(self) -> None:
-        """Ends the files."""
+        """End the files."""
         self._segments.close()
         self.report()
         if self._drawing is not None:
@@ -225,14 +226,14 @@ class ScribeProcess:
 
 
 def _run_with(nice: int) -> None:
-    """Sets the weight of this thread, and of the session of all children among others."""
+    """Set the weight of this thread, and of the session of all children."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
         Path("/proc/self/autogroup").write_text(str(nice))
 
 
 def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
-    from service.viewer.stream import Viewer  # its import takes half a second, and starts threads
+    from service.viewer.stream import Viewer  # its import takes half a second and starts threads
 
     settings = setup.settings
     return Viewer(
@@ -245,37 +246,37 @@ def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
-    """The next message and the files sent along; an empty message: the other side is gone."""
+    """The next message and the files sent with it; an empty message if the other side closed."""
     while True:
         try:
             size, ancillary, _, _ = source.recvmsg_into([buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT)
             break
         except BlockingIOError:
-            time.sleep(POLL_S)
+            time.sleep(SOCKET_POLL_S)
     files = [bytes(child.from_memory(fd)[0]) for fd in child.descriptors(ancillary)]
     return bytes(memoryview(buffer)[:size]), files
 
 
 def _work(source: socket.socket) -> None:
-    buffer = bytearray(LARGEST_MESSAGE)
+    buffer = bytearray(MAX_PACKET_BYTES)
     first, skills = _receive(source, buffer)
     setup = msgspec.json.decode(first, type=ScribeSetup)
     waiting: deque[tuple[bytes, list[bytes]]] = deque()
     ended = threading.Event()
 
     def read() -> None:
-        with contextlib.suppress(OSError):  # it does little, and what it does not read cannot be known to wait
+        with contextlib.suppress(OSError):  # an ordinary weight: it needs little time, and its queue shows the backlog
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
             while (received := _receive(source, buffer))[0]:
                 waiting.append(received)
-                while len(waiting) >= QUEUED:
-                    time.sleep(POLL_S)
+                while len(waiting) >= MAX_WAITING:
+                    time.sleep(SOCKET_POLL_S)
         except ConnectionError:
-            pass  # the same as its end
+            pass  # the other side died
         finally:
-            signal.alarm(END_S)
-            ended.set()  # in any case: without this reader nothing more comes
+            signal.alarm(MAX_CLOSING_S)
+            ended.set()  # after any exception too: without this reader there are no more messages
 
     threading.Thread(target=read, name="socket", daemon=True).start()
     scribe = ScribeProcess(setup, skills[0] if skills else None, source)
@@ -295,11 +296,11 @@ def _work(source: socket.socket) -> None:
 
 
 def run(source: socket.socket) -> None:
-    """Writes and draws what is received until the other side is gone."""
+    """Write and draw the received messages until the other side closes."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # it ends with its socket, once all is written
+        signal.signal(number, signal.SIG_IGN)  # it ends with its socket, after writing everything
     for name, value in RERUN_LOG.items():
         os.environ.setdefault(name, value)
-    child.end_with_parent(END_S)
+    child.end_with_parent(MAX_CLOSING_S)
     _run_with(CATCH_UP_NICE)
     _work(source)

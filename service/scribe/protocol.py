@@ -10,8 +10,8 @@ import numpy as np
 from service.core.frame import TIMING, Event, Outputs, Record, Tick, frame_layout, state_layout
 from service.settings.config import Settings
 
-LONGEST_NOTE = 16_384  # characters
-LARGEST_MESSAGE = 256 * 1024  # skills travel as files in memory instead
+MAX_NOTE_LENGTH = 16_384  # [characters]
+MAX_PACKET_BYTES = 256 * 1024  # skills are larger, and are sent as files in memory
 
 
 class Note(msgspec.Struct, frozen=True, tag=True, array_like=True):
@@ -23,8 +23,8 @@ class Note(msgspec.Struct, frozen=True, tag=True, array_like=True):
 
 
 class _Tick(msgspec.Struct, frozen=True, tag=True, array_like=True):
-    """One tick in bytes. A skill among its events is None: it is in a memory file sent along, of
-    which the last is the skill in force if `with_skill`.
+    """One tick in bytes. A skill among its events is None, and is sent as a memory file. The last
+    of these files is the skill in force if `with_skill`.
     """
 
     index: int
@@ -41,7 +41,7 @@ _MESSAGES = msgspec.msgpack.Decoder(_Tick | Note)
 
 
 class TickMessage(NamedTuple):
-    """One tick as it is sent to the scribe; `lost` ticks before it were not sent."""
+    """One tick as sent to the scribe; `lost` ticks before it were not sent."""
 
     tick: Tick
     frame: Record
@@ -62,40 +62,40 @@ def pack(
     with_skill: bool,
     outputs: Outputs = (),
 ) -> bytes:
-    """One message about a tick, without the bytes of skills."""
+    """The message of a tick, without the bytes of skills."""
     events = [(event.kind, None if event.kind == "skill" else event.payload) for event in tick.inbox]
     end = None if state is None else state.tobytes()
-    told = _Tick(tick.index, lost, events, list(outputs), frame.tobytes(), timing.tobytes(), end, with_skill)
-    return msgspec.msgpack.encode(told)
+    sent = _Tick(tick.index, lost, events, list(outputs), frame.tobytes(), timing.tobytes(), end, with_skill)
+    return msgspec.msgpack.encode(sent)
 
 
 def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage | Note:
-    """The tick, for an arm with so many joints, or the note in a message; `skills` are the files
-    sent along, in order.
+    """The tick or the note in a message. `joints` is the arm's number of joints; `skills` are the
+    files sent with the message, in order.
     """
-    told, files = _MESSAGES.decode(message), iter(skills)
-    if isinstance(told, Note):
-        return told
-    inbox = tuple(Event(kind, next(files) if data is None else data, None) for kind, data in told.events)
-    frame: Record = np.frombuffer(told.frame, frame_layout(joints))[0]
-    timing: Record = np.frombuffer(told.timing, TIMING)[0]
-    state: Record | None = None if told.state is None else np.frombuffer(told.state, state_layout(joints))[0]
-    skill = next(files) if told.with_skill else None
-    return TickMessage(Tick(told.index, inbox), frame, timing, state, skill, told.lost, told.outputs)
+    sent, files = _MESSAGES.decode(message), iter(skills)
+    if isinstance(sent, Note):
+        return sent
+    inbox = tuple(Event(kind, next(files) if data is None else data, None) for kind, data in sent.events)
+    frame: Record = np.frombuffer(sent.frame, frame_layout(joints))[0]
+    timing: Record = np.frombuffer(sent.timing, TIMING)[0]
+    state: Record | None = None if sent.state is None else np.frombuffer(sent.state, state_layout(joints))[0]
+    skill = next(files) if sent.with_skill else None
+    return TickMessage(Tick(sent.index, inbox), frame, timing, state, skill, sent.lost, sent.outputs)
 
 
 def pack_note(key: str, text: str, time_ns: int) -> bytes:
-    """One message with a text for the recording, cut to LONGEST_NOTE."""
-    readable = text[:LONGEST_NOTE].encode(errors="replace").decode()
+    """The message of a text for the recording, cut to MAX_NOTE_LENGTH."""
+    readable = text[:MAX_NOTE_LENGTH].encode(errors="replace").decode()
     return msgspec.msgpack.encode(Note(key, readable, time_ns))
 
 
 class ScribeSetup(msgspec.Struct, frozen=True):
-    """The setup of a scribe; the skill is sent along as a memory file.
+    """The setup of a scribe; the skill is sent with it as a memory file.
 
-    Without state it begins with the first message that has one. `recording` and `rrd` are explicit
-    paths instead of names in `folder`; `attempt` counts the scribes of one daemon; `unmarked` ticks
-    were lost with those before, and no recording marks them yet.
+    Without state the scribe begins with the first message that has one. `recording` and `rrd` are
+    explicit paths instead of names in `folder`. `attempt` counts the scribes of a daemon.
+    `unmarked` ticks were lost with earlier scribes and are not marked in a recording yet.
     """
 
     settings: Settings
@@ -109,9 +109,8 @@ class ScribeSetup(msgspec.Struct, frozen=True):
 
 
 class ScribeReport(msgspec.Struct, frozen=True):
-    """A scribe's report, twice a second: where it writes, and how many of the ticks sent to it are
-    on disk (`kept`), how many never will be (`lost`), and how many of the lost ones no recording
-    marks yet (`unmarked`).
+    """A scribe's report, twice a second: the paths of its files, and the numbers of ticks on disk
+    (`kept`), of lost ticks (`lost`), and of lost ticks that no recording marks yet (`unmarked`).
     """
 
     state: Literal["starting", "recording", "interrupted", "drawing"] = "starting"
@@ -121,7 +120,7 @@ class ScribeReport(msgspec.Struct, frozen=True):
     kept: int = 0
     lost: int = 0
     unmarked: int = 0
-    errors: tuple[str, ...] = ()  # new ones
-    free_mb: float | None = None  # free space where it writes; None: it writes nothing
-    mb_per_hour: float | None = None  # of recordings and drawings lately; None: not known yet
-    keep_mb_left: float | None = None  # that they may grow by before the oldest are removed; None: they are not
+    errors: tuple[str, ...] = ()  # new error messages
+    free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
+    mb_per_hour: float | None = None  # recent growth of recordings and drawings; None: not known yet
+    keep_mb_left: float | None = None  # growth before the oldest recordings are deleted; None: no limit

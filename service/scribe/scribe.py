@@ -1,10 +1,11 @@
 """The daemon's end of the scribe, the process that writes the recording and feeds the viewer.
 
-The loop makes one non-blocking send a tick over a socket pair that keeps message boundaries. What
-does not fit waits here, in a queue of some seconds; a slow or dead scribe does not delay the loop.
-A tick that the queue has no room for is counted as lost, and the next one that fits carries state
-and skill, so that a replay continues behind the gap. A scribe that is dead or hangs is replaced;
-one that is slow is not. What was sent to a dead one and not reported as on disk is lost.
+The loop makes one non-blocking send per tick over a socket pair that keeps message boundaries.
+Messages that do not fit wait in a queue of some seconds, so a slow or dead scribe does not delay
+the loop. A tick that does not fit into the queue is counted as lost, and the next one that fits
+carries state and skill, so that a replay continues after the gap. A scribe that is dead or hangs is
+replaced; a slow one is not. Ticks that were sent to a dead scribe and not reported as on disk are
+lost.
 """
 
 from __future__ import annotations
@@ -23,29 +24,30 @@ import msgspec
 
 from service.core.frame import Outputs, Record, Tick
 from service.process import child
-from service.scribe.protocol import LARGEST_MESSAGE, ScribeReport, ScribeSetup, pack, pack_note
+from service.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, pack_note
 from service.settings.config import Settings
 
-BUFFER_BYTES = 4 * 1024 * 1024  # some seconds of ticks
-_SO_SNDBUFFORCE = 32  # of Linux; Python does not name it
-READY_TIMEOUT_S = 30.0  # without progress, for a scribe to begin
-RESTART_S = 1.0
+BUFFER_BYTES = 4 * 1024 * 1024  # the socket holds some seconds of ticks
+_SO_SNDBUFFORCE = 32  # Linux defines it, Python does not
+READY_TIMEOUT_S = 30.0  # a starting scribe without progress for this time is replaced
+RESTART_S = 1.0  # minimum interval of starts
 NOT_RECORDED = "ticks are not recorded"
-SILENT_S = 5.0  # a scribe reports twice a second
-CLOSE_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
-QUEUED_S = 10.0  # of ticks, that wait for a scribe that begins or falls behind
-CATCH_UP = 8  # ticks sent in the time of one
+HUNG_AFTER_S = 5.0  # a scribe that reports twice a second hangs if it made no progress for this time
+CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
+MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
+MAX_SENDS_PER_TICK = 8  # waiting ticks are sent faster than new ones arrive
 
 
 class Scribe:
-    """Starts the scribe process, and sends it ticks and notes.
+    """The owner of the scribe process, which sends it ticks and notes.
 
     `send` and `skip` are for the loop, `start`, `supervise`, `status` and `close` for one other
-    thread, `note` and `keep` for any.
+    thread, `note` and `keep` for any thread.
 
-    In `folder` it writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another; `recording` and
-    `rrd` are explicit paths. Without any of these and without `live_port` no process is started.
-    One that hangs for `silent_s` [s], or for `ready_s` before it has begun, is replaced.
+    In `folder` the process writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another;
+    `recording` and `rrd` are explicit paths. Without any of these and without `live_port` no
+    process is started. A process that hangs for `silent_s` [s], or for `ready_s` [s] at its start,
+    is replaced.
     """
 
     def __init__(
@@ -57,38 +59,37 @@ class Scribe:
         rrd: Path | None = None,
         live_port: int | None = None,
         restart_s: float = RESTART_S,
-        silent_s: float = SILENT_S,
+        silent_s: float = HUNG_AFTER_S,
         ready_s: float = READY_TIMEOUT_S,
     ) -> None:
         self._settings = settings
         self._restart_s, self._silent_s, self._ready_s = restart_s, silent_s, ready_s
         self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
         self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
-        # of the child that ticks are sent to; None once that is dead
-        self._socket: socket.socket | None = None
+        self._socket: socket.socket | None = None  # socket to the child; None once the child is dead
         self._child: child.Child | None = None
         self._progress: child.Progress | None = None
-        self._listens = False  # whether the child has reported
-        self._queue: deque[tuple[bytes, list[bytes]]] = deque()  # messages, and the skills sent along; for the loop
-        self._most = round(QUEUED_S * settings.rate_hz)
+        self._listens = False  # True once the child has reported
+        self._queue: deque[tuple[bytes, list[bytes]]] = deque()  # messages with the skills to send; for the loop
+        self._most = round(MAX_QUEUED_S * settings.rate_hz)
         self._send_all, self._overflows = True, False
         self._gap = self._lost = self._sent = self._restarts = 0
         self._since_state = 0
-        self._buried = self._unmarked = 0  # ticks lost with dead scribes; those of them that no recording marks
-        self._sent_before = 0  # to dead scribes
+        self._lost_before = self._unmarked = 0  # ticks lost with dead scribes, and those that no recording marks
+        self._sent_before = 0  # ticks sent to dead scribes
         self._started = 0.0
         self._memory: dict[int, tuple[bytes, int]] = {}
         self._report = ScribeReport()
         self._errors: deque[str] = deque(maxlen=5)
 
     def start(self, *, skill: bytes, state: Record | None) -> None:
-        """Starts the process; ticks may be sent at once. Never waits."""
+        """Start the process; ticks may be sent at once. Never waits."""
         if self._wanted:
             self._send_all = state is None
             self._spawn(skill, state)
 
     def ready(self, timeout_s: float) -> bool:
-        """True once the process has begun to work; waits for it for at most `timeout_s`."""
+        """True once the process works; waits for it for at most `timeout_s` [s]."""
         deadline = time.monotonic() + timeout_s
         while not self._listens and self._child is not None and time.monotonic() < deadline:
             self._listen()
@@ -100,7 +101,7 @@ class Scribe:
     def keep(self, skill: bytes) -> int:
         """The descriptor of a memory file with the skill, ready to be sent.
 
-        Preparing takes 1 ms a megabyte: call it on another thread before the loop adopts a skill.
+        It takes 1 ms per megabyte: call it on another thread before the loop adopts a skill.
         """
         known = self._memory.get(id(skill))
         if known is None:
@@ -122,16 +123,16 @@ class Scribe:
         skill: bytes,
         outputs: Outputs = (),
     ) -> None:
-        """Sends a tick, and what it published by key.
+        """Send a tick and its published messages by key.
 
-        Never waits; a tick that cannot be sent is counted. `state` is called once a second, and
+        Never waits; a tick that cannot be sent is counted. `state` is called once a second and
         after a loss.
         """
         if not self._wanted:
             return
         if self._overflows or len(self._queue) >= self._most:
             self._drain()
-            self._overflows = bool(self._queue) or not self._most  # one gap rather than many
+            self._overflows = bool(self._queue) or not self._most  # ends when the queue is empty: one long gap
             if self._overflows:
                 self.skip()
                 return
@@ -148,9 +149,9 @@ class Scribe:
         self._drain()
 
     def _drain(self) -> None:
-        """Sends messages that wait, as many as the socket takes and CATCH_UP at most."""
+        """Send waiting messages until the socket is full, but at most MAX_SENDS_PER_TICK."""
         target = self._socket
-        for _ in range(CATCH_UP):
+        for _ in range(MAX_SENDS_PER_TICK):
             if target is None or not self._queue:
                 return
             message, skills = self._queue[0]
@@ -161,7 +162,7 @@ class Scribe:
                     target.send(message)
             except BlockingIOError:
                 return
-            except OSError:  # it is dead: the next one begins with the next tick
+            except OSError:  # the process is dead; the next one begins with the next tick
                 self._send_all = True
                 if self._socket is target:
                     self._socket = None
@@ -170,7 +171,7 @@ class Scribe:
             self._sent += 1
 
     def skip(self) -> None:
-        """Counts a tick that cannot be sent as lost; for the loop."""
+        """Count a tick that cannot be sent as lost; for the loop."""
         if not self._wanted:
             return
         self._gap += 1
@@ -178,8 +179,8 @@ class Scribe:
         self._send_all = True
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Sends a text for the recording, under `<cell>/<key>`; the viewer shows those under
-        `requests` and `log`. Never waits.
+        """Send a text for the recording, under `<cell>/<key>`; the viewer shows `requests` and
+        `log`. Never waits.
         """
         target = self._socket
         if target is not None:
@@ -187,8 +188,8 @@ class Scribe:
                 target.send(pack_note(key, text, time_ns))
 
     def supervise(self) -> None:
-        """Reads the process's reports, and replaces it if it is dead or hangs, with new files. To
-        be called ten times a second.
+        """Read the process's reports, and replace a process that is dead or hangs. Call it ten
+        times a second.
         """
         if self._child is None or self._progress is None:
             return
@@ -198,31 +199,31 @@ class Scribe:
             limit_s = self._silent_s if self._listens else self._ready_s
             if self._progress.is_hung(limit_s):
                 self._progress.report()
-                self._errors.append(f"the scribe made no progress for {limit_s:g} s and is replaced")
+                self._errors.append(f"the scribe made no progress for {limit_s:g} s, so it is replaced")
                 self._child.kill()
             return
         self._socket = None
         if time.monotonic() - self._started >= self._restart_s:
             self._errors.append(f"the scribe ended with code {code}")
-            self._bury()
+            self._count_lost()
             self._child.socket.close()
             self._restarts += 1
             self._send_all = True
             self._spawn(None, None)
 
-    def _bury(self) -> None:
-        """Counts the ticks that were sent to a dead process and are not on disk."""
+    def _count_lost(self) -> None:
+        """Count the ticks that were sent to a dead process and are not on disk."""
         self._listen()
         last = self._report
         unreported = max(0, self._sent - self._sent_before - last.kept - last.lost)
-        self._buried += last.lost + unreported
+        self._lost_before += last.lost + unreported
         self._unmarked = last.unmarked + unreported + (0 if self._listens else self._unmarked)
         self._sent_before, self._report, self._listens = self._sent, ScribeReport(), False
 
     def status(self) -> dict[str, Any]:
-        """The process's status: alive, its state (`off`, `starting`, `recording`, `drawing` where
-        no recording is wanted, `interrupted` where none can be written), ticks sent and lost,
-        restarts, where it writes, the latest errors.
+        """The process's status: alive, its state (`off`, `starting`, `recording`, `drawing` without
+        a recording, `interrupted` if no recording can be written), ticks sent and lost, restarts,
+        paths of files, and the latest errors.
         """
         alive = self._listens and self._child is not None and self._child.poll() is None
         report = self._report
@@ -231,7 +232,7 @@ class Scribe:
             "state": report.state if alive else "starting" if self._child is not None else "off",
             "pid": None if self._child is None else self._child.pid,
             "sent": self._sent,
-            "lost": self._lost + self._buried + report.lost,
+            "lost": self._lost + self._lost_before + report.lost,
             "restarts": self._restarts,
             "recording": report.recording,
             "rrd": report.rrd,
@@ -242,31 +243,30 @@ class Scribe:
             "keep_mb_left": report.keep_mb_left,
         }
 
-    def close(self, timeout_s: float = CLOSE_S) -> str:
-        """What the recordings lack, in words (empty: nothing), once the process has written all
-        that was sent and closed its files; it is killed if it hangs, or if that takes longer than
-        `timeout_s` [s].
+    def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> str:
+        """Let the process write everything and close its files, and return a message on ticks that
+        are not recorded (empty: none). It is killed if it hangs, or after `timeout_s` [s].
         """
         running, progress = self._child, self._progress
         if running is not None and progress is not None:
             progress.report()
-            running.send_signal(signal.SIGCONT)  # where it was stopped
-            end, is_told = time.monotonic() + timeout_s, False
+            running.send_signal(signal.SIGCONT)  # it may have been stopped
+            end, is_shut = time.monotonic() + timeout_s, False
             while running.poll() is None:
                 self._drain()
-                if not is_told and not self._queue:
-                    is_told = True
+                if not is_shut and not self._queue:
+                    is_shut = True
                     with contextlib.suppress(OSError):
-                        running.socket.shutdown(socket.SHUT_WR)  # also where a forked process still holds this end
+                        running.socket.shutdown(socket.SHUT_WR)  # a forked process may still hold this end
                 if time.monotonic() > end or progress.is_hung(self._ready_s):
-                    self._errors.append("the scribe was not done in time: its last data are lost")
+                    self._errors.append("the scribe did not end in time: its last data are lost")
                     running.kill()
                     running.wait(timeout_s)
                     break
                 time.sleep(0.005)
             self._listen()
             last, self._socket = self._report, None
-            self._bury()
+            self._count_lost()
             self._report = msgspec.structs.replace(last, lost=0)
             self._child = None
             running.socket.close()
@@ -274,11 +274,11 @@ class Scribe:
                 os.close(fd)
             self._memory = {}
             self._lost, self._queue, self._most = self._lost + len(self._queue), deque(), 0
-        lost = self._lost + self._buried if self._folder is not None or self._recording is not None else 0
+        lost = self._lost + self._lost_before if self._folder is not None or self._recording is not None else 0
         return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> None:
-        """Starts a process, and sends it its setup."""
+        """Start a process and send it its setup."""
         folder, recording, rrd = (
             None if path is None else str(path.absolute()) for path in (self._folder, self._recording, self._rrd)
         )
@@ -291,7 +291,7 @@ class Scribe:
         ours.setblocking(False)
         try:
             ours.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, BUFFER_BYTES)
-        except PermissionError:  # then it is cut to what the system allows
+        except PermissionError:  # the size is limited by the system
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         with contextlib.suppress(OSError):
             if skill is None:
@@ -301,11 +301,11 @@ class Scribe:
         self._socket = ours
 
     def _listen(self) -> None:
-        """Reads the reports that have come."""
+        """Read the reports that have arrived."""
         if self._child is None or self._progress is None or not self._child.has_begun():
             return
         with contextlib.suppress(OSError):
-            while data := self._child.socket.recv(LARGEST_MESSAGE, socket.MSG_DONTWAIT):
+            while data := self._child.socket.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT):
                 self._report = msgspec.json.decode(data, type=ScribeReport)
                 self._progress.report()
                 self._errors.extend(self._report.errors)

@@ -1,8 +1,8 @@
-"""The ticks that the scribe receives, written into one recording after another.
+"""Writing of the scribe's ticks into one recording after another.
 
-A recording that is large or old enough ends at a tick whose state is known, and the next begins
-with that state, so that no tick is missing between them. A recording that fails is left as it is;
-the next one begins as soon as that is possible. Ticks lost meanwhile are counted, and marked there.
+A recording that is large or old enough ends at a tick with a known state. The next begins with that
+state, so that no tick is missing between them. After a failure the recording is left as it is, and
+the next one begins as soon as possible; it marks the number of ticks that were lost meanwhile.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ from service.scribe.paths import MB, RecordingPaths
 from service.scribe.protocol import TickMessage
 from service.settings.config import Settings
 
-RETRY_S = 1.0
-SAMPLE_S, GROWTH_S, LEAST_GROWTH_S = 5.0, 600.0, 10.0  # how often sizes are noted, over how long growth is told
-ROOM_BYTES = 1_000_000  # some seconds of ticks; a disk that was full is tried again once this is free
-PRUNE_S = 5.0
+REOPEN_S = 1.0  # interval of attempts to begin a recording
+SAMPLE_S = 5.0  # interval at which sizes of files are noted
+GROWTH_S = 600.0  # growth is measured over at most this time
+MIN_GROWTH_S = 10.0  # growth is unknown before this time
+MIN_FREE_BYTES = 1_000_000  # a full disk is used again once it has space for some seconds of ticks
+PRUNE_S = 5.0  # interval at which old recordings are deleted
 
 
 class Segments:
-    """Writes ticks and notes; `say` is called once with what fails, in words.
+    """Writer of ticks and notes. `say` is called once with the message of each failure.
 
-    `draw` is called with the path of the drawing beside a new recording. Of the ticks received,
-    `kept` are on disk and `lost` never will be. No recording on disk marks `unmarked` of the lost
-    ticks yet; it begins with those of others that went before.
+    `draw` is called with the path of each new drawing. `kept` counts the received ticks on disk,
+    `lost` the lost ones, and `unmarked` the lost ones that no recording on disk marks yet,
+    including those of earlier scribes.
     """
 
     def __init__(
@@ -53,43 +55,45 @@ class Segments:
         self._complete: Path | None = None
         self._kept = self.lost = 0
         self._unmarked = unmarked
-        self._marked = self._marked_pending = 0  # ticks that this recording says are missing; those not on disk yet
+        self._marked = self._marked_pending = 0  # lost ticks marked in this recording; those marks not on disk yet
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = self._drawn = False
-        self._failure: object = None  # the last that was reported
-        self._written = 0  # bytes in files that have ended
-        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], bytes in all
+        self._failure: object = None  # cause of the last reported failure
+        self._written = 0  # [bytes] in files that have ended
+        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], total [bytes]
 
     @property
     def kept(self) -> int:
-        """Ticks on disk."""
+        """Number of ticks on disk."""
         return self._kept + (self._recorder.kept if self._recorder is not None else 0)
 
     @property
     def unmarked(self) -> int:
-        """Lost ticks that no recording on disk marks yet."""
+        """Number of lost ticks that no recording on disk marks yet."""
         return self._unmarked + self._marked_pending
 
     @property
     def path(self) -> Path | None:
-        """The recording being written, or that was written last and is complete."""
+        """The recording being written, or the last complete one."""
         return self._complete if self._recorder is None else self._recorder.path
 
     @property
     def state(self) -> Literal["starting", "recording", "interrupted", "drawing"]:
-        """`starting` before there is a skill; `drawing` where no recording is wanted."""
+        """`starting` before there is a skill; `drawing` without a recording."""
         if self._skill is None or not self._wanted:
             return "starting" if self._skill is None else "drawing"
         return "interrupted" if self._recorder is None else "recording"
 
     def begin(self, skill: bytes | None, state: Record | None) -> None:
-        """Begins with a skill and a state; without them, with the first that are received."""
+        """Begin with a skill and a state; without them, begin with the first that are received."""
         self._skill = skill
         if skill is not None:
             self._recorder = self._opened(state)
 
     def _opened(self, state: Record | None) -> Recorder | None:
-        """A new recording and drawing, if it can be begun; the first drawing begins in any case."""
+        """A new recording with its drawing; None if it cannot be begun. The first drawing begins in
+        any case.
+        """
         self._tried = time.monotonic()
         path, rrd = self._paths.next()
         self._wanted = path is not None
@@ -108,7 +112,7 @@ class Segments:
     def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
         assert self._skill is not None
         try:
-            if self._full and shutil.disk_usage(_existing_folder(path)).free < ROOM_BYTES:
+            if self._full and shutil.disk_usage(_existing_folder(path)).free < MIN_FREE_BYTES:
                 return None
             return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
         except OSError as error:
@@ -117,23 +121,23 @@ class Segments:
             return None
 
     def free_mb(self) -> float | None:
-        """Free space where the recording is written [MB]; None where none is written."""
+        """Free space on the disk of the recording [MB]; None without a recording."""
         with contextlib.suppress(OSError):
             return None if self.path is None else round(shutil.disk_usage(_existing_folder(self.path)).free / 1e6)
         return None
 
     def mb_per_hour(self) -> float | None:
-        """Growth of recordings and drawings lately [MB/h]; None where it is not known yet."""
+        """Recent growth of recordings and drawings [MB/h]; None if it is not known yet."""
         if not self._sizes:
             return None
         (begin_s, begin), now_s = self._sizes[0], time.monotonic()
-        if now_s - begin_s < LEAST_GROWTH_S:
+        if now_s - begin_s < MIN_GROWTH_S:
             return None
         return round((self._written + self._size() - begin) / MB * 3600 / (now_s - begin_s), 1)
 
     @property
     def keep_mb_left(self) -> float | None:
-        """Growth before the oldest recordings are removed [MB]; None where they are not."""
+        """Growth before the oldest recordings are deleted [MB]; None without a limit."""
         left = self._paths.keep_mb_left
         return None if left is None else round(left)
 
@@ -146,24 +150,24 @@ class Segments:
         cause = error.errno or str(error)
         if cause != self._failure:
             self._failure = cause
-            self._say(f"recording to {path} ended: {error.strerror or error}; it continues once that is repaired")
+            self._say(f"recording to {path} failed: {error.strerror or error}; it continues once this is repaired")
 
     def write(self, received: TickMessage) -> int:
-        """Writes a tick; the number of missing ticks before it, if it is marked now, else 0."""
+        """Write a tick, and return the number of lost ticks before it that are marked with it."""
         self._skill = next(
             (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"), self._skill
         )
         self._skill = received.skill or self._skill
         now = time.monotonic()
         may_begin = received.state is not None and self._skill is not None
-        if may_begin and self._recorder is None and now - self._tried > RETRY_S and (self._wanted or self._due(now)):
+        if may_begin and self._recorder is None and now - self._tried > REOPEN_S and (self._wanted or self._due(now)):
             self._recorder = self._opened(None)
         if self._recorder is None:
             if self._wanted:
                 self.lost += 1
                 self._unmarked += 1 + received.lost
             else:
-                self._kept += 1  # drawing was all that was asked for
+                self._kept += 1  # only a drawing is required
             return 0 if self._wanted else received.lost
         missing = received.lost + self._unmarked
         self._marked += missing
@@ -184,8 +188,8 @@ class Segments:
         return too_large or self._moved or now - self._began > files.segment_minutes * 60
 
     def _next(self, state: Record) -> None:
-        """Continues in a new recording, which begins with the old one's last state; stays in the
-        old one where none can be begun.
+        """Continue in a new recording, which begins with the old one's last state, or in the old
+        one if none can be begun.
         """
         self._safely(Recorder.flush)
         new = None if self._recorder is None else self._opened(state)
@@ -194,7 +198,7 @@ class Segments:
             self._recorder = new
 
     def _end(self) -> None:
-        """Ends the recording in progress."""
+        """End the recording in progress."""
         self._safely(Recorder.close)
         if self._recorder is not None:
             self._kept += self._recorder.kept
@@ -202,7 +206,7 @@ class Segments:
             self._recorder = None
 
     def _safely(self, act: Callable[[Recorder], None]) -> None:
-        """Acts on the recording; where that fails it ends, and its pending ticks are lost."""
+        """Act on the recording; after an error it ends, and its pending ticks are lost."""
         recorder = self._recorder
         if recorder is None:
             return
@@ -225,12 +229,12 @@ class Segments:
             _discard(recorder.path)
 
     def note(self, key: str, text: str, time_ns: int) -> None:
-        """Writes a text under `<cell>/<key>`."""
+        """Write a text under `<cell>/<key>`."""
         self._safely(lambda recorder: recorder.note(key, text, time_ns))
 
     def flush(self) -> None:
-        """Hands what was written to the operating system, and checks that the files are at their
-        paths; every PRUNE_S the oldest recordings are removed.
+        """Pass the written data to the operating system, check that the files are at their paths,
+        and delete the oldest recordings every PRUNE_S.
         """
         self._safely(Recorder.flush)
         self._check_files()
@@ -260,7 +264,7 @@ class Segments:
             self._drawn = self._rrd.exists()
 
     def close(self) -> None:
-        """Ends the recording."""
+        """End the recording."""
         self.flush()
         path = self.path
         self._end()
@@ -284,14 +288,14 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None
 
 
 def _bytes_of(path: Path | None) -> int:
-    """The size of a file; 0 where there is none."""
+    """The size of a file; 0 if there is none."""
     with contextlib.suppress(OSError):
         return 0 if path is None else path.stat().st_size
     return 0
 
 
 def _discard(path: Path) -> None:
-    """Removes a recording without a tick."""
+    """Delete a recording without a tick."""
     if path.is_file():
         with contextlib.suppress(OSError):
             path.unlink()

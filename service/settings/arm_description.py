@@ -1,4 +1,4 @@
-"""Completes an arm's settings from its URDF, and refuses those that contradict it."""
+"""Complete an arm's settings from its URDF, and reject settings that contradict it."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from service.contract.explain import ExplainedError, in_words
 from service.settings.robot_xml import readable
 from service.settings.urdf import Shape, Urdf, UrdfError
 
-ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] until the kinematics are known
-MAX_MB = 20  # of a URDF; a humanoid's has 0.1
+ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] assumed before the kinematics are known
+MAX_MB = 20  # a humanoid's URDF has 0.1 MB
 
 
 class SettingsError(ExplainedError, ValueError):
-    """A configuration that cannot be used: names the field, what was given and what is accepted."""
+    """A configuration cannot be used; the message has the field, its value, and accepted values."""
 
 
 class UnreadableError(SettingsError):
-    """A file of settings that cannot be read."""
+    """A file with settings cannot be read."""
 
 
 def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:
-    """An arm's URDF, with a capsule around each collision mesh, or as it is. Meshes are in
-    `packages`, or near it. Raises SettingsError.
+    """An arm's URDF, with a capsule around each collision mesh if `cover`. Meshes are found in
+    `packages`, or in folders above the URDF. Raises SettingsError.
     """
     try:
         text = _text(path)
         if not cover or "<mesh" not in text:
             return text
-        from service.settings.mesh_cover import covered  # heavy, and few arms need it
+        from service.settings.mesh_cover import covered  # its import is slow, and few arms need it
 
         return covered(text, path, packages)
     except OSError as error:
@@ -52,11 +52,11 @@ def _text(path: Path) -> str:
 
 
 class Limits(Protocol):
-    """The joints' settings, as far as a URDF says them."""
+    """The joints' settings that a URDF can contradict."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """In the order of the chain."""
+        """Names of the joints in chain order."""
 
     @property
     def every_kind(self) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class Limits(Protocol):
 
 
 def extent(shape: Shape) -> float:
-    """The length [m] of a shape; 0 of a mesh that is not covered."""
+    """The length [m] of a shape; 0 for a mesh without a capsule."""
     match shape.kind, shape.size:
         case "box", size:
             return math.hypot(*size)
@@ -80,7 +80,7 @@ def extent(shape: Shape) -> float:
 
 
 def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
-    """The settings of an arm with a URDF of its own, with what that says where they are silent.
+    """The settings of an arm with its own URDF; values that are not given come from the URDF.
 
     Raises SettingsError.
     """
@@ -104,14 +104,14 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         ("arm", arm, "posture"),
     )
     if missing := [f"[{path}] {name}" for path, section, name in wanted if name not in section]:
-        needed = f"missing; a URDF does not say it, {len(moving)} numbers needed, one for each joint"
+        needed = f"missing; the URDF does not define it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
 
 
 def check(joints: Limits, urdf: Urdf, plate: str) -> None:
-    """Raises SettingsError for joints the arm does not have, limits wider than the URDF's, and
-    shapes larger than the arm.
+    """Reject joints that the arm does not have, limits wider than the URDF's, and shapes longer
+    than the arm. Raises SettingsError.
     """
     moving = urdf.movable(plate)
     reach = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))

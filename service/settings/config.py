@@ -1,6 +1,6 @@
-"""Settings of one cell: a TOML file, validated whole before anything starts.
+"""Settings of one cell: a TOML file, validated completely before anything starts.
 
-Units stand in the names or beside them, defaults are safe.
+Each number has its unit in its name or in its comment. All defaults are safe.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).parents[1] / "arms" / "wam.urdf"
-RATES_HZ = (50, 1000)  # slowest and fastest
-LONGEST_CELL = 200  # bytes: a recording's name is the cell's and its time, and of 255 bytes at most
-REACHED_SHARE = 0.8  # an arm with a URDF of its own reaches at least this share of a configured `[reach]` ...
-SOME_SHARE = 0.05  # and this share of one that follows from its kinematics, above min_z and before min_x
+RATES_HZ = (50, 1000)  # lowest and highest accepted rate
+MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
+REACHED_SHARE = 0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
+LEAST_REACHED_SHARE = 0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 _LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 Cell = Annotated[
@@ -38,13 +38,14 @@ Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
 
-# Relative paths start from the folder of the configuration, or from the current folder.
-BESIDE = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+# Relative paths in these settings start from the folder of the configuration.
+FROM_FOLDER = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+# Relative paths in these settings start from the current folder.
 FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
-FASTEST_SPEED_UP = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
-FASTEST_JERK = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
+MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
-PRISMATIC_M = 0.5  # what a tolerance of 1 rad is for a prismatic joint: the tool moves as far on a lever of 0.5 m
+PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -52,7 +53,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class HandSettings(Section, frozen=True):
-    """How a tracker's poses become hand positions in frame `base`."""
+    """The tracker's frame, unit and noise, and the limits by which its samples are accepted."""
 
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
@@ -68,7 +69,7 @@ class HandSettings(Section, frozen=True):
 
 
 class ToolSettings(Section, frozen=True):
-    """The tool: where it sits on the tool plate, and how fast it may move."""
+    """The tool: its pose on the tool plate, and its limits of motion."""
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
@@ -88,52 +89,42 @@ class ToolSettings(Section, frozen=True):
         """Acceleration limit of the setpoint [m/s²], as a norm: `max_acceleration`, but at most
         `max_speed` within 80 ms.
 
-        A tool that may move slowly but accelerate fast passes its speed limit in a stop: what its
-        joints add to the speed while they end their accelerations is a² / (2 jerk).
+        A tool with a low speed limit and a high acceleration limit exceeds its speed limit in a
+        stop: while its joints end their accelerations, the speed grows by a² / (2 jerk).
         """
-        return min(self.max_acceleration, FASTEST_SPEED_UP * self.max_speed)
+        return min(self.max_acceleration, MAX_ACCELERATION_PER_SPEED * self.max_speed)
 
     @property
     def jerk(self) -> float:
-        """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most that acceleration
-        within 25 ms.
+        """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most 500 `max_speed`,
+        which reaches that acceleration within 25 ms.
         """
-        return min(self.max_jerk, FASTEST_JERK * self.max_speed)
+        return min(self.max_jerk, MAX_JERK_PER_SPEED * self.max_speed)
 
     @property
     def stop_acceleration(self) -> float:
-        """Acceleration of each axis in a stop [m/s²], with which the norm keeps `acceleration`."""
+        """Acceleration limit of each axis in a stop [m/s²]; the norm then holds `acceleration`."""
         return 0.4 * self.acceleration
 
     @property
     def stop_jerk(self) -> float:
-        """Jerk of each axis in a stop [m/s³], with which the norm keeps `jerk`."""
+        """Jerk limit of each axis in a stop [m/s³]; the norm then holds `jerk`."""
         return self.jerk / math.sqrt(3.0)
 
 
 class ArmSettings(Section, frozen=True):
-    """The arm: which, where its joint states come from, its posture when none come, and when
-    following it is a fault.
+    """The arm: its description, the source of its joint states, its preferred posture, and the
+    limits beyond which following is a fault.
     """
 
     urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
-    packages: tuple[
-        str, ...
-    ] = ()  # folders with packages of ROS, for package:// in the URDF, like /opt/ros/jazzy/share
+    packages: tuple[str, ...] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
     source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
-    posture: PerJoint = (
-        0.1761,
-        0.8604,
-        -0.5,
-        2.5414,
-        -0.4273,
-        -1.0823,
-        0.0,
-    )  # [rad] preferred posture, and the start with `assumed`
+    posture: PerJoint = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] preferred; start if assumed
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
     fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm without joint states is at fault
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm is at fault after this silence
 
 
 class JointSettings(Section, frozen=True):
@@ -179,8 +170,8 @@ class JointSettings(Section, frozen=True):
 
 
 class Reach(Section, frozen=True):
-    """Where targets may lie: a shell around the shoulder, in front of the base plate and above the
-    table [m].
+    """The workspace of targets: a spherical shell around the shoulder, in front of the base plate
+    and above the table [m].
     """
 
     centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
@@ -191,44 +182,45 @@ class Reach(Section, frozen=True):
 
 
 class People(Section, frozen=True):
-    """How near the arm may come to people, and how fast: speed and separation as in ISO/TS 15066.
+    """Speed and separation limits toward people, as in ISO/TS 15066.
 
-    A hand is a capsule from where it is tracked toward the elbow. A part of the arm may approach it
-    as fast as it can still stop `clearance` away, if the hand comes on as fast as now and the stop
-    begins `hands.stale_ms` (so long a hand may move unseen) and `reaction_ms` late. A hand that is
-    not seen for longer is taken to come ever faster, by 5 m/s², up to `unknown_speed`.
+    A hand is a capsule from its tracked point toward the elbow. A part of the arm may approach a
+    hand at the speed from which it can stop `clearance` away from the hand, while the hand
+    continues at its present speed and the stop begins `hands.stale_ms` + `reaction_ms` late: a
+    hand may move unseen for `hands.stale_ms`. A hand out of sight for longer is assumed to
+    accelerate toward the arm at 5 m/s² up to `unknown_speed`.
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm
     length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
     toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand; fingers reach out farther
-    brake: Positive = 3.0  # [m/s²] the slowest joint of the shipped arm brakes its stretched tool by 5
-    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # a sample's interval, a tick, the ramp of the braking
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand's capsule
+    brake: Positive = 3.0  # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # interval of samples + one tick + ramp of the braking
     contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
     unknown_speed: Positive = 1.6  # [m/s] assumed speed of a hand that was only just seen
-    tremor_speed: Positive = 0.1  # [m/s] nothing is foreseen of a slower hand: it trembles; all of it at twice that
+    tremor_speed: Positive = 0.1  # [m/s] a slower hand's motion is ignored as tremor; from twice that it counts in full
 
 
 class Box(Section, frozen=True):
-    """Something that stands around, parallel to the axes of frame base [m]."""
+    """An obstacle: a box parallel to the axes of frame `base` [m]."""
 
     centre: Point
     half_size: tuple[Positive, Positive, Positive]
 
 
 class Obstacles(Section, frozen=True):
-    """What the arm keeps away from besides people: the table, itself, and boxes."""
+    """Obstacles other than people: the table, the arm itself, and boxes."""
 
     boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
     clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] least distance; from the arm itself at most 0.01
-    brake: Positive = 2.0  # [m/s²] deceleration that is assumed toward them
-    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # the ramp of the braking
+    brake: Positive = 2.0  # [m/s²] assumed deceleration toward obstacles
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # ramp of the braking
 
 
-class Table(Section, frozen=True):
-    """The table: its top [m], in pictures, in the simulated bench, and for the arm, which keeps
-    away from it and all below.
+class TableTop(Section, frozen=True):
+    """The table top [m]. The arm avoids it and everything below; pictures and the simulation draw
+    it.
     """
 
     centre: Point = (0.80, 0.0, 0.0)  # [m]
@@ -236,16 +228,16 @@ class Table(Section, frozen=True):
 
 
 class SkillSettings(Section, frozen=True):
-    """How the skill is followed."""
+    """The timing with which the skill is followed."""
 
     lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # the tool is this far ahead of the teacher's timing
 
 
 class Files(Section, frozen=True):
-    """Where skills are read, and via-points, recordings and viewer files are written."""
+    """Folders of skills, via-points and recordings, and the limits of recordings."""
 
     skills: str = ""  # a folder; empty: the shipped recordings
-    state: str = "~/.local/state/thirdhand"  # a folder; via-points are kept there over a restart
+    state: str = "~/.local/state/thirdhand"  # a folder; via-points are stored there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
     rerun: bool = True  # write an .rrd file beside each recording
     rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
@@ -265,7 +257,7 @@ class Settings(Section, frozen=True):
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
     joints: JointSettings = msgspec.field(default_factory=JointSettings)
     reach: Reach = msgspec.field(default_factory=Reach)
-    table: Table = msgspec.field(default_factory=Table)
+    table: TableTop = msgspec.field(default_factory=TableTop)
     people: People = msgspec.field(default_factory=People)
     obstacles: Obstacles = msgspec.field(default_factory=Obstacles)
     network: Network = msgspec.field(default_factory=Network)
@@ -278,13 +270,13 @@ class Settings(Section, frozen=True):
             raise ValueError("\n".join(problems))
 
     def _problems(self) -> Iterator[str]:
-        """What is wrong with values that are right each by itself."""
+        """Contradictions between values that are valid on their own."""
         unusable = [path for path, value in _numbers(msgspec.to_builtins(self), "$") if not math.isfinite(value)]
         yield from (f"{path}: not finite; a finite number needed" for path in unusable)
         if {".", ".."} & set(self.cell.split("/")):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
-        if (size := len(self.cell.encode())) > LONGEST_CELL:
-            yield f"$.cell: a name of {size} bytes given; at most {LONGEST_CELL} accepted, as files are named by it"
+        if (size := len(self.cell.encode())) > MAX_CELL_BYTES:
+            yield f"$.cell: a name of {size} bytes given; at most {MAX_CELL_BYTES} accepted, as files have this name"
         if unusable:
             return
         if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
@@ -344,7 +336,7 @@ class Settings(Section, frozen=True):
                 yield f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted"
 
     def _widest(self) -> dict[str, PerJoint]:
-        """Bounds of the limits: the defaults for the shipped arm, none for others."""
+        """Bounds of the limits: the defaults for the shipped arm, infinity for others."""
         if not self.arm.urdf:
             return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
         n = len(self.joints.names)
@@ -357,7 +349,7 @@ class Settings(Section, frozen=True):
 
 
 def urdf_path(settings: Settings) -> Path:
-    """Where the arm's URDF is."""
+    """The path of the arm's URDF."""
     return Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM
 
 
@@ -378,13 +370,13 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
 
 
 def _make_paths_absolute(given: Any, folder: Path | None) -> None:
-    """Makes every path absolute, so that its meaning no longer depends on a folder. Raises
+    """Make every path absolute, so that its meaning no longer depends on a folder. Raises
     SettingsError.
     """
-    for section, name in (*BESIDE, *FROM_HERE):
+    for section, name in (*FROM_FOLDER, *FROM_HERE):
         table = given.get(section) if isinstance(given, dict) else None
         value = table.get(name) if isinstance(table, dict) else None
-        base = folder if folder is not None and (section, name) in BESIDE else Path()
+        base = folder if folder is not None and (section, name) in FROM_FOLDER else Path()
         if isinstance(table, dict) and isinstance(value, str):
             table[name] = _absolute(value, base, f"[{section}] {name}")
         elif isinstance(table, dict) and isinstance(value, list | tuple):
@@ -395,13 +387,15 @@ def _make_paths_absolute(given: Any, folder: Path | None) -> None:
 
 
 def _absolute(value: str, base: Path, where: str) -> str:
-    """A path, from `base` where it is relative; none stays none. Raises SettingsError."""
+    """An absolute path; a relative `value` starts from `base`, an empty one remains empty. Raises
+    SettingsError.
+    """
     if "\0" in value:
         raise SettingsError(f"{where}: {value!r} given; a path holds no zero bytes")
     try:
         return str((base / Path(value).expanduser()).absolute()) if value else ""
     except RuntimeError:
-        raise SettingsError(f"{where}: {value!r} given; there is no such user's folder") from None
+        raise SettingsError(f"{where}: {value!r} given; no user of this name has a folder here") from None
 
 
 def _mistakes(given: Any) -> list[str]:
@@ -413,11 +407,11 @@ def _mistakes(given: Any) -> list[str]:
 
 
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
-    """Settings from what a TOML file holds; `origin` names it in errors. Raises SettingsError.
+    """Settings from the content of a TOML file; `origin` names it in errors. Raises SettingsError.
 
     Relative paths of URDF, packages, certificate and Zenoh configuration start from `folder`, those
-    of [files] from the current folder; all become absolute here. What is not said of an arm with a
-    URDF of its own is taken from there; no limit may be wider than the URDF's.
+    of [files] from the current folder; all become absolute here. For an arm with its own URDF,
+    settings that are not given are taken from the URDF; no limit may be wider than the URDF's.
     """
     try:
         _make_paths_absolute(given, folder)
@@ -426,7 +420,7 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
             try:
                 own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
                 given = completed(given, Urdf(own, origin=arm["urdf"]))
-            except (UrdfError, SettingsError) as error:  # all else that is wrong, but for what is the arm's
+            except (UrdfError, SettingsError) as error:  # mistakes outside the arm's tables are reported too
                 others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
                 raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
         settings = validated(given, Settings)
@@ -439,24 +433,24 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
     return settings
 
 
-def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
-    """The settings with the reach that follows from the arm's kinematics, but for what is `said`.
+def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
+    """The settings with a reach from the arm's kinematics, except for the `given` fields of it.
 
-    Raises SettingsError where the arm reaches too little of it.
+    Raises SettingsError if the arm reaches too small a share of it.
     """
-    from service.settings.reachable import Shell, workspace_of  # heavy, and few arms need it
+    from service.settings.reachable import Shell, workspace_of  # its import is slow, and few arms need it
 
     workspace = workspace_of(
         urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
     )
     reach = settings.reach
     found = workspace.shell(reach.min_x, reach.min_z)
-    outer = reach.outer if "outer" in said else min(found.outer, reach.outer)
-    inner = reach.inner if "inner" in said else min(found.inner, found.inner / found.outer * outer)
-    centre = reach.centre if "centre" in said else found.centre
+    outer = reach.outer if "outer" in given else min(found.outer, reach.outer)
+    inner = reach.inner if "inner" in given else min(found.inner, found.inner / found.outer * outer)
+    centre = reach.centre if "centre" in given else found.centre
     reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
     share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
-    needed = REACHED_SHARE if said & {"centre", "inner", "outer"} else SOME_SHARE
+    needed = REACHED_SHARE if given & {"centre", "inner", "outer"} else LEAST_REACHED_SHARE
     if share < needed:
         raise SettingsError(
             f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
@@ -467,13 +461,13 @@ def _with_reach(settings: Settings, urdf: Urdf, said: set[str]) -> Settings:
 
 
 def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
-    """Settings from TOML text, as `converted` takes them. Raises SettingsError."""
+    """Settings from TOML text; see `converted`. Raises SettingsError."""
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{origin}: {error}") from None
     except RecursionError:
-        raise SettingsError(f"{origin}: tables or lists in each other, too deep to be meant") from None
+        raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None
     return converted(given, origin=origin, folder=folder)
 
 

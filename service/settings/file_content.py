@@ -1,6 +1,4 @@
-"""The content of a file that a person or an earlier run names: never more than expected, and never
-a wait for what no file holds.
-"""
+"""Bounded reading of files: never more than expected, and no waiting for devices or pipes."""
 
 from __future__ import annotations
 
@@ -9,15 +7,15 @@ from pathlib import Path
 
 from service.contract.explain import ExplainedError
 
-LARGEST_CONFIGURATION = 1_000_000  # bytes
+LARGEST_CONFIGURATION = 1_000_000  # [bytes]
 
 
 class UnusableError(ExplainedError, ValueError):
-    """A file that cannot be used; the message says why."""
+    """A file cannot be used; the message has the cause."""
 
 
 def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> bytes:
-    """The bytes of a regular file, or, where these are accepted, of a pipe.
+    """The bytes of a regular file, or of a pipe if these are accepted.
 
     Raises OSError, UnusableError.
     """

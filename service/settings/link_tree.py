@@ -1,5 +1,5 @@
-"""The tree of a robot's links: each link has one parent, but for the root. Anything else is refused
-in words, and in a time that grows with the number of links alone.
+"""The tree of a robot's links: each link but the root has one parent. Anything else is rejected
+with a message, in a time that is linear in the number of links.
 """
 
 from __future__ import annotations
@@ -9,27 +9,27 @@ from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 MAX_LINKS = 1000  # a humanoid with its hands has 200
-SHOWN = 4  # names in a message
+MAX_NAMED_LINKS = 4  # a message names at most this many
 
 
 class Edge(Protocol):
-    """A joint, by the links that it connects."""
+    """A joint and the two links that it connects."""
 
     @property
     def name(self) -> str:
-        """The joint's own name."""
+        """Name of the joint."""
 
     @property
     def parent(self) -> str:
-        """The link that carries it."""
+        """The link that carries the joint."""
 
     @property
     def child(self) -> str:
-        """The link that it carries."""
+        """The link that the joint carries."""
 
 
 def root_of(links: Sequence[str], joints: Sequence[Edge]) -> str:
-    """The link that all others hang on. Raises ValueError where links and joints are no tree."""
+    """The root link. Raises ValueError if links and joints do not form a tree."""
     if len(links) > MAX_LINKS:
         raise ValueError(f"{len(links)} links; up to {MAX_LINKS} accepted: leave out what does not belong to the arm")
     for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
@@ -72,5 +72,5 @@ def _children(joints: Iterable[Edge]) -> dict[str, list[str]]:
 
 def _named(names: Sequence[str]) -> str:
     """The first few of some names, for a message."""
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(map(repr, names[:SHOWN])) + more
+    more = f" and {len(names) - MAX_NAMED_LINKS} more" if len(names) > MAX_NAMED_LINKS else ""
+    return ", ".join(map(repr, names[:MAX_NAMED_LINKS])) + more

@@ -1,5 +1,5 @@
-"""Covers the collision meshes of a URDF with capsules, which are written beside the meshes' names:
-so whoever has the text needs no file besides.
+"""Capsules around the collision meshes of a URDF, written into the URDF beside the meshes' names,
+so that the text alone describes the arm's shape.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from service.contract.explain import in_words
 from service.settings.urdf import COVER, UrdfError
 
 Points = NDArray[np.float64]
-ROUNDED = 4  # digits of a capsule's ends [m]; its radius is that much larger
-TINY = 1e-12  # [m²]
-KEPT = Path("~/.cache/thirdhand/capsules")  # where capsules are kept, by a digest of mesh and scale
-EVALUATIONS = 100  # of the cost, for each principal axis
-SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))  # tilts; offsets by the size
-RADII = np.linspace(1.0, 1.5, 12)  # that are tried, times the least that holds the points
+END_DIGITS = 4  # a capsule's ends are rounded to 0.1 mm, and its radius is enlarged by 0.1 mm
+MIN_AXIS2_M2 = 1e-12  # added to a squared length, so that an axis of length 0 divides nothing by 0
+CAPSULE_CACHE = Path("~/.cache/thirdhand/capsules")  # files are named by a digest of mesh and scale
+EVALUATIONS = 100  # the cost is evaluated this often for each principal axis
+SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))  # first steps: two tilts, two offsets / size
+RADII = np.linspace(1.0, 1.5, 12)  # tried radii / smallest radius that holds all points
 _HEIGHTS = (np.arange(100) + 0.5) / 100
-_TURNS = np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))  # golden angle: directions spread evenly
+_TURNS = np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))  # the golden angle spreads directions evenly
 DIRECTIONS = np.column_stack(
     (np.sqrt(1.0 - _HEIGHTS**2) * np.cos(_TURNS), np.sqrt(1.0 - _HEIGHTS**2) * np.sin(_TURNS), _HEIGHTS)
-).astype(np.float32)  # over half a sphere
+).astype(np.float32)  # (100, 3) unit vectors over half a sphere
 
 
 @functools.cache
 def covered(text: str, path: Path, packages: tuple[str, ...] = ()) -> str:
     """The URDF in a file, with a capsule around each collision mesh that has none. `packages` are
-    folders in which ROS has packages.
+    folders of ROS packages.
 
-    Raises UrdfError for a mesh that is not found, is none, or has numbers that are not finite.
+    Raises UrdfError for a mesh that is not found, is not a mesh, or has vertices that are not
+    finite.
     """
     robot = ElementTree.fromstring(text)
     if lost := unfound(robot, path, packages, "collision"):
@@ -55,8 +56,8 @@ def covered(text: str, path: Path, packages: tuple[str, ...] = ()) -> str:
 def _capsule(
     mesh: ElementTree.Element, link: ElementTree.Element, urdf: Path, packages: tuple[str, ...]
 ) -> tuple[float, ...]:
-    """The capsule around a mesh in its own frame, scaled as the URDF says; mirrored where a scale
-    is negative. Raises UrdfError.
+    """The capsule around a mesh in its own frame, with the URDF's scale; a negative scale mirrors
+    the mesh. Raises UrdfError.
     """
     name, scale = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
     what = f"{urdf}: the collision mesh {name} of link {link.get('name', '')!r}"
@@ -77,7 +78,7 @@ def _capsule(
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
-        words = in_words(error, named=False).rpartition("message:")[2]  # before it a library names its own files
+        words = in_words(error, named=False).rpartition("message:")[2]  # the library's source file is cut off
         raise UrdfError(f"{what} cannot be read: {' '.join(words.split())}") from None
     return known
 
@@ -85,7 +86,7 @@ def _capsule(
 def found_meshes(
     robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...]
 ) -> Iterator[tuple[ElementTree.Element, Path]]:
-    """The meshes of a robot whose files exist, with these files."""
+    """The meshes of a robot whose files exist, each with its file."""
     for mesh in robot.iter("mesh"):
         candidates = _candidates(mesh.get("filename", ""), urdf, packages)
         if file := next((one for one in candidates if one.is_file()), None):
@@ -93,11 +94,10 @@ def found_meshes(
 
 
 def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], kind: str) -> str:
-    """A sentence, without its end, on the meshes of a kind (collision or visual) that are not
-    found: which they are, where they were looked for, and how to name their folder. Empty where
-    all are found or covered.
+    """A message on the meshes of a kind (collision or visual) that are not found: their names, the
+    searched folders, and how to add a folder. Empty if all are found or covered.
     """
-    lost: dict[str, str] = {}  # the link of each file's name
+    lost: dict[str, str] = {}  # link by name of the file
     for link in robot.iter("link"):
         for mesh in (found for one in link.iter(kind) for found in one.iter("mesh")):
             name = mesh.get("filename", "")
@@ -122,7 +122,7 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
 
 
 def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
-    """Where the file of a mesh may be."""
+    """The paths at which the file of a mesh may be."""
     scheme, _, rest = name.rpartition("://")
     if scheme not in ("package", "model"):
         return [urdf.parent / rest]
@@ -137,15 +137,15 @@ def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
 def _vertices(file: Path, data: bytes) -> Points:
     """The vertices (N, 3) of a mesh [m], in the axes of the file.
 
-    A binary STL file is 80 bytes, the number of triangles, and for each of them 50 bytes. Collada
-    says in which unit it is; its <up_axis> turns nothing, as in RViz and MoveIt, because robots'
-    meshes are drawn in the frames of their links.
+    A binary STL file has 80 bytes, the number of triangles, and 50 bytes for each triangle. A
+    Collada file has a unit. Its <up_axis> is ignored, as in RViz and MoveIt, because robots' meshes
+    are drawn in the frames of their links.
     """
     count = int.from_bytes(data[80:84], "little")
     if file.suffix.lower() == ".stl" and len(data) == 84 + 50 * count:
         triangles = np.frombuffer(data[84:], np.dtype([("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("", "<u2")]))
         return triangles["at"].reshape(-1, 3).astype(np.float64)
-    import coal  # heavy, and few arms need it
+    import coal  # its import is slow, and few arms need it
 
     unit = _unit_m(data) if file.suffix.lower() == ".dae" else 1.0
     return unit * np.array(coal.MeshLoader().load(str(file), np.ones(3)).vertices())
@@ -162,18 +162,20 @@ def _unit_m(collada: bytes) -> float:
 
 
 def _kept(name: str) -> tuple[float, ...] | None:
-    """A capsule that was found before; None where there is none, or the file is no capsule."""
+    """A cached capsule; None if there is no such file, or it does not hold a capsule."""
     with contextlib.suppress(OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
-        found = tuple(float(number) for number in (KEPT.expanduser() / name).read_text(encoding="ascii").split())
+        found = tuple(
+            float(number) for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()
+        )
         if len(found) == 7 and all(map(math.isfinite, found)) and found[6] > 0.0:
             return found
     return None
 
 
 def _keep(name: str, capsule: tuple[float, ...]) -> None:
-    """Keeps a capsule. Where nothing can be written it is found anew each time."""
+    """Cache a capsule. If the folder is not writable, it is computed again each time."""
     with contextlib.suppress(OSError, RuntimeError):
-        folder = KEPT.expanduser()
+        folder = CAPSULE_CACHE.expanduser()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as new:
             new.write(" ".join(map(repr, map(float, capsule))))
@@ -181,17 +183,17 @@ def _keep(name: str, capsule: tuple[float, ...]) -> None:
 
 
 def capsule_around(points: Points) -> tuple[float, ...]:
-    """The ends of its axis and the radius (7,) [m] of a capsule about as small and thin as any that
-    holds all points (N, 3).
+    """A small and thin capsule that holds all points (N, 3): the ends of its axis and its radius
+    (7,) [m].
 
-    An axis is two tilts and two offsets from a principal axis of the points. With the points at
-    distances d from it and heights h along it, a radius r needs the axis from
-    min(h + sqrt(r² - d²)) to max(h - sqrt(r² - d²)); the radius that costs least is taken.
+    The axis is a principal axis of the points, changed by two tilts and two offsets. For points at
+    distances d from it and heights h along it, a radius r requires the axis to reach from
+    min(h + sqrt(r² - d²)) to max(h - sqrt(r² - d²)). The radius of lowest cost is taken.
     """
     outline = _outline(points)
     middle = outline.mean(axis=0)
     outline = outline - middle
-    size, best = float(np.abs(outline).max()) + 10.0**-ROUNDED, (math.inf, np.zeros(6))
+    size, best = float(np.abs(outline).max()) + 10.0**-END_DIGITS, (math.inf, np.zeros(6))
 
     def around(q: Points, axis: Points, across: Points) -> tuple[float, Points]:
         along = axis + q[:2] @ across
@@ -210,18 +212,19 @@ def capsule_around(points: Points) -> tuple[float, ...]:
             options={"maxfev": EVALUATIONS, "initial_simplex": SIMPLEX, "xatol": 1e-3, "fatol": 1e-4 * size**4},
         )
         best = min(best, around(found.x, axis, across), key=lambda one: one[0])
-    ends = np.round(best[1] + np.tile(middle, 2), ROUNDED)
-    return (*ends.tolist(), _radius(points, ends) + 10.0**-ROUNDED)
+    ends = np.round(best[1] + np.tile(middle, 2), END_DIGITS)
+    return (*ends.tolist(), _radius(points, ends) + 10.0**-END_DIGITS)
 
 
 def _along(points: Points, along: Points, start: Points) -> tuple[float, Points]:
-    """The cost, and the ends (6,) of the axis, of the best capsule along a line that holds points
-    (N, 3); the cost is its volume times its radius.
+    """Cost and ends of the axis (6,) of the best capsule along a line that holds points (N, 3).
+
+    cost = volume * radius.
     """
     away = points - start
     heights = away @ along
     squares = np.maximum((away * away).sum(axis=1) - heights * heights, 0.0)
-    radii = (math.sqrt(squares.max()) + 10.0**-ROUNDED) * RADII  # on a line, no length would cost anything
+    radii = (math.sqrt(squares.max()) + 10.0**-END_DIGITS) * RADII  # above 0, or points on a line cost nothing
     depths = np.sqrt(radii[:, None] ** 2 - squares)
     low, high = (heights + depths).min(axis=1), (heights - depths).max(axis=1)
     low, high = np.where(low > high, 0.5 * (low + high), low), np.where(low > high, 0.5 * (low + high), high)
@@ -231,7 +234,7 @@ def _along(points: Points, along: Points, start: Points) -> tuple[float, Points]
 
 
 def _outline(points: Points) -> Points:
-    """The points (N, 3) that are outermost in some of many directions."""
+    """The points (N, 3) that are outermost in one of DIRECTIONS."""
     along = DIRECTIONS @ points.T.astype(np.float32)
     outermost: Points = points[np.unique((along.argmin(axis=1), along.argmax(axis=1)))]
     return outermost
@@ -240,5 +243,5 @@ def _outline(points: Points) -> Points:
 def _radius(points: Points, ends: Points) -> float:
     """The greatest distance of points (N, 3) from the segment between two ends (6,)."""
     start, way = ends[:3], ends[3:] - ends[:3]
-    share = np.clip((points - start) @ way / (way @ way + TINY), 0.0, 1.0)
+    share = np.clip((points - start) @ way / (way @ way + MIN_AXIS2_M2), 0.0, 1.0)
     return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max())

@@ -21,14 +21,13 @@ Domain = Annotated[
 Topic = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z",
-        extra={"accepted": "a topic's full name, /like/this,"},
+        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z", extra={"accepted": "a topic's full name, /like/this,"}
     ),
 ]
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only processes of this machine reach a Zenoh endpoint."""
+    """True if only processes of this machine can reach a Zenoh endpoint."""
     protocol, _, address = endpoint.partition("/")
     host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
     try:
@@ -38,18 +37,18 @@ def is_local(endpoint: str) -> bool:
 
 
 class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Zenoh endpoints. Nothing is announced by multicast; peers are named.
+    """Zenoh endpoints. The service announces nothing by multicast and connects to named peers only.
 
-    With a certificate all endpoints are TLS, and each role may do its own only.
+    With a certificate all endpoints are TLS, and each role has its own rights.
     """
 
     listen: tuple[str, ...] = (ENDPOINT,)  # endpoints on which the daemon listens; port 0: a free one
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
     certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
-    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, whose holders may do nothing any more
-    zenoh_config: str = ""  # a file of Zenoh's own, for what is not set by the service; empty: none
-    ros2_domain: Domain = None  # of ROS 2 nodes that see the cell through rmw_zenoh; None: none
-    allow_insecure: bool = False  # on a network without TLS: whoever reaches it, or its router, moves the arm
+    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, that are no longer accepted
+    zenoh_config: str = ""  # file with Zenoh's own settings, where the service sets none; empty: none
+    ros2_domain: Domain = None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
+    allow_insecure: bool = False  # accept a network without TLS: everyone on it, or at its router, can move the arm
 
     def __post_init__(self) -> None:
         given = {"listen": self.listen, "connect": self.connect}
@@ -66,7 +65,9 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
                     "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
                 )
         if self.revoked and not self.certificate:
-            raise ValueError("$.network.revoked: given without $.network.certificate; without one nobody is told apart")
+            raise ValueError(
+                "$.network.revoked: given without $.network.certificate, without which no client has a certificate"
+            )
         for i, name in enumerate(self.revoked):
             if not any(name in names(role) for role in (*ROLES, DAEMON)):
                 raise ValueError(
@@ -76,14 +77,14 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The arm's controllers of ros2_control, which take commands as they are, and what RViz and rqt
-    show, in the domain `network.ros2_domain`. Of each the full name of its topic; empty: none.
+    """Topics in the domain `network.ros2_domain`: of the arm's controllers in ros2_control, and of
+    RViz and rqt. Each setting is the full name of a topic; empty: none.
     """
 
-    position_commands: Topic = ""  # of a forward_command_controller for positions: /<its name>/commands
-    trajectory: Topic = ""  # of a joint_trajectory_controller: /<its name>/joint_trajectory
-    joint_states: Topic = ""  # of the joint_state_broadcaster: /joint_states, heard beside the cell's own
-    joints: tuple[str, ...] = ()  # in the order of the controller's parameter `joints`; empty: that of `joints.names`
-    tf: Topic = ""  # /tf: setpoint, target and hands ten times a second; what is fixed on the name that ends in _static
-    robot_description: Topic = ""  # /robot_description: the URDF, latched; the links join `tf`. Not beside another's
+    position_commands: Topic = ""  # forward_command_controller for positions: /<its name>/commands
+    trajectory: Topic = ""  # joint_trajectory_controller: /<its name>/joint_trajectory
+    joint_states: Topic = ""  # joint_state_broadcaster: /joint_states, received in addition to the cell's own
+    joints: tuple[str, ...] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
+    tf: Topic = ""  # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
+    robot_description: Topic = ""  # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
     diagnostics: Topic = ""  # /diagnostics: mode, reason and lateness each second

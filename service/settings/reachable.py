@@ -1,6 +1,7 @@
-"""Where an arm's tool can be, by its kinematics, and the shell around its shoulder that it reaches.
+"""The positions that an arm's tool can have, by its kinematics, and the spherical shell around its
+shoulder that it reaches.
 
-For N postures, drawn evenly over the joints' limits: position of the tool
+For N postures, drawn evenly over the joints' limits, the position of the tool is
 
     p = T_1 R_1(q_1) T_2 R_2(q_2) ... T_plate p_tool.
 """
@@ -18,24 +19,24 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from service.settings.urdf import Joint
+from service.settings.urdf import UrdfJoint
 
 Vectors = NDArray[np.float64]
 POSTURES = 30_000  # with more the shell's radii change by less than 1 %
-POINTS = 8_000  # of space that are tested
-SPACING = 0.03  # of the arm's extent: a point is reached when the tool is that near in one of the postures
-RAIL_STEPS = 9  # positions of a prismatic joint below the first one that turns
-NEIGHBOURS = 12  # postures that are looked at for each point
-MORE_NEIGHBOURS = 64  # postures that are looked at for a point that is near none of those
-CERTAIN = 0.08  # of the arm's extent: the tool is never farther from its position in the nearest posture than 0.072
-REACHED = 0.95  # share of the points at a distance from the shoulder that the arm reaches there
+TEST_POINTS = 8_000  # points in space are tested for being reached
+NEAR_SHARE = 0.03  # a reached point is within 0.03 of the arm's extent of the tool in one of the postures
+RAIL_STEPS = 9  # positions of a prismatic joint below the first joint that turns
+NEAR_POSTURES = 12  # this many of the nearest postures are compared for each point
+MORE_NEAR_POSTURES = 64  # compared for a point that is near none of NEAR_POSTURES
+BEYOND_SHARE = 0.08  # distance / extent of points out of reach; measured for reached points: at most 0.072
+REACHED = 0.95  # a layer is reached if this share of the best layer's share of points is reached
 LAYERS = 40  # distances from the shoulder that are tested
-FOLDED = 0.4  # of the outer radius: nearer to its shoulder an arm is folded onto itself
-STRETCHED = 0.96  # of the maximum distance: farther out an arm is singular
+FOLDED = 0.4  # min. inner radius / outer radius: nearer to its shoulder an arm is folded onto itself
+STRETCHED = 0.96  # max. outer radius / maximum distance: farther out an arm is singular
 
 
 class Shell(NamedTuple):
-    """Places between two distances from a point [m]."""
+    """The points between two distances from a centre [m]."""
 
     centre: tuple[float, float, float]
     inner: float
@@ -46,7 +47,11 @@ class Workspace:
     """Positions of an arm's tool (N, 3) [m], frame of the root link."""
 
     def __init__(
-        self, chain: Sequence[Joint], lower: Sequence[float], upper: Sequence[float], plate_from_tool: Sequence[float]
+        self,
+        chain: Sequence[UrdfJoint],
+        lower: Sequence[float],
+        upper: Sequence[float],
+        plate_from_tool: Sequence[float],
     ) -> None:
         moving = [joint for joint in chain if joint.kind != "fixed"]
         ends = np.array([_turns(low, high) for low, high in zip(lower, upper, strict=True)])
@@ -69,18 +74,18 @@ class Workspace:
         self._tree, self._starts = cKDTree(flat), angles - self.postures[:, rails]
 
     def reaches(self, points: Vectors) -> NDArray[np.bool_]:
-        """True for each of the points (M, 3) that is near the tool in one of the postures."""
-        return np.asarray(self._nearest(points, NEIGHBOURS) <= SPACING * self._reach)
+        """A mask (M,) of the points (M, 3) that are near the tool in one of the postures."""
+        return np.asarray(self._nearest(points, NEAR_POSTURES) <= NEAR_SHARE * self._reach)
 
     def beyond(self, points: Vectors) -> Vectors:
-        """Distances (M,) [m] of points (M, 3) from where the tool can be; 0 where it comes."""
+        """Distances (M,) [m] of points (M, 3) from the reached positions; 0 for reached points."""
         out = np.where(self.reaches(points), 0.0, math.inf)
-        out[out > 0.0] = self._nearest(points[out > 0.0], MORE_NEIGHBOURS)
-        return np.where(out > CERTAIN * self.extent, out, 0.0)
+        out[out > 0.0] = self._nearest(points[out > 0.0], MORE_NEAR_POSTURES)
+        return np.where(out > BEYOND_SHARE * self.extent, out, 0.0)
 
     def _nearest(self, points: Vectors, neighbours: int) -> Vectors:
-        """Distances (M,) [m] of points (M, 3) from the tool in the nearest of the postures, with
-        the rails below the first joint that turns at any of their stops.
+        """Distances (M,) [m] of points (M, 3) from the tool in the nearest posture, over all stops
+        of the rails below the first joint that turns.
         """
         return np.asarray(np.min([self._distances(points - stop, neighbours) for stop in self._stops], axis=0))
 
@@ -103,7 +108,7 @@ class Workspace:
 
     def _flattened(self, points: Vectors) -> tuple[Vectors, Vectors]:
         """Distances of points (M, 3) from the first axis and heights along it (M, 2), and angles
-        about it (M,); the points themselves and 0 where no joint turns.
+        about it (M,). Without a joint that turns: the points themselves, and 0.
         """
         if not self._turns:
             return points, np.zeros(len(points))
@@ -113,8 +118,8 @@ class Workspace:
         return np.column_stack((np.hypot(x, y), away @ self._axis)), np.arctan2(y, x)
 
     def shell(self, min_x: float, min_z: float) -> Shell:
-        """The widest shell around the shoulder of which the arm reaches about all above `min_z` and
-        before `min_x`.
+        """The widest shell around the shoulder that the arm reaches nearly whole where z >= `min_z`
+        and x >= `min_x`.
         """
         points, distances = _ball(self.shoulder, self.extent, min_x, min_z)
         edges = np.linspace(0.0, self.extent, LAYERS + 1)
@@ -128,8 +133,8 @@ class Workspace:
         return Shell((round(x, 4), round(y, 4), round(z, 4)), round(float(inner), 4), round(float(outer), 4))
 
     def share(self, shell: Shell, min_x: float, min_z: float) -> float:
-        """Share of a shell, above `min_z` and before `min_x`, that the arm reaches; 0 where nothing
-        of it is left.
+        """Reached share of the part of a shell where z >= `min_z` and x >= `min_x`; 0 if that part
+        is empty.
         """
         points, distances = _ball(np.array(shell.centre), shell.outer, min_x, min_z)
         points = points[distances >= shell.inner]
@@ -138,15 +143,15 @@ class Workspace:
 
 @functools.cache
 def workspace_of(
-    chain: tuple[Joint, ...], lower: tuple[float, ...], upper: tuple[float, ...], plate_from_tool: tuple[float, ...]
+    chain: tuple[UrdfJoint, ...], lower: tuple[float, ...], upper: tuple[float, ...], plate_from_tool: tuple[float, ...]
 ) -> Workspace:
-    """A workspace, kept."""
+    """A workspace, cached by its arguments."""
     return Workspace(chain, lower, upper, plate_from_tool)
 
 
 def _spread(count: int, dimensions: int) -> Vectors:
-    """Points (N, D) spread evenly over a unit cube: n times the powers of 1 / g, modulo 1, with
-    g^(D + 1) = g + 1 (an additive recurrence of low discrepancy).
+    """Points (N, D) spread evenly over a unit cube, by an additive recurrence of low discrepancy:
+    (1/2 + n g^-d) mod 1 with g^(D + 1) = g + 1.
     """
     g = 2.0
     for _ in range(50):
@@ -160,27 +165,27 @@ def _turns(lower: float, upper: float) -> tuple[float, float]:
 
 
 def _ball(centre: Vectors, radius: float, min_x: float, min_z: float) -> tuple[Vectors, Vectors]:
-    """Points (M, 3) spread evenly over a ball, above and before these, and their distances from its
-    centre (M,).
+    """Points (M, 3) spread evenly over the part of a ball where x >= `min_x` and z >= `min_z`, and
+    their distances from its centre (M,).
     """
-    points = centre + radius * (2.0 * _spread(POINTS, 3) - 1.0)
+    points = centre + radius * (2.0 * _spread(TEST_POINTS, 3) - 1.0)
     distances = np.linalg.norm(points - centre, axis=1)
     kept = (distances <= radius) & (points[:, 0] >= min_x) & (points[:, 2] >= min_z)
     return points[kept], distances[kept]
 
 
 def _longest(flags: NDArray[np.bool_]) -> tuple[int, int]:
-    """Begin and end of the longest run of true flags; all of them where none is."""
+    """Begin and end of the longest run of true flags; all flags if none is true."""
     runs = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0])).reshape(-1, 2)
     begin, end = max(runs.tolist(), key=lambda run: run[1] - run[0], default=(0, len(flags)))
     return begin, end
 
 
 def _placed(
-    chain: Sequence[Joint], postures: Vectors, plate_from_tool: Sequence[float]
+    chain: Sequence[UrdfJoint], postures: Vectors, plate_from_tool: Sequence[float]
 ) -> tuple[Vectors, Vectors, list[tuple[Vectors, Vectors]]]:
-    """The tool's positions and where its +z points (N, 3); each joint's origin and axis with those
-    before it at 0.
+    """The tool's positions and the directions of its +z (N, 3), and each joint's origin and axis
+    with the joints before it at 0.
     """
     count = len(postures)
     turn, at = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
@@ -204,8 +209,8 @@ def _placed(
 
 
 def _shoulder(axes: Sequence[tuple[Vectors, Vectors]]) -> Vectors:
-    """The point of the first axis that is nearest to the second; with parallel axes, or one alone,
-    the foot of the second's origin.
+    """The point of the first axis that is nearest to the second. For parallel axes, or one alone:
+    the projection of the second's origin onto the first axis.
     """
     (at, along), (other, across) = axes[0], axes[min(1, len(axes) - 1)]
     between, cosine = other - at, float(along @ across)

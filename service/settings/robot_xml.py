@@ -1,7 +1,7 @@
-"""The XML of a robot's description, as the world writes it, read in bounded time.
+"""The XML of a robot's description, read in bounded time.
 
-Undeclared prefixes are accepted, because other readers of URDF accept them: elements with a prefix
-hold nothing that a URDF defines.
+Undeclared prefixes are accepted, because other readers of URDF accept them. Elements with a prefix
+are ignored: they hold nothing that a URDF defines.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 Element = ElementTree.Element
-MAX_DEPTH = 64  # of elements in each other; a URDF needs 6
+MAX_DEPTH = 64  # nested elements; a URDF needs 6
 MAX_ELEMENTS = 100_000  # an arm with a hand has about 1000
-ANY_LIMIT = {"lower": "-1e4", "upper": "1e4", "velocity": "1e4", "effort": "0"}  # other readers need one
-LARGEST = 1e6  # of any number of a link or joint
-NUMERIC = {  # attributes with numbers, besides xyz and rpy, by element
+ANY_LIMIT = {"lower": "-1e4", "upper": "1e4", "velocity": "1e4", "effort": "0"}  # Pinocchio requires a <limit>
+MAX_NUMBER = 1e6  # largest magnitude of any number of a link or joint
+NUMERIC = {  # attributes with numbers by element, in addition to xyz and rpy
     "box": ("size",),
     "cylinder": ("radius", "length"),
     "capsule": ("radius", "length"),
@@ -31,15 +31,15 @@ MACROS = "its macros are not expanded: make a URDF of it first, by `xacro arm.ur
 def element_of(text: str | bytes) -> Element:
     """The outermost element, without elements and attributes that have a prefix.
 
-    Bytes are decoded as their XML declaration says. Raises ValueError for what is no XML, too deep,
-    too long, or holds macros of xacro.
+    Bytes are decoded by their XML declaration. Raises ValueError for text that is not XML, is
+    nested too deeply, has too many elements, or holds xacro macros.
     """
     builder = ElementTree.TreeBuilder()
     encoded = text if isinstance(text, bytes) else text.encode("utf-8", "replace")
     parser = expat.ParserCreate(None if isinstance(text, bytes) else "utf-8")
     parser.buffer_text = True
     open_tags: list[str] = []
-    count, foreign = 0, 0  # elements so far; how many of the open ones are in one with a prefix
+    count, foreign = 0, 0  # elements; open elements inside one with a prefix
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count, foreign
@@ -72,14 +72,14 @@ def element_of(text: str | bytes) -> Element:
     parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, characters
     try:
         parser.Parse(encoded, True)
-    except (expat.ExpatError, LookupError) as error:  # LookupError: an encoding that nobody knows
+    except (expat.ExpatError, LookupError) as error:  # LookupError: an unknown encoding
         raise ValueError(f"no XML: {error}") from None
     return builder.close()
 
 
 def readable(data: bytes) -> str:
-    """The text of a file as every reader of XML accepts it: as it is, or, with undeclared prefixes
-    or in another encoding than UTF-8, written anew. Raises ValueError.
+    """The text of a file in a form that every XML reader accepts. A file with undeclared prefixes,
+    or in an encoding other than UTF-8, is rewritten. Raises ValueError.
     """
     robot = element_of(data)
     try:
@@ -97,8 +97,8 @@ def numbers(element: Element | None, name: str, default: str) -> tuple[float, ..
         found = tuple(float(number) for number in text.split())
     except ValueError:
         found = (math.nan,)
-    if element is not None and not all(abs(number) <= LARGEST for number in found):
-        raise ValueError(f"<{element.tag} {name}={text!r}>: finite numbers up to {LARGEST:g} needed")
+    if element is not None and not all(abs(number) <= MAX_NUMBER for number in found):
+        raise ValueError(f"<{element.tag} {name}={text!r}>: finite numbers up to {MAX_NUMBER:g} needed")
     return found
 
 
@@ -112,7 +112,7 @@ def three(element: Element | None, name: str, default: str) -> tuple[float, floa
 
 
 def check_numbers(robot: Element) -> None:
-    """Raises ValueError for a number of a link or joint that is not finite, or far too large."""
+    """Reject numbers of links and joints that are not finite or too large. Raises ValueError."""
     for part in (*robot.findall("link"), *robot.findall("joint")):
         for element in part.iter():
             for name in element.attrib:
@@ -124,9 +124,10 @@ def check_numbers(robot: Element) -> None:
 
 
 def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]]) -> str:
-    """The links and joints of a robot alone, as a URDF: without shapes, masses and all else that
-    does not say where links are. Joints that are not `moving`, about these axes, are fixed; those
-    that are have limits that mean nothing, and continuous ones are revolute.
+    """A URDF with only the links, joints and origins of a robot, without shapes and masses.
+
+    `moving` has the axes of the joints that move, by name; all others are fixed. Moving joints get
+    the limits ANY_LIMIT, and continuous joints become revolute.
     """
     out = Element("robot", name="arm")
     for link in robot.findall("link"):

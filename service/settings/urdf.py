@@ -1,4 +1,4 @@
-"""Reads an arm's URDF: the chain's joints to the tool, their limits, links' poses and shapes."""
+"""An arm's URDF: the chain's joints to the tool, their limits, links' poses and shapes."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from service.contract.messages import Quaternion, Transform, Vector3
 from service.settings.link_tree import root_of
 from service.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three
 
-KINDS = ("revolute", "continuous", "prismatic")  # of joints that an arm may have
-CONTINUOUS_RAD = 6000.0  # limit of a continuous joint each way: 950 turns, so that positions keep their precision
+JOINT_KINDS = ("revolute", "continuous", "prismatic")  # an arm's chain may have these
+CONTINUOUS_RAD = 6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise
 
 
 class UrdfError(ExplainedError, ValueError):
-    """A robot description that cannot be used: says what is wrong with it and what would do."""
+    """A robot description cannot be used; the message has the cause and the remedy."""
 
 
-class Joint(NamedTuple):
-    """A joint: the links it connects, where it sits in the parent, and for a movable one its axis
-    and limits [rad, rad/s], of a prismatic one [m, m/s].
+class UrdfJoint(NamedTuple):
+    """A joint: the links that it connects, its pose in the parent link, and if it is movable its
+    axis and limits [rad, rad/s], for a prismatic joint [m, m/s].
     """
 
     name: str
@@ -38,20 +38,20 @@ class Joint(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """A collision shape of a link, and where it sits in that link's frame."""
+    """A collision shape of a link, and its pose in that link's frame."""
 
     link: str
     kind: str  # box, cylinder, sphere, capsule, mesh
     size: tuple[float, ...]
-    """[m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: the ends of
-    the axis (2, 3) and the radius of a capsule that covers it, or nothing.
+    """[m] box: edges; cylinder, capsule: radius, length along z; sphere: radius; mesh: ends of the
+    axis (2, 3) and radius of a capsule that covers it, or empty.
     """
     translation: Vector3
     rotation: Quaternion
 
 
 class Urdf:
-    """A robot description, read. Raises UrdfError."""
+    """A robot description, parsed. Raises UrdfError."""
 
     def __init__(self, text: str, *, origin: str = "the URDF") -> None:
         self.origin = origin
@@ -76,9 +76,9 @@ class Urdf:
         parents = {joint.parent for joint in self.joints}
         self.leaves = tuple(joint.child for joint in self.joints if joint.child not in parents)
 
-    def chain(self, tip: str) -> tuple[Joint, ...]:
+    def chain(self, tip: str) -> tuple[UrdfJoint, ...]:
         """The joints from the root to link `tip`, in order. Raises UrdfError."""
-        found: list[Joint] = []
+        found: list[UrdfJoint] = []
         link = tip
         while link != self.root:
             if link not in self._above:
@@ -89,24 +89,24 @@ class Urdf:
         return tuple(reversed(found))
 
     def kinematics(self, names: Sequence[str]) -> str:
-        """Links and joints alone, as a URDF in which the joints of these names move."""
+        """A URDF with links and joints only, in which the joints of these names move."""
         return kinematics(self._robot, {joint.name: joint.axis for joint in self.joints if joint.name in names})
 
-    def above(self, link: str) -> Joint | None:
-        """The joint whose child a link is; None for the root."""
+    def above(self, link: str) -> UrdfJoint | None:
+        """The joint that carries a link; None for the root."""
         return self._above.get(link)
 
-    def movable(self, tip: str) -> tuple[Joint, ...]:
-        """The joints from the root to link `tip` that turn or slide, in order; continuous ones have
-        the limits ±CONTINUOUS_RAD, and an infinite velocity where the description has none.
+    def movable(self, tip: str) -> tuple[UrdfJoint, ...]:
+        """The joints from the root to link `tip` that turn or slide, in order. Continuous joints
+        get the limits ±CONTINUOUS_RAD, and an infinite velocity if the description has none.
 
-        Raises UrdfError for a joint of another kind, without limits, or that follows another one.
+        Raises UrdfError for a joint of another kind, without limits, or that mimics another one.
         """
         moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
             mistake = _lack(joint)
-            if joint.kind not in KINDS:
-                mistake = f"is {joint.kind}; {', '.join(KINDS)} or fixed needed"
+            if joint.kind not in JOINT_KINDS:
+                mistake = f"is {joint.kind}; {', '.join(JOINT_KINDS)} or fixed needed"
             elif joint.mimics:
                 mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
             if mistake:
@@ -116,12 +116,12 @@ class Urdf:
         return moving
 
     def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
-        """Each link in its parent link, for joint positions by name [rad, m]; others are at 0."""
+        """Poses of links in their parent links, for joint positions by name [rad, m], else 0."""
         return [_moved(joint, positions.get(joint.name, 0.0)) for joint in self.joints]
 
 
-def _moved(joint: Joint, position: float) -> Transform:
-    """A joint's child link in its parent link."""
+def _moved(joint: UrdfJoint, position: float) -> Transform:
+    """Pose of a joint's child link in its parent link."""
     at, turn = joint.translation, joint.rotation
     if position and joint.kind == "prismatic":
         dx, dy, dz = rotated(turn, joint.axis)
@@ -131,9 +131,9 @@ def _moved(joint: Joint, position: float) -> Transform:
     return Transform(joint.parent, joint.child, at, turn)
 
 
-def _limited(joint: Joint) -> Joint:
-    """The joint with limits of its position, which a continuous one does not have; its velocity
-    need not be limited either.
+def _limited(joint: UrdfJoint) -> UrdfJoint:
+    """The joint; a continuous one with the limits ±CONTINUOUS_RAD, and with an infinite velocity if
+    the description does not limit it.
     """
     if joint.kind != "continuous":
         return joint
@@ -141,17 +141,17 @@ def _limited(joint: Joint) -> Joint:
     return joint._replace(lower=-CONTINUOUS_RAD, upper=CONTINUOUS_RAD, velocity=velocity)
 
 
-def _lack(joint: Joint) -> str:
-    """Why a joint of the chain cannot be moved; empty where it can."""
+def _lack(joint: UrdfJoint) -> str:
+    """The reason why a joint of the chain cannot be moved; empty if it can."""
     is_continuous, unit = joint.kind == "continuous", "m" if joint.kind == "prismatic" else "rad"
     if not any(joint.axis):
         return "has the axis 0 0 0; a direction needed"
-    if not is_continuous and not -FARTHEST <= joint.lower < joint.upper <= FARTHEST:
+    if not is_continuous and not -MAX_JOINT_LIMIT <= joint.lower < joint.upper <= MAX_JOINT_LIMIT:
         given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
-        return f"{given}; lower below upper, within {FARTHEST:g} {unit}, needed in its <limit>"
-    if not 0.0 < joint.velocity <= FARTHEST and not (is_continuous and joint.velocity == math.inf):
+        return f"{given}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit>"
+    if not 0.0 < joint.velocity <= MAX_JOINT_LIMIT and not (is_continuous and joint.velocity == math.inf):
         given = f"has the velocity {_or_none(joint.velocity)}"
-        return f"{given}; above 0, up to {FARTHEST:g} {unit}/s, needed in its <limit>"
+        return f"{given}; above 0, up to {MAX_JOINT_LIMIT:g} {unit}/s, needed in its <limit>"
     return ""
 
 
@@ -159,13 +159,13 @@ def _or_none(number: float) -> str:
     return "none" if math.isnan(number) else f"{number:g}"
 
 
-def _joint(element: Element) -> Joint:
+def _joint(element: Element) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
     try:
         x, y, z = three(element.find("axis"), "xyz", "1 0 0")
-        norm = math.hypot(x, y, z) or 1.0  # a joint without an axis cannot move: `movable` refuses it
-        return Joint(
+        norm = math.hypot(x, y, z) or 1.0  # a joint with the axis 0 0 0 cannot move: `movable` rejects it
+        return UrdfJoint(
             name,
             kind,
             _link(element, "parent"),
@@ -183,17 +183,17 @@ def _joint(element: Element) -> Joint:
 
 
 def _limit(limit: Element | None, which: str) -> float:
-    """A limit as given, which only the joints before the plate need; NaN where it is no number."""
+    """A limit; NaN if it is missing or not a number, as only joints of the chain need limits."""
     try:
         return math.nan if limit is None else float(limit.get(which, "nan"))
     except ValueError:
         return math.nan
 
 
-COVER = "covered_by"  # an attribute of a mesh, which is ours: others do not look at it
+COVER = "covered_by"  # our own attribute of a mesh with its capsule; other readers ignore it
 SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
-COUNTS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}  # of the numbers in these
-FARTHEST = 1000.0  # [rad], [rad/s] limits of a joint
+SIZE_COUNTS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}  # numbers in the attributes of SIZES
+MAX_JOINT_LIMIT = 1000.0  # [rad, rad/s, m, m/s] larger limits are rejected as mistakes
 MAX_SHAPES = 500  # an arm with a hand has 30
 
 
@@ -207,7 +207,7 @@ def _shape(link: str, element: Element) -> Shape:
             size = numbers(given, COVER, "")
         elif kind in SIZES:
             size = tuple(number for name in SIZES[kind] for number in numbers(given, name, ""))
-            if len(size) != COUNTS[kind] or not all(number > 0.0 for number in size):
+            if len(size) != SIZE_COUNTS[kind] or not all(number > 0.0 for number in size):
                 raise ValueError(f"<{kind}> has no size; {' and '.join(SIZES[kind])} above 0 needed")
         else:
             raise ValueError(f"<{kind}> is no shape; {', '.join(SIZES)} and mesh accepted")
@@ -227,7 +227,7 @@ def _link(element: Element, which: str) -> str:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """The rotation b followed by the rotation a; x y z w."""
+    """The rotation b followed by the rotation a, as quaternions x y z w."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (

@@ -1,5 +1,5 @@
-"""Measures the loop's timing on this machine, beside an empty loop of the same rate, which shows
-what the machine allows, and beside the core alone.
+"""Measurement of the loop's timing on this machine, compared with an empty loop of the same rate,
+which shows the limits of the machine, and with the core alone.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
 from service.process.progress import say
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
-from service.timing.probe_processes import BenchError, echo, family, probe
+from service.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "service")
-SECONDS, SOAK_S = 24.0, 1800.0
-PARTS = 6  # of the duration: two each for the empty loop, the core and the whole
-MISSED_MORE = 0.0005  # share of deadlines that the whole may miss more than the empty loop
+BENCH_S = 24.0  # default duration
+SOAK_S = 1800.0  # default duration of --soak
+DURATION_PARTS = 6  # the duration is divided into two parts each for the empty loop, the core and the whole
+MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (
-    ("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance", "`performance` keeps the clock up"),
-    ("/proc/sys/kernel/sched_rt_runtime_us", "-1", "-1 lets a real-time loop run whenever it has to"),
+    ("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance", "`performance` holds the clock rate"),
+    ("/proc/sys/kernel/sched_rt_runtime_us", "-1", "-1 does not limit the time of a real-time loop"),
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
-KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
-NOTHING_US = 10.0  # added to both medians of lateness, so that their ratio is not one of two small numbers
-SLOWER = 1.15  # accepted latency, as a multiple of half a period, the round trip and the work
+LOOP_KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
+NOTHING_US = 10.0  # added to both medians of lateness, because the ratio of two small numbers means nothing
+SLOWER = 1.15  # accepted latency / (half a period + round trip + work)
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Exit code 0 once measured, whatever the result."""
+    """Measure, print the report, and return exit code 0 for any result."""
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
     settings = cell_of(args.arm, rate_hz=args.rate)
     report: Any
     read: Callable[[Any], str]
-    seconds = args.seconds or (SOAK_S if args.soak else SECONDS)
+    seconds = args.seconds or (SOAK_S if args.soak else BENCH_S)
     if args.soak:
         report, read = soak.run(seconds / 60, settings.rate_hz, settings=settings, say=say), soak.text
     elif args.loads:
@@ -69,11 +70,11 @@ def run(
     program: tuple[str, ...] = PROGRAM,
     keep: Path | None = None,
 ) -> dict[str, Any]:
-    """The measurements of about `seconds` [s]: empty loop, core, whole, core, empty loop.
+    """Measure for about `seconds` [s]: empty loop, core, whole, core, empty loop.
 
-    The recording of the whole stays in the folder `keep`. Raises BenchError and LaunchError.
+    The recording of the whole remains in the folder `keep`. Raises ProbeError and LaunchError.
     """
-    part_s = seconds / PARTS
+    part_s = seconds / DURATION_PARTS
     skill = str(recordings() / SHIPPED_SKILL)
     kinds = {"empty": (rate_hz, part_s), "core": (skill, rate_hz, part_s, arm)}
     found: dict[str, list[dict[str, Any]]] = {"empty": [], "core": []}
@@ -115,8 +116,8 @@ def _whole(
                 for who, process in family(service.process.pid).items()
             }
             if service.stop() != 0:
-                raise BenchError(f"the service failed: {service.log.read_text()[-500:]}")
-        recorded = sorted(set(folder.glob("*.mcap")) - before)  # one after the other
+                raise ProbeError(f"the service failed: {service.log.read_text()[-500:]}")
+        recorded = sorted(set(folder.glob("*.mcap")) - before)
         timing = np.array(
             [step.timing for path in recorded for step in Recording.open(path).steps() if step.timing], TIMING
         )
@@ -132,7 +133,7 @@ def _whole(
 
 
 def _joined(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """The parts of one kind as one: sums of counts, means of percentiles, the maximum of maxima."""
+    """The merged parts of one kind: sums of counts, means of percentiles, the maximum of maxima."""
     out: dict[str, Any] = {name: sum(part[name] for part in parts) for name in ("ticks", "missed")}
     for name in ("lateness_us", "work_us"):
         means = {share: round(float(np.mean([part[name][share] for part in parts])), 2) for share in parts[0][name]}
@@ -162,7 +163,7 @@ def text(report: dict[str, Any]) -> str:
     """The report for people to read."""
     names = ("p50", "p99", "p99.9", "max")
     rows = [f"{report['rate_hz']} Hz on {report['cores']} cores {'':>18}{''.join(f'{name:>9}' for name in names)}"]
-    for kind, what in KINDS:
+    for kind, what in LOOP_KINDS:
         one = report[kind]
         share = 100 * one["missed"] / max(1, one["ticks"])
         rows.append(f"  {what:<11} {one['missed']} of {one['ticks']} deadlines missed ({share:.2f} %)")
@@ -186,8 +187,8 @@ def text(report: dict[str, Any]) -> str:
         "",
         f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and {ratios['lateness_p99.9']:.2f} times "
         "the empty loop's;",
-        f"  missed {100 * ratios['missed_more']:+.2f} % of deadlines beside it",
-        f"  hand to command: {ratios['latency']:.2f} times half a period, the way by Zenoh and the work",
+        f"  missed deadlines: {100 * ratios['missed_more']:+.2f} % compared with the empty loop",
+        f"  hand to command: {ratios['latency']:.2f} times the sum of half a period, the round trip and the work",
         "",
         _verdict(report),
     ]
@@ -195,16 +196,16 @@ def text(report: dict[str, Any]) -> str:
 
 
 def draw(report: dict[str, Any], path: Path) -> None:
-    """The histograms of lateness and work, of the empty loop, the core and the whole, as a PNG."""
+    """Draw histograms of lateness and work of the empty loop, the core and the whole as a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2, sharey=True), ("lateness", "work"), strict=True):
-        for (kind, what), colour in zip(KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True):
+        for (kind, what), colour in zip(LOOP_KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True):
             counts = np.array(report[kind][f"{name}_counts"])
             axes.stairs(counts / max(1, counts.sum()), EDGES_US, label=what, color=colour, linewidth=1.4)
         axes.axvline(1e6 / report["rate_hz"], color="black", linestyle=":", linewidth=1)
-        axes.set(xscale="log", yscale="log", xlabel=f"{name} [µs], the period dotted", xlim=(1, 2e4))
+        axes.set(xscale="log", yscale="log", xlabel=f"{name} [µs], dotted: the period", xlim=(1, 2e4))
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("share of ticks")
     figure.axes[0].legend()
@@ -220,16 +221,16 @@ def _verdict(report: dict[str, Any]) -> str:
             "line `<user> - rtprio 90` in /etc/security/limits.conf, or AmbientCapabilities=CAP_SYS_NICE in its unit."
         )
     if report["cores"] < 2:
-        return "One core is too few: loop, recorder and viewer want two."
+        return "One core is too few: loop, recorder and viewer need two."
     if report["empty"]["missed"] > 0.001 * report["empty"]["ticks"]:
-        return f"This machine does not keep even an empty loop's time: look for what else runs on it. {advice}"
+        return f"Even an empty loop misses deadlines on this machine: stop other programs. {advice}"
     if report["ratios"]["missed_more"] > MISSED_MORE or report["ratios"]["latency"] > SLOWER:
-        return f"The machine would allow better: deadlines are missed, or answers late, more than they had to. {advice}"
-    return "The loop keeps its time here."
+        return f"The loop misses more deadlines, or answers later, than this machine would allow. {advice}"
+    return "The loop meets its deadlines on this machine."
 
 
 def _kernel() -> list[str]:
-    """The kernel's settings that disturb a loop's timing, in words."""
+    """Messages on kernel settings that disturb a loop's timing."""
     found = []
     for path, good, advice in KERNEL:
         try:
@@ -238,4 +239,4 @@ def _kernel() -> list[str]:
             continue
         if value != good:
             found.append(f"{path} is {value}, {advice}")
-    return found or ["No setting of the kernel that can be read disturbs the loop"]
+    return found or ["No readable setting of the kernel disturbs the loop"]

@@ -42,8 +42,8 @@ from service.viewer.stream import rerun_program
 
 QUERIES_HZ, TEACHING_HZ, BURST_HZ, COLLECTIONS_HZ = 200.0, 10.0, 5000.0, 10.0
 LARGE_SKILL = "large"
-LARGE = 100_000  # points of it
-SETTLE_S = 2.0
+LARGE_POINTS = 100_000  # points of that skill
+LOAD_SETTLE_S = 2.0
 COLLECTING = f"""
 from service.process import one_blas_thread
 import gc, sys, threading, time
@@ -60,19 +60,19 @@ sys.exit(main(sys.argv[1:]))
 
 
 class LoadError(ExplainedError):
-    """A load could not be applied; the message says why."""
+    """A load could not be applied; the message has the cause."""
 
 
 @dataclass(frozen=True)
 class LoadedCell:
-    """A running daemon under load, and what a load needs to reach it."""
+    """A running daemon under load, with a client and the port of its live view."""
 
     service: Launched
     client: Client
     live_port: int
 
     def scribe(self) -> int:
-        """The process number of its scribe. Raises LoadError."""
+        """The process id of its scribe. Raises LoadError."""
         pid = self.client.status().scribe["pid"]
         if pid is None:
             raise LoadError("the daemon has no scribe")
@@ -96,7 +96,7 @@ def _killed(cell: LoadedCell) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _full(cell: LoadedCell) -> Iterator[None]:
-    """Limits the size of the scribe's files, which fails as a full disk does."""
+    """Limit the size of the scribe's files, which fails like a full disk."""
     pid, none = cell.scribe(), resource.RLIM_INFINITY
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, none))
     yield
@@ -106,11 +106,11 @@ def _full(cell: LoadedCell) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stalled(cell: LoadedCell) -> Iterator[None]:
-    """A viewer that connects, and then stops reading."""
+    """Run a viewer that connects and then stops reading."""
     with tempfile.TemporaryDirectory() as folder:
         url = f"rerun+http://127.0.0.1:{cell.live_port}/proxy"
         with _process([str(rerun_program()), "--save", str(Path(folder) / "live.rrd"), url]) as viewer:
-            time.sleep(SETTLE_S)
+            time.sleep(LOAD_SETTLE_S)
             if viewer.poll() is not None:
                 raise LoadError(f"Rerun's program ended with code {viewer.returncode}")
             viewer.send_signal(signal.SIGSTOP)
@@ -119,24 +119,24 @@ def _stalled(cell: LoadedCell) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _beside(kind: str, cell: LoadedCell) -> Iterator[None]:
-    """One of ASKING, which must not end before the load does."""
-    with asking(kind, cell.service.endpoint) as process:
+    """Run one of CLIENTS, which must not end before the load ends."""
+    with running_client(kind, cell.service.endpoint) as process:
         yield
         if process.poll() is not None:
-            raise LoadError(f"what asks for {kind!r} ended with code {process.returncode}")
+            raise LoadError(f"the client {kind!r} ended with code {process.returncode}")
 
 
 @dataclass(frozen=True)
 class Load:
-    """A load: its name for people, and what applies it."""
+    """A load: its title, and the context that applies it."""
 
     what: str
     put_on: Callable[[LoadedCell], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
     program: tuple[str, ...] = ("-m", "service")
 
 
-def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
-    """Calls `act` at a rate, or as fast as it can, until killed."""
+def _repeat(rate_hz: float, act: Callable[[int], object]) -> None:
+    """Call `act` at a rate, or as fast as possible, until killed."""
     began, k = time.monotonic(), 0
     while True:
         with contextlib.suppress(RefusedError):
@@ -148,20 +148,20 @@ def _asked(rate_hz: float, act: Callable[[int], object]) -> None:
 
 
 def _status(client: Client, session: Any) -> None:
-    _asked(QUERIES_HZ, lambda k: client.status())
+    _repeat(QUERIES_HZ, lambda k: client.status())
 
 
 def _teaching(client: Client, session: Any) -> None:
-    """Teaches one via-point over and over, alternating by a millimetre."""
+    """Teach one via-point again and again, alternating by a millimetre."""
     skill = shipped_skill()
     x, tool = skill.hands[0].tolist(), skill.mean(skill.hands[:1])[0].tolist()
     left, right = tuple(x[:3]), tuple(x[3:])
-    _asked(TEACHING_HZ, lambda k: client.add([ViaPoint("here", left, right, (*tool[:2], tool[2] + 0.001 * (k % 2)))]))
+    _repeat(TEACHING_HZ, lambda k: client.add([ViaPoint("here", left, right, (*tool[:2], tool[2] + 0.001 * (k % 2)))]))
 
 
 def _loading(client: Client, session: Any) -> None:
     names = (LARGE_SKILL, SHIPPED_SKILL.removesuffix(".npz"))
-    _asked(0.5, lambda k: client.load_skill(names[k % 2]))
+    _repeat(0.5, lambda k: client.load_skill(names[k % 2]))
 
 
 def _hands(rate_hz: float, client: Client, session: Any) -> None:
@@ -171,10 +171,10 @@ def _hands(rate_hz: float, client: Client, session: Any) -> None:
         now_ns = time.time_ns()
         publish(now_ns % 10**13 / 1e9, now_ns)
 
-    _asked(rate_hz, put)
+    _repeat(rate_hz, put)
 
 
-ASKING: dict[str, Callable[[Client, Any], None]] = {
+CLIENTS: dict[str, Callable[[Client, Any], None]] = {
     "hands": partial(_hands, TRACKER_HZ),
     "bursts": partial(_hands, BURST_HZ),
     "status": _status,
@@ -189,7 +189,7 @@ LOADS = (
     Load("disk full", _full),
     Load(f"{QUERIES_HZ:.0f} status queries a second", partial(_beside, "status")),
     Load(f"taught each {1e3 / TEACHING_HZ:.0f} ms", partial(_beside, "teaching")),
-    Load(f"skills of {LARGE} points loaded", partial(_beside, "loading")),
+    Load(f"skills of {LARGE_POINTS} points loaded", partial(_beside, "loading")),
     Load(f"hands at {BURST_HZ / 1e3:g} kHz", partial(_beside, "bursts")),
     Load(f"{COLLECTIONS_HZ:.0f} collections a second", program=("-c", COLLECTING)),
 )
@@ -199,15 +199,14 @@ def run(
     rate_hz: int, seconds: float, *, settings: Settings | None = None, say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """A row for each load: missed deadlines and lateness of the daemon's loop over `seconds` [s],
-    the same of an empty loop under the same load, and how much of the recording replays bit for
-    bit.
+    of an empty loop under the same load, and the number of recorded ticks that replay identically.
 
     Raises LoadError and LaunchError.
     """
     with tempfile.TemporaryDirectory() as name:
         skills = Path(name)
         shutil.copy(recordings() / SHIPPED_SKILL, skills)
-        say(f"making a skill of {LARGE} points")
+        say(f"making a skill of {LARGE_POINTS} points")
         (skills / f"{LARGE_SKILL}.npz").write_bytes(large_skill())
         rows = []
         for load in LOADS:
@@ -217,12 +216,7 @@ def run(
 
 
 def _row(
-    load: Load,
-    rate_hz: int,
-    seconds: float,
-    skills: Path,
-    settings: Settings | None,
-    say: Callable[[str], None],
+    load: Load, rate_hz: int, seconds: float, skills: Path, settings: Settings | None, say: Callable[[str], None]
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
@@ -231,7 +225,7 @@ def _row(
         with (
             launched(folder, *arguments, **cell, say=say) as service,
             open_session(connect=[service.endpoint]) as session,
-            asking("hands", service.endpoint),
+            running_client("hands", service.endpoint),
         ):
             loaded = LoadedCell(service, Client(session), port)
             until_following(loaded.client)
@@ -261,7 +255,7 @@ def _row(
 
 
 def _let_others_first(pid: int) -> bool:
-    """Whether a daemon's loop had real-time scheduling, which is taken from it."""
+    """Take real-time scheduling from a daemon's loop; True if it had it."""
     had = os.sched_getscheduler(pid) == os.SCHED_FIFO
     if had:
         os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
@@ -269,22 +263,22 @@ def _let_others_first(pid: int) -> bool:
 
 
 def until_following(client: Client) -> None:
-    """Waits until a daemon follows the hands, and SETTLE_S more. Raises LoadError."""
+    """Wait until a daemon follows the hands, and LOAD_SETTLE_S more. Raises LoadError."""
     until = time.monotonic() + 15.0
     while (now := client.status()).mode != "follow":
         if time.monotonic() > until:
             raise LoadError(f"the daemon does not follow the hands: {now.mode} ({now.reason})")
         time.sleep(0.1)
-    time.sleep(SETTLE_S)
+    time.sleep(LOAD_SETTLE_S)
 
 
 def large_skill() -> bytes:
-    """The file of a skill of many points: the shipped one's over and over, a little beside."""
+    """The file of a skill with LARGE_POINTS: the shipped skill's points, repeated with noise."""
     skill = shipped_skill()
-    model: Any = skill.model  # whichever it is
+    model: Any = skill.model
     inputs, reference = model.primitive.inputs, model.primitive.reference
-    pick = np.arange(LARGE) % len(inputs)
-    beside = np.random.default_rng(0).normal(scale=0.01, size=(LARGE, inputs.shape[1]))
+    pick = np.arange(LARGE_POINTS) % len(inputs)
+    beside = np.random.default_rng(0).normal(scale=0.01, size=(LARGE_POINTS, inputs.shape[1]))
     moved = inputs[pick] + beside
     primitive = KMP.fit(
         moved,
@@ -299,12 +293,12 @@ def large_skill() -> bytes:
 
 
 @contextlib.contextmanager
-def asking(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
-    """One of ASKING as a running process of its own. Raises LoadError."""
+def running_client(kind: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    """One of CLIENTS as a process of its own. Raises LoadError."""
     with _process([sys.executable, "-m", "service.timing.loads", kind, endpoint]) as process:
         assert process.stdout is not None
         if not process.stdout.readline():
-            raise LoadError(f"what asks for {kind!r} did not begin")
+            raise LoadError(f"the client {kind!r} did not begin")
         yield process
 
 
@@ -319,7 +313,7 @@ def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def text(rows: list[dict[str, Any]]) -> str:
-    """The rows for people to read."""
+    """The rows as a table in text."""
     lines = [
         f"{'':<34}{'missed':>9}{'late p50':>10}{'p99 µs':>9}{'empty:':>10}{'p50':>8}{'p99':>9}  replayed identically"
     ]
@@ -334,9 +328,9 @@ def text(rows: list[dict[str, Any]]) -> str:
 
 
 def main(kind: str, endpoint: str) -> int:
-    """One of ASKING, until it is killed."""
+    """Run one of CLIENTS until it is killed."""
     with contextlib.suppress(UnreachableError), open_session(connect=[endpoint]) as session:
-        ASKING[kind](Client(session), session)
+        CLIENTS[kind](Client(session), session)
     return 0
 
 

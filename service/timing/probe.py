@@ -1,6 +1,5 @@
-"""Probes for `thirdhand bench`, each a process of its own that prints one JSON line: a loop that
-only does a fixed piece of work, the core alone in such a loop, a tracker that waits for the
-commands which answer its hands, and an echo.
+"""Probes for `thirdhand bench`, each a process that prints one JSON line: a loop with a fixed piece
+of work, a loop with the core alone, a tracker that measures the commands' latency, and an echo.
 """
 
 from __future__ import annotations
@@ -34,24 +33,26 @@ from service.files.shipped import cell_of
 from service.learning.skill_file import decoded
 from service.settings.config import Settings, robot_description
 
-SHARES = (50.0, 99.0, 99.9, 100.0)
-EDGES_US = np.geomspace(1.0, 1e5, 101)  # of histograms
-TRACKER_HZ = 487.3  # no multiple of a loop's rate
-SWAY_M, SWAY_HZ = 0.03, 0.3  # of the hands
+PERCENTS = (50.0, 99.0, 99.9, 100.0)
+EDGES_US = np.geomspace(1.0, 1e5, 101)  # edges of the histograms' bins
+TRACKER_HZ = 487.3  # it is no multiple of a loop's rate
+SWAY_M = 0.03  # amplitude of the hands' motion
+SWAY_HZ = 0.3  # frequency of the hands' motion
 HANDS_EVERY_S = 0.01
-PING_EVERY = 20  # samples
-FLOATS, CALLS = 200, 20  # of the fixed piece of work
-SETTLE_S = 1.0  # at the start, not counted
+PING_EVERY = 20  # every 20th sample measures the round trip
+FLOATS = 200  # additions in Python in the fixed piece of work
+CALLS = 20  # calls of NumPy in the fixed piece of work
+UNCOUNTED_S = 1.0  # the first second is not counted
 
 
 def percentiles(values: Any) -> dict[str, float]:
-    """The SHARES of some values, by name; zeros where there are none."""
-    found = np.percentile(values, SHARES).round(2).tolist() if len(values) else [0.0] * len(SHARES)
+    """The percentiles PERCENTS of values, by name; zeros without values."""
+    found = np.percentile(values, PERCENTS).round(2).tolist() if len(values) else [0.0] * len(PERCENTS)
     return dict(zip(("p50", "p99", "p99.9", "max"), found, strict=True))
 
 
 def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
-    """Percentiles (SHARES) and histograms (EDGES_US) of a loop's lateness and work [us]."""
+    """Percentiles and histograms of a loop's lateness and work [µs]."""
     found: dict[str, Any] = {}
     for name, values in (("lateness", lateness_us), ("work", work_us)):
         found[f"{name}_us"] = percentiles(values)
@@ -60,7 +61,7 @@ def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
 
 
 def fixed_work(array: Vector) -> float:
-    """A fixed piece of Python and NumPy, by which the machine's speed at the moment is measured."""
+    """Do a fixed piece of work in Python and NumPy, which measures the machine's present speed."""
     total = 0.0
     for k in range(FLOATS):
         total += 0.5 * k
@@ -70,48 +71,43 @@ def fixed_work(array: Vector) -> float:
 
 
 def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[str, Any]:
-    """Missed deadlines, lateness and work [us] of a loop that does `work` each tick."""
+    """Run a loop that does `work` each tick; its missed deadlines, lateness and work [µs]."""
     realtime = ask_for_real_time().realtime
     clock = Deadlines(rate_hz, spin_ns=SPIN_NS if realtime else 0)
     late_us, work_us = [], []
     first = missed = 0
-    for _ in range(round((SETTLE_S + seconds) * rate_hz)):
+    for _ in range(round((UNCOUNTED_S + seconds) * rate_hz)):
         index, late_ns = clock.wait()
         began = time.perf_counter_ns()
         work(index)
         took = time.perf_counter_ns() - began
-        if index < SETTLE_S * rate_hz:
+        if index < UNCOUNTED_S * rate_hz:
             first, missed = index, clock.missed
-        elif index > (SETTLE_S + seconds) * rate_hz:
+        elif index > (UNCOUNTED_S + seconds) * rate_hz:
             break
         else:
             late_us.append(late_ns / 1e3)
             work_us.append(took / 1e3)
-    return {
-        "realtime": realtime,
-        "ticks": index - first,
-        "missed": clock.missed - missed,
-        **figures(late_us, work_us),
-    }
+    return {"realtime": realtime, "ticks": index - first, "missed": clock.missed - missed, **figures(late_us, work_us)}
 
 
 @functools.cache
 def _middle(skill: Skill) -> list[float]:
-    """Both hands (6,) [m], those demonstrated that are nearest to their mean."""
+    """The demonstrated positions of both hands (6,) [m] that are nearest to their mean."""
     hands = skill.hands
     nearest: list[float] = hands[((hands - hands.mean(axis=0)) ** 2).sum(axis=1).argmin()].tolist()
     return nearest
 
 
 def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
-    """Both hands [m] at a time [s], about some that were demonstrated."""
+    """Positions of both hands [m] at a time [s], swaying about demonstrated positions."""
     middle = _middle(skill)
     x = SWAY_M * math.sin(2 * math.pi * SWAY_HZ * t)
     return [(middle[0] + x, middle[1], middle[2]), (middle[3] + x, middle[4], middle[5])]
 
 
 def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], None]:
-    """The function that publishes both swaying hands of a time [s] with a stamp [ns]."""
+    """A function that publishes both swaying hands of a time [s] with a stamp [ns]."""
     cell = Settings().cell
     publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
 
@@ -123,7 +119,7 @@ def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], Non
 
 
 def core(skill: Skill, rate_hz: int, seconds: float, arm: str) -> dict[str, Any]:
-    """The result of the loop with the core alone."""
+    """Run the loop with the core alone; the result of `loop`."""
     cell = cell_of(arm)
     assumed = msgspec.structs.replace(cell.arm, source="assumed")
     settings = msgspec.structs.replace(cell, rate_hz=rate_hz, arm=assumed)
@@ -142,7 +138,7 @@ def core(skill: Skill, rate_hz: int, seconds: float, arm: str) -> dict[str, Any]
 
 
 def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[str, Any]:
-    """Time from a published hand to the command that answers it, and round trip to an echo [ms]."""
+    """Measure the time from a published hand to its command, and the round trip to an echo [ms]."""
     cell = Settings().cell
     answered: dict[int, int] = {}
     trips_ms: list[float] = []
@@ -163,12 +159,12 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
         publish = hands_of(session, skill)
         ping = session.declare_publisher("probe/ping", express=True)
         start_ns, sent = time.time_ns(), []
-        for k in range(round((SETTLE_S + seconds) * TRACKER_HZ)):
+        for k in range(round((UNCOUNTED_S + seconds) * TRACKER_HZ)):
             due_ns = start_ns + round(1e9 * k / TRACKER_HZ)
             time.sleep(max(0.0, (due_ns - time.time_ns()) / 1e9))
             now_ns = time.time_ns()
             publish(k / TRACKER_HZ, now_ns)
-            if k > SETTLE_S * TRACKER_HZ:
+            if k > UNCOUNTED_S * TRACKER_HZ:
                 sent.append(now_ns)
                 if k % PING_EVERY == 0:
                     ping.put(str(time.time_ns()).encode())
@@ -180,7 +176,7 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
 
 
 def echo() -> None:
-    """Sends back what it receives, until its standard input ends."""
+    """Send received messages back until the standard input ends."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         back = session.declare_publisher("probe/pong", express=True)
         heard = session.declare_subscriber("probe/ping", lambda sample: back.put(sample.payload))
@@ -190,8 +186,8 @@ def echo() -> None:
 
 
 def main(kind: str, *arguments: str) -> int:
-    """`empty RATE SECONDS`, `core SKILL RATE SECONDS ARM`, `tracker SKILL ENDPOINT ECHO SECONDS` or
-    `echo`.
+    """Run the probe of a command line: `empty RATE SECONDS`, `core SKILL RATE SECONDS ARM`,
+    `tracker SKILL ENDPOINT ECHO SECONDS` or `echo`.
     """
     if kind == "echo":
         echo()

@@ -1,4 +1,4 @@
-"""Starts the probes of `service.timing.probe`; finds a daemon's processes."""
+"""Start of the probes of `service.timing.probe`, and the processes of a daemon."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ import psutil
 from service.contract.explain import ExplainedError
 
 PROBE = [sys.executable, "-m", "service.timing.probe"]
-TIMEOUT_S = 900.0
+PROBE_TIMEOUT_S = 900.0
 
 
-class BenchError(ExplainedError):
-    """A measurement failed; the message says why."""
+class ProbeError(ExplainedError):
+    """A measurement failed; the message has the cause."""
 
 
 def probe(kind: str, *arguments: object) -> dict[str, Any]:
-    """The result of one of the probes. Raises BenchError."""
+    """Run a probe and return its result. Raises ProbeError."""
     command = [*PROBE, kind, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
     if done.returncode != 0:
-        raise BenchError(f"{kind} could not be measured: {done.stderr.strip()[-500:]}")
+        raise ProbeError(f"{kind} could not be measured: {done.stderr.strip()[-500:]}")
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 
 
 @contextlib.contextmanager
 def echo() -> Iterator[str]:
-    """The endpoint at which an echo listens, while the context lasts."""
+    """A context with a running echo; its endpoint."""
     with subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdin is not None
@@ -47,7 +47,7 @@ def echo() -> Iterator[str]:
 
 
 def family(pid: int) -> dict[str, psutil.Process]:
-    """A daemon's process and its children, by kind."""
+    """The processes of a daemon, `daemon` and its children, by name."""
     found = {"daemon": psutil.Process(pid)}
     found |= {child.name(): child for child in found["daemon"].children()}
     return found

@@ -1,5 +1,5 @@
-"""Memory and open files of a daemon's processes over minutes, with recorder, viewer and a tracker,
-for `thirdhand bench --soak`.
+"""Measurement of memory and open files of a daemon's processes over time, with recorder, viewer and
+a tracker, for `thirdhand bench --soak`.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from service.client import Client, open_session
 from service.daemon.launch import launched
 from service.settings.config import Settings
-from service.timing.loads import asking, until_following
+from service.timing.loads import running_client, until_following
 from service.timing.probe_processes import family
 
-LONGEST_PAUSE_S = 5.0  # between samples
-FEWEST = 60  # samples
-WARM_UP = 0.2  # share of the duration that is not counted
-T_95 = 1.96  # of a 95 % interval
+LONGEST_PAUSE_S = 5.0  # maximum interval of samples
+FEWEST = 60  # minimum number of samples
+WARM_UP = 0.2  # the first 20 % of the duration are not counted
+T_95 = 1.96  # half width of a 95 % interval / standard deviation
 
 
 def run(
     minutes: float, rate_hz: int, *, settings: Settings | None = None, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """The growth of each process's memory [MB/h] with its interval, open files at start and end,
-    and missed deadlines. Raises LoadError and LaunchError.
+    """Measure the growth of each process's memory [MB/h] with its interval, open files at start and
+    end, and missed deadlines. Raises LoadError and LaunchError.
     """
     say(f"daemon with recorder and viewer, a tracker: {minutes:g} min")
     with tempfile.TemporaryDirectory() as name:
@@ -38,7 +38,7 @@ def run(
                 folder, "--joints", "assumed", "--rate", str(rate_hz), settings=settings, record=folder, say=say
             ) as service,
             open_session(connect=[service.endpoint]) as session,
-            asking("hands", service.endpoint),
+            running_client("hands", service.endpoint),
         ):
             client = Client(session)
             until_following(client)
@@ -63,9 +63,9 @@ def run(
 
 
 def judged(samples: Any) -> dict[str, Any]:
-    """Memory's growth by least squares after warming up, and half the width of its 95 % interval.
+    """Growth of memory by least squares after the warm-up, and half the width of its 95 % interval.
 
-    The interval follows from ten blocks, as neighbouring samples are correlated.
+    The interval is computed from ten blocks, because neighbouring samples are correlated.
     """
     kept = samples[samples[:, 0] >= WARM_UP * samples[-1, 0]]
     hours, memory, files = kept[:, 0] / 3600, kept[:, 1], kept[:, 2]
@@ -82,7 +82,7 @@ def judged(samples: Any) -> dict[str, Any]:
 
 
 def text(report: dict[str, Any]) -> str:
-    """The report for people to read."""
+    """The report as a table in text."""
     lines = [f"  {'':<10}{'memory MB':>10}{'grows MB/h':>16}{'open files':>14}"]
     for who, one in report["processes"].items():
         grows = f"{one['slope_mb_per_h']:+.1f} ± {one['interval_mb_per_h']:.1f}"

@@ -1,5 +1,5 @@
-"""Captures a demonstration: hands, tool and gripper of a cell, received over Zenoh until a person
-ends it or all is at rest, and written as received.
+"""Capture of a demonstration: hands, tool and gripper of a cell are received over Zenoh until a
+person ends it or everything is at rest, and are written as received.
 """
 
 from __future__ import annotations
@@ -27,30 +27,32 @@ from service.core.intake.tuning import MAX_HAND_DISTANCE_M
 from service.files.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.files.dwells import REST_M
 from service.files.mcap_file import machine, whole_file
-from service.files.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES
+from service.files.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES_TOPIC
 from service.files.tool_poses import tool_poses
 from service.settings.config import Settings, robot_description
 
-HANDS, TOOL = ("hands/left", "hands/right"), ENDINGS["tool"]
-HEARD = (*HANDS, TOOL, JOINT_STATES, GRIPPER_STATE)
-ELSEWHERE = ("**/hands/*", "**/tool/pose")  # what is published in other cells, or misspelt
-MOST_OTHERS = 8  # of ELSEWHERE that an error lists
-REST_RAD = 0.02  # motion of a joint at rest
-COVERED = 0.7  # share of the rest's duration that samples have to cover
-MOVED = 5.0  # times the motion at rest, which has to be seen before rest ends a capture
-KEPT_S = 0.3  # of the rest before and after the motion
-SILENT_S = 2.0  # without any message, after which a capture ends
-POLL_S, SHOW_S = 0.02, 0.1
+HAND_KEYS = ("hands/left", "hands/right")
+TOOL_KEY = ENDINGS["tool"]
+CAPTURED_KEYS = (*HAND_KEYS, TOOL_KEY, JOINT_STATES, GRIPPER_STATE)
+OTHER_CELLS = ("**/hands/*", "**/tool/pose")  # these find streams of other cells, and misspelt keys
+MAX_OTHER_KEYS = 8  # an error message lists at most this many of them
+REST_RAD = 0.02  # a joint at rest moves less than this
+MIN_COVERED_SHARE = 0.7  # samples must cover this share of a rest
+MOVED_RATIO = 5.0  # a rest ends a capture only after a motion of 5 times the motion at rest
+RETAINED_REST_S = 0.3  # this time of the rest before and after the motion is retained
+CAPTURE_SILENCE_S = 2.0  # a capture ends after this time without a message
+CAPTURE_POLL_S = 0.02
+PROGRESS_S = 0.1  # interval of progress reports
 Until = Literal["key", "rest"]
 
 
 class CaptureError(ExplainedError, RuntimeError):
-    """A demonstration could not be captured; the message says what was not received."""
+    """A demonstration could not be captured; the message has the cause."""
 
 
 class Sample(NamedTuple):
-    """A message as received: when [ns], its bytes, and what rest is judged by (the position of a
-    hand or the tool [m], or joints [rad]).
+    """A received message: its arrival [ns], its bytes, and the position of hand or tool [m] or of
+    joints [rad], by which rest is detected.
     """
 
     arrived_ns: int
@@ -59,14 +61,18 @@ class Sample(NamedTuple):
 
 
 class Capture:
-    """The samples of one demonstration, of the hands that conduct; subscribed until closed."""
+    """The samples of one demonstration, of the hands that lead the tool; subscribed until
+    closed.
+    """
 
     def __init__(
         self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both", person: str = ""
     ) -> None:
         self.cell, self.settings, self.conducts, self.person = cell, settings, conducts, person
-        self.hands = HANDS if conducts == "both" else (ENDINGS[conducts],)
-        self.samples: dict[str, list[Sample]] = {key: [] for key in HEARD if key not in HANDS or key in self.hands}
+        self.hands = HAND_KEYS if conducts == "both" else (ENDINGS[conducts],)
+        self.samples: dict[str, list[Sample]] = {
+            key: [] for key in CAPTURED_KEYS if key not in HAND_KEYS or key in self.hands
+        }
         self.malformed: dict[str, int] = {}
         self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in self.samples}
         self._heard_s, self._moved = time.monotonic(), False
@@ -80,13 +86,13 @@ class Capture:
         return lambda sample: waiting.append((time.time_ns(), sample.payload.to_bytes()))
 
     def close(self) -> None:
-        """Ends the subscriptions, and collects what came last."""
+        """End the subscriptions and decode the last messages."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self.collect()
 
     def collect(self) -> None:
-        """Decodes what came since the last call; messages that are not readable are counted."""
+        """Decode the messages since the last call; unreadable ones are counted."""
         for key, waiting in self._waiting.items():
             while waiting:
                 arrived_ns, payload = waiting.pop(0)
@@ -98,7 +104,7 @@ class Capture:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
 
     def _state(self, key: str, arrived_ns: int, payload: bytes) -> Sample | None:
-        """The state of all joints that a message completes; None: it completes none."""
+        """The state of all joints that a message completes; None if it completes none."""
         message = cdr.decode_joints(payload)
         state = self._states.take(message, arrived_ns / 1e9) or self._states.incomplete(message, arrived_ns / 1e9)
         if state is None:
@@ -123,42 +129,42 @@ class Capture:
 
     @property
     def missing(self) -> list[str]:
-        """The streams that a demonstration needs and that have not been received yet."""
-        tool = [] if self.samples[TOOL] or self.samples[JOINT_STATES] else [f"{TOOL} or {JOINT_STATES}"]
+        """The required streams that have not been received yet."""
+        tool = [] if self.samples[TOOL_KEY] or self.samples[JOINT_STATES] else [f"{TOOL_KEY} or {JOINT_STATES}"]
         return [key for key in self.hands if not self.samples[key]] + tool
 
     def check(self) -> None:
-        """Raises CaptureError where a hand or the tool is too far away, or in an unknown frame."""
+        """Raise CaptureError if a hand or the tool is too far away, or in an unknown frame."""
         hands = self.settings.hands
-        for key in (*self.hands, TOOL):
+        for key in (*self.hands, TOOL_KEY):
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
                 at = np.array(pose.position)
                 if problem := unknown_frame(key, pose.frame_id, hands):
-                    raise CaptureError(f"{problem}. Nothing is recorded")
+                    raise CaptureError(f"{problem}. Nothing was recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
                     at = from_tracker(at, hands)
                 if np.linalg.norm(at) > MAX_HAND_DISTANCE_M:
                     why = far_away(key, pose.frame_id, pose.position, hands)
-                    raise CaptureError(f"{key} is {why}. Nothing is recorded")
+                    raise CaptureError(f"{key} is {why}. Nothing was recorded")
 
     @property
     def streams(self) -> dict[str, list[Sample]]:
         """The streams of both hands, and of the tool if it is tracked, else of the arm's joints."""
-        return {key: self.samples[key] for key in (*self.hands, TOOL if self.samples[TOOL] else JOINT_STATES)}
+        return {key: self.samples[key] for key in (*self.hands, TOOL_KEY if self.samples[TOOL_KEY] else JOINT_STATES)}
 
     @property
     def silent_s(self) -> float:
-        """Time since anything came [s]."""
+        """Time since the last message [s]."""
         return time.monotonic() - self._heard_s
 
     def begin(self) -> None:
-        """Starts the demonstration: forgets all but the newest sample of each stream."""
+        """Begin the demonstration: delete all but the newest sample of each stream."""
         for samples in self.samples.values():
             del samples[:-1]
 
     def is_over(self, rest_s: float) -> bool:
-        """Whether everything has been at rest for `rest_s` [s] after it moved."""
+        """True once everything has been at rest for `rest_s` [s] after a motion."""
         now_ns = time.time_ns()
         began_ns = min(samples[0].arrived_ns for samples in self.streams.values())
         if now_ns - began_ns < 1e9 * rest_s:
@@ -168,14 +174,18 @@ class Capture:
                 ::-1
             ]
             still = [sample.at for sample in lately]
-            self._moved = self._moved or (bool(still) and _motion(key, np.array([samples[0].at, still[-1]])) > MOVED)
+            self._moved = self._moved or (
+                bool(still) and _motion(key, np.array([samples[0].at, still[-1]])) > MOVED_RATIO
+            )
             covered_s = (lately[-1].arrived_ns - lately[0].arrived_ns) / 1e9 if lately else 0.0
-            if covered_s < COVERED * rest_s or _motion(key, np.array(still)) > 1:
+            if covered_s < MIN_COVERED_SHARE * rest_s or _motion(key, np.array(still)) > 1:
                 return False
         return self._moved
 
     def keep_motion(self) -> tuple[float, float]:
-        """The rest before and after the motion that was left out [s]; KEPT_S of each is kept."""
+        """Delete the rest before and after the motion, and return the deleted times [s].
+        RETAINED_REST_S of each is retained.
+        """
         times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
         start_ns, end_ns = self.span_of_motion()
         for key, samples in self.samples.items():
@@ -183,7 +193,7 @@ class Capture:
         return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
-        """When anything moves, from and to [ns], with KEPT_S of rest before and after."""
+        """Begin and end of the motion [ns], with RETAINED_REST_S of rest before and after."""
         begins, ends = [], []
         for key, samples in self.streams.items():
             at = np.array([sample.at for sample in samples])
@@ -194,34 +204,33 @@ class Capture:
                 ends.append(samples[len(at) - 1 - int(np.argmax(away[1][::-1]))].arrived_ns)
         if not begins:
             return 0, time.time_ns()
-        return min(begins) - int(1e9 * KEPT_S), max(ends) + int(1e9 * KEPT_S)
+        return min(begins) - int(1e9 * RETAINED_REST_S), max(ends) + int(1e9 * RETAINED_REST_S)
 
     def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
-        """Writes the demonstration, all or nothing: the messages as received and the task's places;
-        settings and URDF are attached.
+        """Write the demonstration, all or nothing: the received messages and the task's via-points,
+        with settings and URDF attached.
 
-        Where nobody tracks the tool, its poses follow from the joints. Raises CaptureError,
-        OSError.
+        Without a tracked tool its poses are computed from the joints. Raises CaptureError, OSError.
         """
         if lacking := self.missing:
-            raise CaptureError(f"nothing of {', '.join(lacking)} came in this time: no demonstration is written")
+            raise CaptureError(f"no messages on {', '.join(lacking)} arrived in time: no demonstration was written")
         urdf = robot_description(self.settings)
         messages = [
             (sample.arrived_ns, key, sample.payload) for key, samples in self.samples.items() for sample in samples
         ]
-        if not self.samples[TOOL]:
+        if not self.samples[TOOL_KEY]:
             messages += self._tool_by_joints(urdf)
         if places:
             text = cdr.encode_string(encode_json(tuple(places)).decode())
-            messages.append((min(messages)[0], PLACES, text))
+            messages.append((min(messages)[0], PLACES_TOPIC, text))
         with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
-            told = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
-            file.writer.add_metadata("thirdhand", told)
+            about = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
+            file.writer.add_metadata("thirdhand", about)
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
             file.attach("arm.urdf", urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
-                codec = channels.STRING if key == PLACES else channels.BY_KEY[key].codec
+                codec = channels.STRING if key == PLACES_TOPIC else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
 
     def _tool_by_joints(self, urdf: str) -> list[tuple[int, str, bytes]]:
@@ -231,7 +240,7 @@ class Capture:
         return [
             (
                 states[i].arrived_ns,
-                TOOL,
+                TOOL_KEY,
                 channels.POSE.encode(PoseStamped(stamps[i], BASE, tuple(at[:3]), tuple(at[3:]))),
             )
             for i, at in zip(kept, poses.tolist(), strict=True)
@@ -239,7 +248,7 @@ class Capture:
 
 
 def _motion(key: str, at: Vector) -> float:
-    """The largest motion in positions or joints (N, K), as a multiple of the motion at rest."""
+    """Largest motion of positions or joints (N, K), as a multiple of the motion at rest."""
     return float(np.ptp(at, axis=0).max()) / (REST_RAD if key == JOINT_STATES else REST_M)
 
 
@@ -258,12 +267,12 @@ def capture(
     progress: Callable[[str], None] = lambda line: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Capture:
-    """A demonstration, captured from when hands and tool are received until `is_ended`, until all
-    rests for `rest_s` [s] after it moved, or until nothing came for SILENT_S.
+    """Capture a demonstration, from the first messages of hands and tool until `is_ended`, until
+    everything rests for `rest_s` [s] after a motion, or until CAPTURE_SILENCE_S without a message.
 
-    Raises CaptureError where they are not received within `wait_s` [s].
+    Raises CaptureError if they are not received within `wait_s` [s].
     """
-    captured, others = Capture(session, cell, settings, conducts, person), Overheard(session, *ELSEWHERE)
+    captured, others = Capture(session, cell, settings, conducts, person), Overheard(session, *OTHER_CELLS)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
     try:
         begun_s = time.monotonic()
@@ -273,25 +282,25 @@ def capture(
                 unreadable = "".join(
                     f"; {n} messages on {key} are not readable" for key, n in captured.malformed.items()
                 )
-                meant = {channels.key(cell, key) for key in HEARD}
-                elsewhere = [key for key in others.keys if key not in meant][:MOST_OTHERS]
-                instead = f"; heard instead: {', '.join(elsewhere)}" if elsewhere else ""
+                meant = {channels.key(cell, key) for key in CAPTURED_KEYS}
+                elsewhere = [key for key in others.keys if key not in meant][:MAX_OTHER_KEYS]
+                instead = f"; received instead: {', '.join(elsewhere)}" if elsewhere else ""
                 raise CaptureError(
-                    f"not heard: {', '.join(captured.missing)}{unreadable}{instead}. Are tracker and arm running, "
-                    f"connected to the same place, and in cell {cell}?"
+                    f"not received: {', '.join(captured.missing)}{unreadable}{instead}. Are tracker and arm running, "
+                    f"connected to the same endpoint, and in cell {cell}?"
                 )
-            time.sleep(POLL_S)
+            time.sleep(CAPTURE_POLL_S)
             captured.collect()
         others.close()
         captured.check()
         captured.begin()
         begun_s, shown_s = time.monotonic(), 0.0
-        say(f"recording{f'; it ends once {at_rest} after they moved' if until == 'rest' else ''}")
+        say(f"recording{f'; it ends once {at_rest} after a motion' if until == 'rest' else ''}")
         while not is_ended():
-            time.sleep(POLL_S)
+            time.sleep(CAPTURE_POLL_S)
             captured.collect()
             lasts_s = time.monotonic() - begun_s
-            if lasts_s - shown_s > SHOW_S:
+            if lasts_s - shown_s > PROGRESS_S:
                 shown_s = lasts_s
                 counts = ", ".join(f"{key} {len(samples)}" for key, samples in captured.streams.items())
                 progress(f"{lasts_s:5.1f} s   {counts}")
@@ -301,8 +310,8 @@ def capture(
             if lasts_s > longest_s:
                 say(f"ended after {longest_s:g} s")
                 break
-            if captured.silent_s > SILENT_S:
-                say(f"ended: nothing came for {SILENT_S:g} s")
+            if captured.silent_s > CAPTURE_SILENCE_S:
+                say(f"ended: no message arrived for {CAPTURE_SILENCE_S:g} s")
                 break
     except KeyboardInterrupt:
         if captured.missing:
@@ -313,5 +322,5 @@ def capture(
     if until == "rest":
         before_s, behind_s = captured.keep_motion()
         if before_s or behind_s:
-            say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s behind it")
+            say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s after it")
     return captured

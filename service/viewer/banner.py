@@ -30,7 +30,7 @@ def log_line(mode: int, reason: int, settings: Settings) -> str:
 @functools.cache
 def banner(mode: int, reason: int) -> NDArray[np.uint8]:
     """The picture (HEIGHT, WIDTH, 3) that shows the headline."""
-    image = Image.new("RGB", (WIDTH, HEIGHT), palette.MODES[Mode(mode)])
+    image = Image.new("RGB", (WIDTH, HEIGHT), palette.BY_MODE[Mode(mode)])
     draw, text, size = ImageDraw.Draw(image), headline(mode, reason), LETTERS
     while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:
         size -= 1

@@ -174,7 +174,7 @@ def _log_capsules(
             radii=capsules["radius"],
             translations=capsules["ends"][:, 0],
             quaternions=np.array(turns),
-            colors=[palette.faint(palette.MEASURED, 0.35) if faint else palette.ARM],
+            colors=[palette.faint(palette.MEASURED, 0.35) if faint else palette.ARM_BODY],
             line_radii=[0.0005],
             fill_mode=fill,
         )
@@ -235,12 +235,12 @@ def _log_names(fix: Any, settings: Settings) -> None:
         (
             f"/joints/{quantity}",
             [f"{joint} [{unit}{per}]" for joint, unit in zip(joints, units, strict=True)],
-            palette.JOINTS,
+            palette.BY_JOINT,
         )
         for quantity, per in (("position", ""), ("velocity", "/s"), ("acceleration", "/s²"))
     ]
     series += [
-        ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.JOINTS),
+        ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.BY_JOINT),
         ("/age", [f"{side} hand [ms]" for side in SIDES], (palette.LEFT, palette.RIGHT)),
     ]
     single = (
@@ -273,7 +273,7 @@ def _log_names(fix: Any, settings: Settings) -> None:
         widths = [1.5] * len(names)
         fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
     for path, members, colours_packed in (
-        ("/mode", Mode, [palette.packed(palette.MODES[mode]) for mode in Mode]),
+        ("/mode", Mode, [palette.packed(palette.BY_MODE[mode]) for mode in Mode]),
         ("/reason", Reason, [palette.packed(palette.GREY)] * len(Reason)),
     ):
         names = [word(member) for member in members]

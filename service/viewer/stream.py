@@ -30,7 +30,7 @@ from service.contract.messages import SceneObject, WireError
 from service.contract.printable import printable
 from service.core.frame import Record
 from service.core.intake.arm_samples import in_turn
-from service.files.recording import OBJECTS
+from service.files.recording import OBJECTS_NOTE
 from service.files.shipped import skills_folder
 from service.learning.demonstration import Demonstration
 from service.settings.config import Settings
@@ -395,7 +395,7 @@ class Viewer:
 
     def note(self, key: str, text: str, time_ns: int) -> None:
         """Show a note: objects on the bench, or a line in the log (a warning under `log`)."""
-        if key == OBJECTS:
+        if key == OBJECTS_NOTE:
             found = msgspec.json.decode(text, type=tuple[SceneObject, ...])
             self._each(lambda destination: destination.show_objects(found, time_ns))
         else:

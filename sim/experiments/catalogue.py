@@ -14,8 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from sim.made_tasks import KINDS
-from sim.people import SEEDS as PERSON_SEEDS
+from sim.made_tasks import TASK_KINDS
+from sim.people import GROUP_SEEDS
 from sim.scene import Scene
 
 DRAWING = 0  # seed of the scatter of dots in a figure, and of resampling for an interval
@@ -102,16 +102,16 @@ _TUNED_HANDS = {"people": Stream("moving hands", 0, range(3)), "stops": Stream("
 _TEACHERS = {**_SHIPPED, "teachers": Stream("moving hands", 0, range(100, 105))}
 
 ALL, CORE, KMP = ("core", "learning", "kmp"), ("core", "learning"), ("kmp",)
-_TEST, _TUNING, _LEARNED = (PERSON_SEEDS[group] for group in ("test", "tuning", "demonstrations"))
+_TEST, _TUNING, _LEARNED = (GROUP_SEEDS[group] for group in ("test", "tuning", "demonstrations"))
 _PEOPLE = Seeds(
     {"people": Stream("person", _TEST, range(24)), "breaking": Stream("breaking scene", _TEST, range(40))},
     tuning={"people": Stream("person", _TUNING, range(10)), "breaking": Stream("breaking scene", _TUNING, range(10))},
     learned={"people": Stream("person", _LEARNED, range(6))},
 )
 _PARTNERS = Seeds(
-    {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in KINDS},
-    tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in KINDS},
-    learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in KINDS},
+    {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in TASK_KINDS},
+    tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in TASK_KINDS},
+    learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in TASK_KINDS},
 )
 _FOLLOWED = {"people": Stream("moving hands", 0, range(200, 203)), "stops": Stream("sudden stop", 0, range(200, 224))}
 _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings

@@ -32,7 +32,7 @@ from sim.experiments.reached import taught
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
 from sim.experiments.rivals.partners import RIVALS, left_out_by
 from sim.experiments.workers import shared_out
-from sim.made_tasks import KINDS, takes
+from sim.made_tasks import TASK_KINDS, takes
 
 SERVICE, TOLD = "service", ", told"
 RECORDED = {  # the beginnings of the files' names
@@ -48,7 +48,7 @@ NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
 BLOCK = 9  # takes of `walk` that are left out together
 SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
-DEMONSTRATORS = len(SEEDS.learned[KINDS[0]].numbers)
+DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
 GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
 SHOWN = {
     SERVICE: ("service", ADAPTED, "o"),
@@ -90,7 +90,7 @@ class Found(NamedTuple):
 @functools.lru_cache(maxsize=2)
 def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], list[LeftOut]]:
     """Takes to learn from, and those that are left out wherever they are not learned from."""
-    if task in KINDS:
+    if task in TASK_KINDS:
         groups = [
             [
                 left_out(f"person {take.person} take {i % EACH}", "", take.demonstration)
@@ -123,7 +123,7 @@ def part(one: Part) -> Found:
         shown, asked = [t for t in shown if t.group != one.out], [t for t in asked if t.group == one.out]
     named = bool(shown[0].demonstration.places)
     found = Found({}, {})
-    for told in [False] * (one.task not in KINDS) + [True] * named:
+    for told in [False] * (one.task not in TASK_KINDS) + [True] * named:
         for name, rival in RIVALS.items():
             said = left_out_by(rival, shown, asked, told=told)
             found.rivals[name + TOLD * told] = [judged(*pair) for pair in zip(asked, said, strict=True)]
@@ -185,7 +185,7 @@ def served(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) ->
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers of all sets."""
     people = max(2, round(DEMONSTRATORS * options.share))
-    parts = [Part(kind, "", people, None) for kind in KINDS[: max(2, round(len(KINDS) * options.share))]]
+    parts = [Part(kind, "", people, None) for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]]
     if options.data is not None:
         for task in RECORDED:
             groups = sorted({take.group for take in _takes(task, 0, options.data)[0]})
@@ -204,7 +204,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "takes_each": EACH,
         "tested_people": people,
         "recorded": {task: numbers_of(by_task[task]) for task in RECORDED if task in by_task},
-        "made": {kind: numbers_of(by_task[kind]) for kind in KINDS if kind in by_task},
+        "made": {kind: numbers_of(by_task[kind]) for kind in TASK_KINDS if kind in by_task},
     }
     draw_numbers(results, numbers)
     return numbers

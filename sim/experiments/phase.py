@@ -21,9 +21,9 @@ from sim.experiments.rivals.as_skill import in_bench
 from sim.experiments.rivals.promp import ProMPOverTime
 from sim.experiments.scenes import Drawn
 from sim.scene import Scene
-from sim.script import PAUSE_RAMP_S, Pause
+from sim.script import PAUSE_RAMP_S, ScriptPause
 
-STOP, BACK = Pause(1.6, 2.0), Pause(8.0, 3.2, depth=2.0)
+STOP, BACK = ScriptPause(1.6, 2.0), ScriptPause(8.0, 3.2, depth=2.0)
 SEED, RATE_HZ = EXPERIMENTS["phase"].seeds.evaluation["hands"].seed, 500
 STOPPED_S = STOP.at_s + PAUSE_RAMP_S, STOP.at_s + STOP.lasts_s - PAUSE_RAMP_S  # the hands stand still
 SETTLED_S = 0.3  # after the hands have stopped

@@ -21,7 +21,7 @@ from sim.experiments.scenes import OFFSET_M, Drawn
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 
 EVENTS = TaskEvents.__struct_fields__
 
@@ -44,11 +44,13 @@ def places_in(scene: Scene) -> Places:
     return Places._make([*(np.array(point) for point in points), 0.0])
 
 
-def shown() -> list[Shown]:
+def shown() -> list[SessionDemonstration]:
     """The shipped demonstrations, with the places of their scene."""
     places = places_in(Scene())
     return [
-        Shown(np.arange(len(one.tool), dtype=np.float64) * one.period_s, one.hands, one.tool[:, :3], places)
+        SessionDemonstration(
+            np.arange(len(one.tool), dtype=np.float64) * one.period_s, one.hands, one.tool[:, :3], places
+        )
         for one in demonstrated()
     ]
 

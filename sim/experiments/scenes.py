@@ -11,7 +11,7 @@ import numpy as np
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M
 from sim.experiments.results import Array
 from sim.scene import MOST_MOVED, Scene
-from sim.script import Clock, HandScript, Pause
+from sim.script import Clock, HandScript, ScriptPause
 
 LOWEST_M = 0.05  # above the table
 OFFSET_M = 0.008  # deviation of where the hands stop, each axis
@@ -22,7 +22,7 @@ class Drawn(NamedTuple):
 
     scene: Scene
     speed: float
-    pauses: tuple[Pause, ...]
+    pauses: tuple[ScriptPause, ...]
     seed: int
 
     def script(self) -> HandScript:
@@ -59,14 +59,14 @@ def draw(number: int, *, seed: int) -> Drawn:
     )
     speed = float(2 ** random.uniform(-1, 1))
     lasts_s = scene.duration_s / speed
-    pauses: list[Pause] = []
+    pauses: list[ScriptPause] = []
     stops, turns = random.random() < 2 / 3, random.random() < 1 / 2
     halves = [0, 1] if random.random() < 1 / 2 else [1, 0]
     for half, wanted, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
         if wanted:
             # Each lies in its own half of the script; the second is delayed by the first.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
-            pauses.append(Pause(at_s, float(random.uniform(0.6, longest_s)), depth))
+            pauses.append(ScriptPause(at_s, float(random.uniform(0.6, longest_s)), depth))
     ordered = sorted(pauses)
     if len(ordered) == 2:
         first, second = ordered
@@ -74,7 +74,7 @@ def draw(number: int, *, seed: int) -> Drawn:
     return Drawn(scene, speed, tuple(_never_before_the_start(ordered, speed)), 1000 * seed + number)
 
 
-def _never_before_the_start(pauses: list[Pause], speed: float) -> list[Pause]:
+def _never_before_the_start(pauses: list[ScriptPause], speed: float) -> list[ScriptPause]:
     """The pauses; those in which the hands go back end where they would be at their start."""
     shorter = list(pauses)
     for i in range(len(shorter)):
@@ -83,7 +83,7 @@ def _never_before_the_start(pauses: list[Pause], speed: float) -> list[Pause]:
     return shorter
 
 
-def _script_s_after(pause: Pause, pauses: list[Pause], speed: float) -> float:
+def _script_s_after(pause: ScriptPause, pauses: list[ScriptPause], speed: float) -> float:
     return Clock(speed=speed, pauses=pauses).at(pause.at_s + pause.lasts_s)[0]
 
 

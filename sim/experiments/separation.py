@@ -30,7 +30,7 @@ from sim.experiments.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from sim.experiments.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from sim.experiments.scenes import OFFSET_M, Drawn, draw
 from sim.experiments.workers import shared_out
-from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, Motion, Pause, Teacher
+from sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, PointMotion, ScriptPause, Teacher
 
 SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")
@@ -67,7 +67,7 @@ class ThrustScript(HandScript):
                 self._place = ahead[0]
                 break
         later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
-        back = Pause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
+        back = ScriptPause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
         super().__init__(
             drawn.scene,
             seed=drawn.seed,
@@ -85,7 +85,7 @@ class ThrustScript(HandScript):
         back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
         share, rate = (a - b for a, b in zip(_reach(begin), _reach(back), strict=True))
         motion, way = hands[self.side], self._place - hands[self.side].position
-        hands[self.side] = Motion(
+        hands[self.side] = PointMotion(
             motion.position + share * way,
             (1.0 - share) * motion.velocity + rate / self.lasts_s * way,
             motion.acceleration,

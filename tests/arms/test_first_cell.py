@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.arms.first_cell import PLACES, Proposal, plate_of, proposed, rates, turn_of_tool, written
+from service.arms.first_cell import DEMO_TOOL_M, Proposal, proposed, written
+from service.arms.plate import plate_of, turn_of_tool
+from service.arms.rates import rates
 from service.core.arm.stage import Arm
 from service.core.separation.stage import Separation
 from service.files.shipped import shipped_skill
@@ -97,7 +99,7 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
 def test_the_places_are_those_of_the_demo() -> None:
     scene = Scene()
     places = {"start": scene.robot_start, "handover": scene.offer, "glass": scene.glass, "soldering": scene.carry}
-    for name, place in PLACES.items():
+    for name, place in DEMO_TOOL_M.items():
         assert place == pytest.approx(places.pop(name))
     assert not places
 

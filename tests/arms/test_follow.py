@@ -166,7 +166,7 @@ def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_
     with serving(tmp_path, network=PATIENT) as daemon:
         at = ("--connect", daemon.endpoint)
         with following("simulated", *at, "--config", str(tmp_path / "arm.toml")) as running:
-            running.until("is driven")
+            running.until("driving simulated")
             Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
             done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
             assert done.returncode == 0, done.stderr
@@ -192,15 +192,15 @@ def refused(*arguments: str) -> str:
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     assert "no arm 'frankia'; franka and simulated are shipped" in refused("frankia")
-    assert "is a daemon running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
+    assert "is a daemon or a router running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
     six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
     with serving(tmp_path) as daemon:
         at = ("--connect", daemon.endpoint)
         assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
         assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
-        assert "here 6 were configured" in line
-        assert "give --config, the daemon's own settings" in line
+        assert "the settings here have 6" in line
+        assert "give the daemon's settings by --config" in line
         assert "give --config with its own URDF" in refused("franka", *at)
 
 
@@ -210,7 +210,7 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
         running.until("waiting, up to 60 s: ")
         time.sleep(3.0)  # longer than a connection or a request is tried
         with serving(tmp_path, network=f'[network]\nlisten = ["{at}"]\n') as daemon, Tracker(daemon.session):
-            running.until("commands come, the arm follows")
+            running.until("commands arrive, the arm follows")
             assert running.ended() == 0
 
 
@@ -220,7 +220,7 @@ def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program:
         done = thirdhand(program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(
-        "50 Hz is too slow: commands would come every 20 ms, and an arm brakes 20 ms after its last command; "
+        "50 Hz is too slow: commands would arrive every 20 ms, and an arm brakes 20 ms after its last command; "
         "67 Hz or more needed"
     )
 

@@ -20,7 +20,7 @@ from service.core.limiter.stage import Limiter
 from service.settings.config import JointSettings, Settings, robot_description
 from support.franka_cell import STANDS, assert_allowed, cell, fr3, robot, simulated
 
-TICK, PERIOD = 0.002, franka.PERIOD_S  # [s]
+TICK, PERIOD = 0.002, franka.FRANKA_PERIOD_S  # [s]
 Vector = npt.NDArray[np.float64]
 
 

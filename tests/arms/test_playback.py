@@ -315,7 +315,7 @@ def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_
     period = f"{1000 / rate_hz:.0f} ms"
     assert playback.reason == playback.too_slow
     assert playback.too_slow == (
-        f"{rate_hz} Hz is too slow: commands would come every {period}, and an arm brakes 20 ms after its last "
+        f"{rate_hz} Hz is too slow: commands would arrive every {period}, and an arm brakes 20 ms after its last "
         "command; 67 Hz or more needed"
     )
 

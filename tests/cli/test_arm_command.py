@@ -55,7 +55,7 @@ def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     folder, _ = made
     before = {file: file.read_bytes() for file in folder.iterdir()}
     done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
-    assert (done.returncode, "cell.toml is there already: name another one by --output" in done.stderr) == (1, True)
+    assert (done.returncode, "cell.toml exists already: name another file by --output" in done.stderr) == (1, True)
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
 
 

@@ -100,15 +100,15 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
     ("code", "words", "arguments"),
     [
         (1, "nowhere does not exist: a folder of takes needed", ("record", "--list", "--folder", "nowhere")),
-        (1, "is a daemon running", ("status", *NOBODY)),
+        (1, "is a daemon or a router running", ("status", *NOBODY)),
         (1, "", ("doctor", *NOBODY)),
         (1, "", ("cells", *NOBODY)),
-        (1, "is a daemon running", ("hold", *NOBODY)),
+        (1, "is a daemon or a router running", ("hold", *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
         (1, "at least 2 needed", ("learn", str(RECORDINGS / "demonstration-1.mcap"), "--output", "nowhere.npz")),
-        (1, "no such user's folder", ("status", "--certificate", "~nobody-of-this-name/x")),
+        (1, "no user of this name", ("status", "--certificate", "~nobody-of-this-name/x")),
         (2, "--cell: '", ("status", "--cell", "*")),
         (2, "command line: cell: '*' given", ("serve", "--cell", "*")),
         (2, "--cell: '", ("hold", "--cell", "")),
@@ -128,7 +128,7 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "--web shows a running daemon, not files", ("view", "a.rrd", "--web")),
         (2, "--tab chooses the tab of a picture", ("view", "live", "--web", "--tab", "timing")),
         *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
-        (1, "50 Hz is too slow: commands would come every 20 ms", ("demo", "--rate", "50")),
+        (1, "50 Hz is too slow: commands would arrive every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
         (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
     ],
@@ -172,7 +172,7 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
 def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
     done = thirdhand("status", *NOBODY)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("thirdhand status: nobody listens at tcp/127.0.0.1:1: is a daemon")
+    assert done.stderr.startswith("thirdhand status: nothing listens at tcp/127.0.0.1:1: is a daemon")
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = thirdhand("status", "--connect", f"tcp/127.0.0.1:{silent.getsockname()[1]}")
     assert done.returncode == 1
@@ -200,7 +200,7 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
                 assert time.monotonic() < end
             process.send_signal(number)
             assert process.wait(30) == code
-            ended = "ended: the bench of cell thirdhand, after 0 whole runs; no report was kept (--output)"
+            ended = "ended: the bench of cell thirdhand, after 0 complete runs; without --output no report was written"
             assert process.stderr.read().splitlines()[-1] == ended
 
 

@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import EVENTS, text
+from service.cli.demo import EVENT_TITLES, text
 from service.settings.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
@@ -102,7 +102,7 @@ def test_each_cause_of_a_failed_demo_is_printed_once() -> None:
     whys = (None, held, held)
     events = {
         name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0} | ({"why": why} if why else {})
-        for name, why in zip(EVENTS, whys, strict=True)
+        for name, why in zip(EVENT_TITLES, whys, strict=True)
     }
     few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
     figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}

@@ -206,7 +206,7 @@ def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: py
         status = capsys.readouterr().err
         token.undeclare()  # type: ignore[no-untyped-call]
     for said in (doctor, status):
-        assert "its daemon is there, but begins or ends" in said
+        assert "its daemon is alive, but it is starting or ending" in said
         assert "start `thirdhand serve`" not in said
 
 

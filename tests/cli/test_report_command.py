@@ -54,7 +54,7 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
     assert [one for one in fetched if not one.startswith("#")] == []
     assert "far_from_demonstrations" in text
-    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.MODES.values()):  # as in the viewer
+    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.BY_MODE.values()):  # as in the viewer
         assert palette.written(colour) in text
 
     assert {path.name for path in folder.iterdir()} == {"golden", "golden-2", "comparison.csv"}
@@ -97,8 +97,8 @@ def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
         (["nowhere.mcap"], 1, "no recording nowhere.mcap"),
         ([str(RECORDINGS / "demonstration-1.mcap")], 1, "not a recording of thirdhand"),
         ([str(GOLDEN), "--html", "no/such/folder.html"], 2, "there is no folder no/such"),
-        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file, a folder needed"),
-        ([str(GOLDEN)], 1, f"keeps checksums of its frames: thirdhand replay {GOLDEN} --output whole.mcap"),
+        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file; a folder needed"),
+        ([str(GOLDEN)], 1, f"has checksums instead of frames: thirdhand replay {GOLDEN} --output whole.mcap"),
     ],
 )
 def test_what_cannot_be_read_or_written_is_said_first(

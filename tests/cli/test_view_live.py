@@ -322,5 +322,5 @@ def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_s
     with Image.open(tmp_path / "phone.png") as image:
         assert image.size == (780, 1688)
         pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
-    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, palette.ARM):
+    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, palette.ARM_BODY):
         assert (np.abs(pixels - colour).max(axis=1) < 12).sum() > 100

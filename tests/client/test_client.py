@@ -112,7 +112,8 @@ def test_a_certificate_that_is_none_is_told(tmp_path: Path) -> None:
 
 def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
     with pytest.raises(
-        UnreachableError, match=r"nobody answers at tcp/127.0.0.1:1: is a daemon running and listening there"
+        UnreachableError,
+        match=r"nobody answers at tcp/127.0.0.1:1: is a daemon, `thirdhand record --listen` or a router listening",
     ):
         open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 

@@ -80,7 +80,7 @@ def test_names_limits_and_reach_come_from_its_description(cell: Settings) -> Non
     [
         ({"plate": ""}, "[arm] plate: missing; the link that carries the tool needed, the last ones are"),
         ({"plate": 'plate = "gripper"'}, "no link 'gripper'"),
-        ({"posture": ""}, "[arm] posture: missing; a URDF does not say it, 6 numbers needed"),
+        ({"posture": ""}, "[arm] posture: missing; the URDF does not define it, 6 numbers needed"),
         ({"jerk": ""}, "[joints] jerk: missing"),
         ({"posture": "posture = [0, 0, 0]"}, "[arm] posture: 3 numbers, 6 needed, one for each of [joints] names"),
         (

@@ -30,7 +30,7 @@ from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS
 from service.core.skill.skill import Skill
 from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
-from service.settings.config import Box, Obstacles, Settings, Table, robot_description
+from service.settings.config import Box, Obstacles, Settings, TableTop, robot_description
 from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
@@ -232,7 +232,7 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
     body = body_of(cell, urdf)
     box = Box(centre=(0.52, -0.2, 0.36), half_size=(0.08, 0.04, 0.3))
     cells = [
-        msgspec.structs.replace(cell, table=Table(centre=(0.8, 0.0, 0.27))),
+        msgspec.structs.replace(cell, table=TableTop(centre=(0.8, 0.0, 0.27))),
         msgspec.structs.replace(cell, obstacles=Obstacles(boxes=(box,))),
     ]
     for settings in cells:

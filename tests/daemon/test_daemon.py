@@ -236,7 +236,10 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
     again = told("via-points", "add", "my place", *place, *at)
-    assert (again.returncode, again.stdout.endswith("replaced, as there was one of this name: my place\n")) == (0, True)
+    assert (again.returncode, again.stdout.endswith("replaced, because a via-point had the same name: my place\n")) == (
+        0,
+        True,
+    )
     assert "1 via-point in force" in told("via-points", "list", *at).stdout
     refused = told("via-points", "remove", "other", *at)
     assert refused.returncode == 1
@@ -252,7 +255,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
     shared_daemon.until(lambda s: not any(age < 300 for age in s["hand_age_ms"].values()))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+        patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
     said = capsys.readouterr().err
     assert re.search(r"nothing taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
@@ -261,7 +264,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
         assert main(add) == 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.TIMEOUT_S", 0.0)
+            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
             assert main(add) == 1
     assert "nothing taught: hands or tool did not hold still" in capsys.readouterr().err
     (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
@@ -284,7 +287,7 @@ def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
         add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
         daemon.until(lambda s: s["tick"] > 0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.TIMEOUT_S", 2.0)
+            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 2.0)
             assert main([*add, "--here"]) == 1
         said = capsys.readouterr().err
         assert "waiting until right, tool are seen" in said
@@ -322,7 +325,7 @@ def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> Non
     assert set(status.hand_age_ms) == {"left", "right"}
     assert status.rejected.get("not_finite", 0) == 0
     assert "of the left hand" in played.stderr
-    assert "came to the daemon's loop" in played.stderr
+    assert "the daemon's loop received" in played.stderr
 
 
 def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:

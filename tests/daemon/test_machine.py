@@ -108,5 +108,5 @@ def test_a_bench_that_skips_periods_is_told_by_the_demo() -> None:
     calm = {"periods": 5000, "skipped": 20, "longest_pause_ms": 12.0}
     assert too_busy(calm) == ""
     assert too_busy(calm | {"skipped": 400, "longest_pause_ms": 90.0}) == (
-        "the bench missed 400 of its 5000 periods, the bench stood still for 90 ms"
+        "the bench missed 400 of its 5000 periods, the bench paused for 90 ms"
     )

@@ -24,7 +24,7 @@ from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.launch import launched
-from service.daemon.single_instance import BOUNDS
+from service.daemon.single_instance import NETWORK_BOUNDS
 from support.cell import LEFT, Tracker, thirdhand, told
 
 CELL = "bench"
@@ -62,7 +62,7 @@ class Guarded:
         self.session = open_session(
             listen=["tls/127.0.0.1:0"],
             certificate=secrets / "daemon",
-            more=BOUNDS | access_control(CELL, revoked, DOMAIN),
+            more=NETWORK_BOUNDS | access_control(CELL, revoked, DOMAIN),
         )
         (self.endpoint,) = endpoints(self.session)
         self.taken: set[str] = set()
@@ -227,8 +227,8 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     ("arguments", "code", "words"),
     [
         (("--role", "tracker", "--name", "left-camera"), 2, "tracker with a number needed, tracker-2 to tracker-99"),
-        (("--name", "tracker-2"), 2, "the --role that it is to have needed too"),
-        (("--role", "tracker", "--name", "tracker"), 1, "a name that was not given before needed"),
+        (("--name", "tracker-2"), 2, "--role needed with it"),
+        (("--role", "tracker", "--name", "tracker"), 1, "a new name needed"),
         (("--role", "nobody"), 2, "invalid choice"),
         (("--role", "tracker", "--host", "not plain \u00fc"), 2, "a name in plain letters, or an address, needed"),
         (("--role", "daemon", "--days", "0"), 2, "accepted"),
@@ -279,7 +279,7 @@ def test_a_certificate_out_of_its_time_is_told_in_words(
     today = datetime.datetime.now(datetime.UTC)
     for days, name, words in (
         (-30, "tracker-5", r"certificate\.pem expired on 20.* UTC: a new certificate needed"),
-        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, and the clock here says"),
+        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, but the clock here shows"),
     ):
         made = today + datetime.timedelta(days=days)
         monkeypatch.setattr("service.cli.certificates.now", lambda made=made: made)
@@ -314,7 +314,7 @@ def test_what_the_command_makes_is_private_and_not_written_over(secrets: Path) -
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
     again = told("certificates", str(secrets))
     assert again.returncode == 1
-    assert "not written over" in again.stderr
+    assert "not overwritten" in again.stderr
 
 
 def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path) -> None:

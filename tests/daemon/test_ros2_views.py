@@ -26,7 +26,7 @@ from service.contract.roles import access_control
 from service.core.frame import blank, frame_layout
 from service.core.transforms import Frames
 from service.daemon.ros2_domain import Ros2Domain
-from service.daemon.single_instance import BOUNDS
+from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.shipped import cell_of
 from service.settings.config import Settings, parse, robot_description
 from support.cell import Tracker, serving, told
@@ -199,7 +199,7 @@ def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: 
     assert told("certificates", str(tmp_path / "secrets")).returncode == 0
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
     topics = list(ros2.of_settings(settings.ros2))
-    guarded = {**BOUNDS, **access_control(settings.cell, (), DOMAIN, topics)}
+    guarded = {**NETWORK_BOUNDS, **access_control(settings.cell, (), DOMAIN, topics)}
     listen, secrets = ["tls/127.0.0.1:0"], tmp_path / "secrets"
     with open_session(listen=listen, certificate=secrets / "daemon", more=guarded) as session:
         failures: list[str] = []

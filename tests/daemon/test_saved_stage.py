@@ -12,8 +12,8 @@ import pytest
 
 from service.client import RefusedError
 from service.core.skill.skill import Skill
-from service.daemon.saved_stage import LONGEST_S, SavedStage
-from service.daemon.saved_state import LARGEST_BYTES, NOT_OURS
+from service.daemon.saved_stage import MAX_RESTART_S, SavedStage
+from service.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.single_instance import state_folder
 from service.files.shipped import shipped_skill
@@ -40,7 +40,7 @@ def test_it_is_kept_for_its_skill_and_for_a_while(settings: Settings, skill: Ski
     assert saved.read(replace(skill, learned_from="others")) == ""
     file = tmp_path / "lab/bench2/stage.json"
     assert [one.name for one in file.parent.iterdir()] == [file.name]
-    old = file.stat().st_mtime - LONGEST_S - 1.0
+    old = file.stat().st_mtime - MAX_RESTART_S - 1.0
     os.utime(file, (old, old))
     assert saved.read(skill) == ""
     for spoilt in ("{", "[]", json.dumps({"learned_from": skill.learned_from, "via_point": 3})):
@@ -67,7 +67,7 @@ def damage(path: Path, how: str) -> None:
 REASONS = {
     "a folder": ("Is a directory; a file needed, and that is a folder",),
     "a pipe": ("it is not a file",),
-    "a huge file": (f"it has {1 << 40} bytes, at most {LARGEST_BYTES} accepted",),
+    "a huge file": (f"it has {1 << 40} bytes, at most {MAX_STATE_BYTES} accepted",),
     "a link to itself": ("Too many levels of symbolic links",),
 }
 

@@ -130,7 +130,7 @@ def test_a_file_that_somebody_edited_is_set_aside(
 ) -> None:
     saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
     whole = saved.path(skill).read_text()
-    for text, why in ((whole.replace("0.03", "0.04"), "changed since"), (whole.replace("checksum", "sum"), "checksum")):
+    for text, why in ((whole.replace("0.03", "0.04"), "was edited"), (whole.replace("checksum", "sum"), "checksum")):
         saved.path(skill).write_text(text)
         assert saved.read(skill) is None
         assert why in caplog.text
@@ -202,11 +202,14 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
     for min_x in (0.0, *(np.sort(tools[:, 0])[[0, 1, 2]] + 0.01)):
         reach = msgspec.structs.replace(settings.reach, min_x=float(min_x))
         changed = msgspec.structs.replace(settings, files=Files(state=str(tmp_path)), reach=reach)
-        read = SavedViaPoints(changed).read(skill)
+        changed_saved = SavedViaPoints(changed)
+        read = changed_saved.read(skill)
         assert read is not None
         out = {point.name: min_x - point.tool[0] for point in POINTS if point.tool[0] < min_x}
         assert read == (tuple(point for point in POINTS if point.name not in out), 0.03)
         assert ("out of the arm's reach" in caplog.text) is bool(out)
+        assert bool(changed_saved.remark) is bool(out)
+        assert all(repr(name) in changed_saved.remark for name in out)
         for name, distance_m in out.items():
             assert f"{name!r} by {distance_m:.3f} m" in caplog.text
         if out:

@@ -82,7 +82,7 @@ def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_pa
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder. There are: soldering"),
+        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder; its skills: soldering"),
         ({"name": "../soldering"}, "$.name: "),
         ({"name": "/etc/passwd"}, "$.name: "),
         ({"name": ".."}, "$.name: "),

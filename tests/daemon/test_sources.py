@@ -18,7 +18,7 @@ from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
 from service.core.frame import Event, Frame, Tick, blank, frame_layout
 from service.core.skill.skill import Skill
-from service.daemon.input_monitor import KEYS, InputMonitor, evidence
+from service.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, evidence
 from service.daemon.status import CellStatus
 from service.settings.config import HandSettings, Settings
 from support.in_process import LEFT, RIGHT
@@ -52,8 +52,8 @@ class Cell:
         """One tick, in whose inbox messages are by source."""
         index = next(self.ticks)
         for source, message in messages:
-            self.sources.arrivals[KEYS[source]].take(message, message.stamp_ns + late_ns)
-        inbox = tuple(Event(KEYS[source], b"", message) for source, message in messages)
+            self.sources.arrivals[KEY_OF_SOURCE[source]].take(message, message.stamp_ns + late_ns)
+        inbox = tuple(Event(KEY_OF_SOURCE[source], b"", message) for source, message in messages)
         self.frame = self.controller.step(Tick(index, inbox))
 
     def status(self, now_s: float, *, failure: str = "") -> Status:
@@ -105,7 +105,7 @@ def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: A
     refused = cell.controller.intake.refused[source, cause]
     assert refused[:2] == (cause, message)
     cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
-    assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEYS[source]])).why
+    assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEY_OF_SOURCE[source]])).why
 
 
 def test_a_joint_that_leapt_is_named_with_where_it_was(skill: Skill) -> None:
@@ -215,7 +215,7 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
         cell.status(100 + k / 10)
     assert [line.split(":")[0] for line in cell.log] == ["left hand"]
     assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: set [hands] f" in cell.log[0]
-    cell.sources.arrivals[KEYS["right"]].refuse("a header of another kind")
+    cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse("a header of another kind")
     cell.status(103.0)
     assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
     cell.status(109.0)

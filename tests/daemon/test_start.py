@@ -21,17 +21,17 @@ from service.client import Client, StartingError, UnreachableError, cells, endpo
 from service.contract.channels import CHANNELS
 from service.daemon import launch
 from service.daemon.launch import LaunchError, launched
-from service.daemon.start import LOG_EVERY_S, Start, starting
+from service.daemon.start import LOG_EVERY_S, Startup, starting
 from service.settings.config import Files, Settings
 from service.settings.network import Network
 from support.cell import serving
 from support.paths import ROOT
 
-COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading what is compiled), (\d+) of (\d+) functions are there")
+COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
 
 
 @pytest.fixture
-def started(tmp_path: Path) -> Iterator[tuple[Start, str]]:
+def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
     """A cell whose daemon has begun to start, and where it listens."""
     network, files = Network(listen=("tcp/127.0.0.1:0",)), Files(state=str(tmp_path))
     with starting(Settings(cell="lab/bench", network=network, files=files)) as start:
@@ -39,7 +39,7 @@ def started(tmp_path: Path) -> Iterator[tuple[Start, str]]:
 
 
 def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
-    started: tuple[Start, str], capsys: pytest.CaptureFixture[str]
+    started: tuple[Startup, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     start, endpoint = started
     with open_session(connect=[endpoint]) as session:
@@ -63,7 +63,7 @@ def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
         assert not isinstance(ended.value, StartingError)
 
 
-def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(started: tuple[Start, str]) -> None:
+def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(started: tuple[Startup, str]) -> None:
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:
         client = Client(session, "lab/bench")
@@ -124,7 +124,7 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
-    started: tuple[Start, str],
+    started: tuple[Startup, str],
     terminal: bool,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -134,8 +134,8 @@ def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
     started[0].over()
     capsys.readouterr()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr("service.daemon.start.TELL_EVERY_S", 0.01)
-    start = Start(started[0].lock, started[0].session, "other")
+    monkeypatch.setattr("service.daemon.start.REPORT_EVERY_S", 0.01)
+    start = Startup(started[0].lock, started[0].session, "other")
     caplog.clear()
     functions = [SimpleNamespace(signatures=[]) for _ in range(60)]
     start._functions = functions  # noqa: SLF001
@@ -149,7 +149,7 @@ def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
         assert logged == []
         assert "\n" not in shown
         assert shown.count("\r\x1b[K") > 30
-        assert shown.endswith("60 of 60 functions are there\r\x1b[K")
+        assert shown.endswith("60 of 60 functions are ready\r\x1b[K")
     else:
         assert shown == ""
         assert [COUNTED.search(line)[2] for line in logged[-4:]] == ["15", "30", "45", "60"]  # type: ignore[index]
@@ -160,7 +160,7 @@ def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkey
     monkeypatch.setattr(launch, "STUCK_S", 8.0)
     before = "import time\nfrom service.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
     said: list[str] = []
-    stuck = r"no further for 8 s.*last: loading what is compiled, \d+ of \d+ functions"
+    stuck = r"no progress for 8 s.*last report: loading compiled functions, \d+ of \d+ functions"
     with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
         raise AssertionError("it was ready")
     assert said[0].startswith("  starting: importing")
@@ -189,7 +189,7 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
         [sys.executable, "-c", f"{code}sys.exit(code)"], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 1
-    assert re.search(r"nobody listens at|nothing listens on", done.stdout + done.stderr)
+    assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
     assert "Traceback" not in done.stderr
 
 

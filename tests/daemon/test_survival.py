@@ -115,11 +115,11 @@ def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> 
     with serving(tmp_path, "--arm", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
         started = children(daemon.process.pid)
         daemon.until(lambda status: status["tick"] > 0)
-        assert "a second daemon of this cell is only noticed by Zenoh" in daemon.log.read_text()
+        assert "a second daemon of this cell is only detected through Zenoh" in daemon.log.read_text()
         (tmp_path / "step").write_text("always")
         assert daemon.process.wait(20) == 1
         assert "step is sabotaged" in daemon.log.read_text()
-        assert "the arm is commanded no more" in daemon.log.read_text()
+        assert "the arm gets no more commands" in daemon.log.read_text()
         assert gone(started, 10)
 
 
@@ -178,7 +178,7 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
         asking.join(20)
         said = daemon.log.read_text()
         assert "Traceback" not in said
-        assert "has not come to rest" not in said  # the time-out of the stop
+        assert "did not come to rest" not in said  # the time-out of the stop
     (recording,) = records.glob("*.mcap")
     last = said.splitlines()[-1]
     assert last.endswith(f" ended: the daemon of cell thirdhand; its newest recording is {recording}")

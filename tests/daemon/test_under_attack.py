@@ -21,8 +21,8 @@ import pytest
 
 from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
-from service.daemon.daemon import MOST_NOTES
-from service.daemon.single_instance import MOST_SESSIONS
+from service.daemon.daemon import MAX_NOTES_PER_S
+from service.daemon.single_instance import MAX_SESSIONS
 from service.daemon.start import NETWORK_NICE
 from support.cell import Daemon, serving
 from support.paths import ROOT
@@ -210,7 +210,7 @@ def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kin
         assert holds_s(daemon)[-1] < SOON_S
     daemon.client.ask("hold")
     noted = len(daemon.log.read_text().splitlines()) - before
-    assert noted < (MOST_NOTES + 5) * (time.monotonic() - begin + 2)
+    assert noted < (MAX_NOTES_PER_S + 5) * (time.monotonic() - begin + 2)
 
 
 def test_hold_does_not_wait_for_a_client_that_asks_on_and_reads_no_answer(daemon: Daemon) -> None:
@@ -300,9 +300,9 @@ def test_idle_connections_shut_nobody_out_for_long(daemon: Daemon) -> None:
 
 def test_sessions_are_bounded_and_who_is_in_is_served(daemon: Daemon) -> None:
     with attack(IDLE_SESSIONS, daemon) as said:
-        assert 0 < int(said) < MOST_SESSIONS
+        assert 0 < int(said) < MAX_SESSIONS
         assert holds_s(daemon)[-1] < SOON_S
-        with pytest.raises(UnreachableError, match="not overrun"):
+        with pytest.raises(UnreachableError, match="not overloaded"):
             open_session(connect=[daemon.endpoint], timeout_s=0.5)
     assert is_welcome(daemon)
 

@@ -109,7 +109,7 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
         (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
         (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
-        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's box, ("),
+        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, ("),
         (
             add(point(tool=[0.2, 0.0, 0.3])),
             "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach by 0.145 m: 0.35 to 0.88 m from the",
@@ -121,11 +121,11 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         ({"op": "add"}, "$: field `points` is missing"),
         (
             {"op": "remove", "names": ["nothing"]},
-            "$.names[0]: no via-point 'nothing'. There are: handover, glass, soldering",
+            "$.names[0]: no via-point 'nothing'; in force: handover, glass, soldering",
         ),
         (
             {"op": "remove", "names": ["glass", "nothing"]},
-            "$.names[1]: no via-point 'nothing'. There are: handover, glass, soldering",
+            "$.names[1]: no via-point 'nothing'; in force: handover, glass, soldering",
         ),
         ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
         ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),

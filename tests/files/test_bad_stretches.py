@@ -14,7 +14,7 @@ from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING
 from service.contract.messages import JointState, PoseStamped
 from service.files.demonstration_files import summary
-from service.files.demonstration_reader import ENOUGH, read_demonstration, write_demonstration
+from service.files.demonstration_reader import MIN_USABLE_SHARE, read_demonstration, write_demonstration
 from service.files.mcap_file import McapFile, RecordingError
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
@@ -88,7 +88,7 @@ def test_a_jump_is_named_with_its_times_by_learn_and_record_alike(clean: list[De
     path, said = write_streams(tmp_path / "a.mcap", streams), list[str]()
     got = read_demonstration(path, say=said.append)
     assert got.begins == (300,)
-    words = "left out, 1.5 of 10.6 s: hands/left 2.99 to 4.50 s: no motion that a hand could make"
+    words = "left out, 1.5 of 10.6 s: hands/left 2.99 to 4.50 s: a motion that no hand can make"
     assert said[-1].endswith(words)
     assert words in summary(path).remarks
 
@@ -100,10 +100,10 @@ def test_a_take_without_enough_of_the_rest_is_refused(
     take, streams = clean[1], streams_of(clean[1])
     is_unseen = (take.seconds > kept_s) & (take.seconds < take.seconds[-1])
     spoiled.gap(streams, "right", is_unseen, np.random.default_rng(0))
-    if kept_s / take.seconds[-1] > ENOUGH:
+    if kept_s / take.seconds[-1] > MIN_USABLE_SHARE:
         assert read_back(tmp_path / "a.mcap", streams).seconds[-1] == pytest.approx(kept_s)
         return
-    with pytest.raises(RecordingError, match=r"3\.0 of 10\.6 s can be learned from, 50% needed: hands/right 3\.00 to"):
+    with pytest.raises(RecordingError, match=r"3\.0 of 10\.6 s are usable, 50% needed: hands/right 3\.00 to"):
         read_back(tmp_path / "a.mcap", streams)
 
 
@@ -129,7 +129,7 @@ def test_where_a_clock_begins_anew_the_times_of_recording_count(
     for name in which:
         streams[name].stamps_ns[500:] += round(1e9 * by_s)
     got = read_back(tmp_path / "a.mcap", streams, said)
-    assert f"the clock of {', '.join(spoiled.KEYS[name] for name in which)} begins anew meanwhile" in said[0]
+    assert f"the clock of {', '.join(spoiled.KEYS[name] for name in which)} restarts or was set" in said[0]
     np.testing.assert_array_equal(got.hands, take.hands)
     np.testing.assert_array_equal(got.tool, take.tool)
 
@@ -142,7 +142,7 @@ def test_where_the_times_of_recording_begin_anew_too_the_longest_part_counts(
     write_demonstration(path, take._replace(stamps_ns=take.stamps_ns - anew_ns))
     got = read_demonstration(path, say=said.append)
     np.testing.assert_array_equal(got.tool, take.tool[400:])
-    assert "begins anew, and the times of recording with it: part 2 of 2 is used, of 6.6 s; 1200 poses" in said[0]
+    assert "restarts, and the times of recording do too: part 2 of 2 is used, which lasts 6.6 s; 1200 poses" in said[0]
 
 
 def test_a_single_stamp_that_is_wrong_and_a_hold_up_are_no_clock_that_begins_anew(
@@ -197,5 +197,5 @@ def test_what_a_skill_does_not_use_never_refuses_a_take(clean: list[Demonstratio
     got = read_demonstration(path, say=said.append)
     np.testing.assert_array_equal(got.hands, take.hands)
     assert (got.gripper, got.places) == (None, ())
-    assert any("states of the gripper tell nothing" in line for line in said)
+    assert any("states of the gripper have no position" in line for line in said)
     assert any("places are not understood, and not used" in line for line in said)

@@ -173,7 +173,7 @@ def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path:
     recording = Recording.open(path)
     steps = [step for step in recording.steps() if step.frame is not None]
     assert shown == len(steps) > 0
-    assert said[-1] == f"{shown} ticks are there and shown"
+    assert said[-1] == f"the other {shown} ticks are shown"
     gaps = [step for step in steps if step.lost or step.damage]
     assert len(said) == len(gaps) + 1 + (kind == "cut")
     expected = {

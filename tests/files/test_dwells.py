@@ -44,7 +44,7 @@ def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
     least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
     (remark,) = found.remarks
     assert remark == (
-        f"place 'vise' was never reached: the tool came no nearer to it than {1000 * least:.0f} mm (100 needed)"
+        f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} mm, 100 mm needed"
     )
     assert remark in table(found)
 
@@ -63,7 +63,7 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
     assert remarks_on_places(taken) == []
     (remark,) = remarks_on_places(rested)
     assert remark.startswith("hands and tool rest from ")
-    assert remark.endswith("is this a place that is not named?")
+    assert remark.endswith("is a via-point missing here?")
     (first, _) = remarks_on_places(rested._replace(places=rested.places[1:]))
     assert first.startswith("hands and tool rest from 0.0 to ")  # as its start has no name
     assert remarks_on_places(rested._replace(places=())) == []  # who names none is not asked for one

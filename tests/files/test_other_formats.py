@@ -168,7 +168,10 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
 
 
 def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demonstration, tmp_path: Path) -> None:
-    for labels, words in ((list(NAMES.values()), "cut: .* of .* frames are there"), (["RightHand"] * 3, "RightHand 2")):
+    for labels, words in (
+        (list(NAMES.values()), "was cut: it holds .* of .* frames"),
+        (["RightHand"] * 3, "RightHand 2"),
+    ):
         file: Any = ezc3d.c3d()
         file["parameters"]["POINT"]["RATE"]["value"] = [50.0]
         file["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
@@ -195,7 +198,11 @@ def lerobot(path: Path) -> None:
         ("c.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not a CSV file that can be read"),
         ("a.c3d", lambda path: path.write_bytes(b"nothing"), "is not a C3D file that can be read"),
         ("a.mcap.zst", lambda path: path.write_bytes(b"x"), "is not read: decompress it first, or give the folder"),
-        ("a.parquet", lambda path: path.write_bytes(b"x"), r"is not read: Arrays of any origin .*docs/arrays\.md"),
+        (
+            "a.parquet",
+            lambda path: path.write_bytes(b"x"),
+            r"has a format that is not read: A few lines of Python .*docs/arrays\.md",
+        ),
     ],
 )
 def test_what_is_not_read_is_refused_with_what_to_do(

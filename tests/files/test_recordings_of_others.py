@@ -106,7 +106,7 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
         (
             {"left": PoseTopic("/nowhere")},
-            r"--left /nowhere: no topic there; its topics: .*of these hold poses: /mocap",
+            r"--left /nowhere: no topic there; its topics: .*topics with poses: /mocap",
         ),
         ({}, r"no topic ending in hands/left .*; --left TOPIC\[:PART\] names another"),
     ):
@@ -137,7 +137,7 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
     with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
         read_demonstration(path)
     other = msgspec.structs.replace(hands, frame="optitrack")
-    with pytest.raises(RecordingError, match=r"'mocap': 'base', or 'optitrack' as \[hands\] frame says, needed"):
+    with pytest.raises(RecordingError, match=r"'mocap': 'base', or 'optitrack' of \[hands\] frame, needed"):
         read_demonstration(path, settings=Settings(hands=other))
     with pytest.raises(RecordingError, match=r"tool.*; /arm/tcp, /hand/gripper could be it"):
         read_demonstration(bag(tmp_path / "two", {"/tf": frames, "/arm/tcp": tool, "/hand/gripper": tool}))
@@ -165,8 +165,8 @@ def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count
     }
     said: list[str] = []
     got = read_demonstration(bag(tmp_path / "bag", topics), say=said.append)
-    assert "tool found from /joint_states by the arm's URDF" in said[0]
-    assert "stamps are of different clocks" in said[1]
+    assert "tool is computed from /joint_states by the arm's URDF" in said[0]
+    assert "stamps come from different clocks" in said[1]
     assert "tool/pose by -1.001 s" in said[1]
     np.testing.assert_array_equal(got.stamps_ns, STAMPS + 1_000_000)
     np.testing.assert_allclose(got.left[:, 2], WAY)
@@ -189,7 +189,7 @@ def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None
     said: list[str] = []
     got = read_demonstration(RECORDINGS / "golden.mcap", say=said.append)
     assert re.search(
-        r"tool found from .*joints/state by the arm's URDF; \d+ of \d+ poses are none, or farther", said[0]
+        r"tool is computed from .*joints/state by the arm's URDF; \d+ of \d+ poses are invalid or farther", said[0]
     )
     assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in said)
     assert got.seconds[got.begins[0]] - got.seconds[got.begins[0] - 1] == pytest.approx(0.51)

@@ -152,7 +152,7 @@ def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
 @pytest.mark.parametrize(
     ("options", "code", "says"),
     [
-        (["--lerobot", "."], 2, "--lerobot . is there already, a new folder needed"),
+        (["--lerobot", "."], 2, "--lerobot . exists already; a new folder needed"),
         (["--lerobot", "{}", "--fps", "0"], 2, "--fps"),
     ],
 )

@@ -31,7 +31,7 @@ from service.report.report import Report, Span, differing_settings, reported, wh
 from service.report.stages import LEAST_S
 from service.report.tables import tables, verdict
 from service.settings.config import Settings
-from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SECONDS, TEACH_S
+from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.wam import URDF
 from support.wicked import wicked_skill
@@ -156,7 +156,7 @@ def test_the_initial_approach_of_the_tool_is_no_error_of_following(
 def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:
     ends = [span.start_s + span.lasts_s for span in session.spans]
     assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
-    assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SECONDS, abs=0.05)
+    assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SESSION_S, abs=0.05)
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     for reason, (begin_s, end_s) in {
         Reason.STALE_HAND: (DROPOUT_S[0] + 0.25, DROPOUT_S[1]),  # so long the tool could do without that hand

@@ -193,7 +193,7 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
 
         until(replaced)
         status = one.status()
-        assert "the scribe made no progress for 1 s and is replaced" in status["errors"]
+        assert "the scribe made no progress for 1 s, so it is replaced" in status["errors"]
         assert status["restarts"] == 1
         with pytest.raises(ProcessLookupError):
             os.kill(stopped, 0)

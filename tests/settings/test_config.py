@@ -113,7 +113,7 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[hand]\nunit = 'mm'", "unknown field 'hand'", "did you mean hands?"),
         ("[obstacles]\nclearence = 1", "unknown field 'clearence'", "did you mean clearance?"),
         ("[files]\nrecord = 3", "[files] record", "a text needed"),
-        ("[files]\nstate = '~nobody-of-this-name/x'", "[files] state", "no such user's folder"),
+        ("[files]\nstate = '~nobody-of-this-name/x'", "[files] state", "no user of this name"),
         ('[network]\ncertificate = "a\\u0000b"', "[network] certificate", "no zero bytes"),
         (
             "[network]\nlisten = ['tcp/0.0.0.0:7447']",
@@ -138,7 +138,7 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[network] connect, entry 1",
             "tls/... needed",
         ),
-        ("[network]\nrevoked = ['tracker']", "[network] revoked", "nobody is told apart"),
+        ("[network]\nrevoked = ['tracker']", "[network] revoked", "no client has a certificate"),
         (
             "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', 'tracer']",
             "[network] revoked, entry 2",
@@ -307,7 +307,9 @@ def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_pat
     assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
-    with pytest.raises(SettingsError, match=r"\[joints\] velocity: missing; a URDF does not say it, 6 numbers needed"):
+    with pytest.raises(
+        SettingsError, match=r"\[joints\] velocity: missing; the URDF does not define it, 6 numbers needed"
+    ):
         load(tmp_path / "cell.toml")
 
 

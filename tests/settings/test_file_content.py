@@ -121,4 +121,4 @@ def test_a_folder_of_recordings_that_is_none_is_refused(tmp_path: Path, kind: st
         path.write_bytes(b"")
     done = told("serve", "--arm", "assumed", "--record", str(path))
     assert done.returncode == 1
-    assert done.stderr.endswith(f"nothing can be recorded in {path}: it is not a folder\n")
+    assert done.stderr.endswith(f"cannot record in {path}: it is not a folder\n")

@@ -7,11 +7,11 @@ import pytest
 from service.contract.records import Mode
 from service.report.page import MODE_COLOURS, TINT
 from service.settings import palette
-from service.settings.palette import BACKGROUND, LEAST_CONTRAST, MODES, PAPER, contrast, written
+from service.settings.palette import BACKGROUND, BY_MODE, LEAST_CONTRAST, PAPER, contrast, written
 
 LINES = {name: getattr(palette, name) for name in ("LEFT", "RIGHT", "TOOL", "TARGET", "MEASURED", "NEAREST", "PLACE")}
-LINES |= {name: getattr(palette, name) for name in ("OFF", "GATE", "LATENCY", "WORK", "LATENESS", "ARM")}
-LINES |= {f"joint {number}": colour for number, colour in enumerate(palette.JOINTS)}
+LINES |= {name: getattr(palette, name) for name in ("OFF", "GATE", "LATENCY", "WORK", "LATENESS", "ARM_BODY")}
+LINES |= {f"joint {number}": colour for number, colour in enumerate(palette.BY_JOINT)}
 
 
 def channels(colour: str) -> palette.Colour:
@@ -32,7 +32,7 @@ def test_lines_stand_out_from_the_dark_and_on_paper(name: str) -> None:
 
 
 def test_words_on_a_mode_are_read_in_the_banner_and_on_a_page() -> None:
-    for mode, colour in MODES.items():
+    for mode, colour in BY_MODE.items():
         assert contrast((0, 0, 0), colour) >= LEAST_CONTRAST
         assert contrast((255, 255, 255), channels(MODE_COLOURS[mode])) >= LEAST_CONTRAST
         if mode is not Mode.FOLLOW:  # only then a plot is tinted

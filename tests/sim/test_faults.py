@@ -18,7 +18,7 @@ pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: 
 
 from sim.experiments.__main__ import main
 from sim.experiments.load.faults import SHORT
-from sim.parts import Part
+from sim.parts import CellPart
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.timed]
 BRAKE_MM = 40.0  # of a tool at up to 0.8 m/s that brakes 20 ms after the last command
@@ -89,7 +89,7 @@ def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(suff
 def test_a_frozen_relay_is_silent_and_a_killed_one_tears(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as far_end:
         target = f"tcp/127.0.0.1:{far_end.getsockname()[1]}"
-        with closing(Part("relay", target, "0")) as relay:
+        with closing(CellPart("relay", target, "0")) as relay:
             port = int(relay.endpoint.rsplit(":", 1)[1])
             with socket.create_connection(("127.0.0.1", port), timeout=10) as near:
                 far, _ = far_end.accept()

@@ -12,7 +12,7 @@ from service.files.shipped import shipped_skill
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.closed_loop import ClosedLoop
-from sim.film import FRAME_HZ, SIZE, SPEED, Film
+from sim.film import FRAME_HZ, PICTURE_PX, PLAYBACK_SPEED, Film
 from sim.scene import Scene
 from sim.script import HandScript
 from support.paths import ROOT
@@ -24,7 +24,7 @@ def test_the_picture_in_the_readme_is_small_lasts_some_seconds_and_moves() -> No
     assert "(docs/demo.webp)" in "\n".join((ROOT / "README.md").read_text(encoding="utf-8").splitlines()[:12])
     lasts_ms = 0
     with Image.open(path) as picture:
-        assert picture.size == SIZE
+        assert picture.size == PICTURE_PX
         frames = []
         for number in range(picture.n_frames):
             picture.seek(number)
@@ -47,5 +47,5 @@ def test_pictures_are_taken_as_the_script_goes() -> None:
             film.look(tick, frame)
             if bench.time_s > 0.5:
                 break
-    assert len(film.pictures) == int(0.5 * FRAME_HZ / SPEED) + 1
-    assert {picture.size for picture in film.pictures} == {SIZE}
+    assert len(film.pictures) == int(0.5 * FRAME_HZ / PLAYBACK_SPEED) + 1
+    assert {picture.size for picture in film.pictures} == {PICTURE_PX}

@@ -7,12 +7,12 @@ import pytest
 
 from service.learning.division import FOLLOW, off_via_point
 from service.settings.config import Reach
-from sim.made_tasks import AHEAD_S, CARRIED_M, KINDS, LATE_S, RATE_HZ, run, takes
+from sim.made_tasks import CARRIED_M, LEAD_S, REACTION_S, TAKE_HZ, TASK_KINDS, run, takes
 from sim.sessions import along
 
 
 def test_takes_are_the_same_from_the_same_numbers_and_differ_between_people_takes_and_seeds() -> None:
-    for kind in KINDS[:3]:
+    for kind in TASK_KINDS[:3]:
         one, other = (takes(kind, people=(0, 1), each=2) for _ in range(2))
         assert [take.person for take in one] == [0, 0, 1, 1]
         for a, b in zip(one, other, strict=True):
@@ -23,7 +23,7 @@ def test_takes_are_the_same_from_the_same_numbers_and_differ_between_people_take
         assert len({take.demonstration.left.tobytes() for take in one}) == 5
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TASK_KINDS)
 def test_hands_move_as_hands_do_and_the_tool_comes_to_the_places(kind: str) -> None:
     for who in range(3):
         one = run(kind, who, 0)
@@ -32,7 +32,7 @@ def test_hands_move_as_hands_do_and_the_tool_comes_to_the_places(kind: str) -> N
         assert np.linalg.norm(velocity, axis=2).max() <= 2.0
         assert np.linalg.norm(np.gradient(velocity, 0.005, axis=0), axis=2).max() <= 16.0
         shown = one.demonstration()
-        assert shown.period_s == pytest.approx(1.0 / RATE_HZ)
+        assert shown.period_s == pytest.approx(1.0 / TAKE_HZ)
         assert np.abs(np.linalg.norm(np.stack(shown[1:4])[..., 3:], axis=-1) - 1.0).max() < 1e-9
         for i in one.order:
             assert off_via_point(shown, shown.places[i], FOLLOW[shown.places[i].follow]).min() < 0.02
@@ -42,7 +42,7 @@ def test_hands_move_as_hands_do_and_the_tool_comes_to_the_places(kind: str) -> N
         assert shown.tool[:, 2].min() > reach.min_z
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TASK_KINDS)
 def test_takes_move_every_place(kind: str) -> None:
     places = np.array([[p.tool for p in take.demonstration.places] for take in takes(kind, people=range(8), each=1)])
     spread = places.std(axis=0)
@@ -58,7 +58,7 @@ def test_the_kinds_are_what_they_say() -> None:
     assert np.linalg.norm(cyclic.scene.tool[out] - cyclic.scene.tool[again]) > 0.08
     ahead = run("ahead", 0, 0)
     began = [next(leg.begin_s for leg in legs if leg.progress[0] < leg.progress[1]) for legs in ahead.legs]
-    assert began[1] - began[0] == pytest.approx(AHEAD_S, abs=0.5)
+    assert began[1] - began[0] == pytest.approx(LEAD_S, abs=0.5)
     orders = {run("loose", who, 0).order for who in range(24)}
     assert {len(order) for order in orders} == {5, 6, 8}
     lasts = [run("long", who, 0).lasts_s for who in range(3)]
@@ -73,7 +73,7 @@ def test_the_tool_is_fixed_to_what_a_hand_carries_and_comes_late() -> None:
     tool, _ = one.tool(times)
     fixed = [
         np.abs(np.linalg.norm(tool - along(one.legs[0], times - s)[0], axis=1) - np.linalg.norm(CARRIED_M)).max()
-        for s in np.linspace(*LATE_S, 61)
+        for s in np.linspace(*REACTION_S, 61)
     ]
     assert min(fixed) < 0.004
     assert fixed[0] > min(fixed)

@@ -163,7 +163,7 @@ def test_a_reduced_run_has_all_methods_and_says_what_is_refused(
     pytest.importorskip("matplotlib")
     from sim.experiments.partners import run
 
-    monkeypatch.setattr("sim.experiments.partners.KINDS", ("three", "cyclic"))
+    monkeypatch.setattr("sim.experiments.partners.TASK_KINDS", ("three", "cyclic"))
     results = Results(tmp_path, "partners", said=False)
     found = json.loads(results.numbers(run(results, Options(share=0.5))).read_text())
     assert (tmp_path / "partners.png").read_bytes()[:4] == b"\x89PNG"

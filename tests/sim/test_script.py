@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from sim.scene import Scene
-from sim.script import HandScript, Motion, Pause, Teacher
+from sim.script import HandScript, PointMotion, ScriptPause, Teacher
 from sim.teach import demonstrations
 
 SCENE = Scene()
 
 
-def motions(script: HandScript, t: float) -> tuple[Motion, Motion, Motion]:
+def motions(script: HandScript, t: float) -> tuple[PointMotion, PointMotion, PointMotion]:
     return (*script.truth(t), Teacher(SCENE, seed=3, clock=script.clock).truth(t))
 
 
-@pytest.mark.parametrize("options", [{}, {"speed": 1.7}, {"pauses": (Pause(1.2, 1.0), Pause(5.0, 0.6))}])
+@pytest.mark.parametrize("options", [{}, {"speed": 1.7}, {"pauses": (ScriptPause(1.2, 1.0), ScriptPause(5.0, 0.6))}])
 def test_velocity_and_acceleration_are_the_derivatives_of_position(options: dict[str, object]) -> None:
     script = HandScript(SCENE, seed=3, **options)  # type: ignore[arg-type]
     h = 1e-5
@@ -109,7 +109,7 @@ def test_the_taught_tool_points_forward_and_down_with_a_level_axis_across() -> N
 
 
 def test_a_pause_stops_the_hands_and_makes_the_script_longer() -> None:
-    script = HandScript(SCENE, seed=1, pauses=(Pause(1.0, 1.5),))
+    script = HandScript(SCENE, seed=1, pauses=(ScriptPause(1.0, 1.5),))
     assert not script.truth(1.8).left.velocity.any()
     assert script.duration_s == pytest.approx(SCENE.duration_s + 1.5 - 0.3)
     np.testing.assert_allclose(
@@ -118,7 +118,7 @@ def test_a_pause_stops_the_hands_and_makes_the_script_longer() -> None:
 
 
 def test_in_a_deep_pause_the_hands_go_back_the_way_they_came_and_come_again() -> None:
-    clock = HandScript(SCENE, seed=1, pauses=(Pause(4.0, 1.5, depth=2.0),)).clock
+    clock = HandScript(SCENE, seed=1, pauses=(ScriptPause(4.0, 1.5, depth=2.0),)).clock
     before, turned, after = clock.at(3.9), clock.at(4.8), clock.at(6.0)
     assert (before[1], turned[1], after[1]) == pytest.approx((1.0, -1.0, 1.0))
     assert after[0] == pytest.approx(6.0 - 2 * (1.5 - 0.3))
@@ -128,7 +128,8 @@ def test_in_a_deep_pause_the_hands_go_back_the_way_they_came_and_come_again() ->
 
 
 @pytest.mark.parametrize(
-    "options", [{"speed": 0.0}, {"pauses": (Pause(1.0, 0.1),)}, {"pauses": (Pause(1.0, 2.0), Pause(2.0, 1.0))}]
+    "options",
+    [{"speed": 0.0}, {"pauses": (ScriptPause(1.0, 0.1),)}, {"pauses": (ScriptPause(1.0, 2.0), ScriptPause(2.0, 1.0))}],
 )
 def test_a_clock_that_cannot_run_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"speed|pause"):

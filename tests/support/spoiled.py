@@ -13,7 +13,7 @@ from service.contract.channels import POSE, STRING
 from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint, encode_json
 from service.files.mcap_file import McapFile
-from service.files.pose_streams import PLACES
+from service.files.pose_streams import PLACES_TOPIC
 from service.learning.demonstration import Demonstration
 
 KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
@@ -54,7 +54,7 @@ def write_streams(
             file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
         if places:
             text = encode_json(places).decode()
-            file.put(f"{cell}/{PLACES}", STRING.type, cdr.encode_string(text), rows[0][0], 0)
+            file.put(f"{cell}/{PLACES_TOPIC}", STRING.type, cdr.encode_string(text), rows[0][0], 0)
     return path
 
 

@@ -28,9 +28,18 @@ from service.files.demonstration_files import demonstration_paths, summary, tabl
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.dwells import REST_M
 from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseTopic, Recorded
+from service.files.pose_streams import PoseRecording, PoseTopic
 from service.settings.config import HandSettings, Settings, ToolSettings, robot_description
-from service.trackers.capture import JOINT_STATES, KEPT_S, MOVED, REST_RAD, Capture, CaptureError, Sample, capture
+from service.trackers.capture import (
+    JOINT_STATES,
+    MOVED_RATIO,
+    REST_RAD,
+    RETAINED_REST_S,
+    Capture,
+    CaptureError,
+    Sample,
+    capture,
+)
 from sim.scene import Scene
 from sim.teach import perform
 from support.paths import ROOT
@@ -87,7 +96,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
-    assert Recorded(path).settings == SETTINGS
+    assert PoseRecording(path).settings == SETTINGS
     longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
     of_joints = {"tool": PoseTopic("bench/joints/state")}
     np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
@@ -97,12 +106,12 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
 
 def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
     with pytest.raises(
-        CaptureError, match=r"not heard: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
+        CaptureError, match=r"not received: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
     ):
         capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
     empty = Capture(sessions[0], "bench", SETTINGS)
     empty.close()
-    with pytest.raises(CaptureError, match=r"nothing of hands/left, .* came in this time"):
+    with pytest.raises(CaptureError, match=r"no messages on hands/left, .* arrived in time"):
         empty.write(tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
 
@@ -124,12 +133,12 @@ def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]],
             {"bench/hands/left": (980.0, -320.0, 60.0), "bench/hands/right": (0, 0, 1), "bench/tool/pose": (0, 0, 1)},
             20.0,
             r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at most 5 m from the "
-            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing is recorded",
+            r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing was recorded",
         ),
         (
             {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
             1.0,
-            r"not heard: hands/left, tool.*; heard instead: bench7/hands/left, thirdhand/hands/Left\. Are",
+            r"not received: hands/left, tool.*; received instead: bench7/hands/left, thirdhand/hands/Left\. Are",
         ),
     ],
 )
@@ -176,7 +185,8 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     assert [line.split(":")[0] for line in found.remarks if "of motion" in line] == ["hands", "tool"]
     told(("base", 1e3))
     words = (
-        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is in metres, whatever \[hands\] unit says"
+        r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is always in metres, "
+        r"and \[hands\] unit is ignored"
     )
     with pytest.raises(CaptureError, match=f"tool/pose is {words}"):
         taken.check()
@@ -198,7 +208,7 @@ def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begin
         pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
         taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
         if refused:
-            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing is recorded"
+            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing was recorded"
             with pytest.raises(CaptureError, match=words):
                 taken.check()
         else:
@@ -232,10 +242,10 @@ def test_what_rest_is_is_told_as_it_is() -> None:
     add_options(parser)
     options = " ".join(parser.format_help().split())
     assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
-    assert f"{KEPT_S:g} s are then retained" in options
+    assert f"{RETAINED_REST_S:g} s are then retained" in options
     tutorial = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
     assert f"within {1000 * REST_M:g} mm (joints within {REST_RAD:g} rad) for that time" in tutorial
-    assert MOVED == 5, "the tutorial says five times"
+    assert MOVED_RATIO == 5, "the tutorial says five times"
 
 
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
@@ -268,10 +278,12 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert np.linalg.norm(tool[0] - Scene().robot_start) < 0.05
     assert np.linalg.norm(tool[-1] - Scene().carry) < 0.05
 
-    with pytest.raises(Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left, and it stays as it was"):
+    with pytest.raises(
+        Exception, match=r"lasts \d\.\d s: from 20 to 30 s too little is left to learn from, so it was not trimmed"
+    ):
         trim(path, 20, 30)
     assert summary(path).lasts_s == found.lasts_s
-    assert trim(path, 0, 20).startswith("nothing is cut: ")
+    assert trim(path, 0, 20).startswith("nothing was cut: ")
     whole = path.read_bytes()
     assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
     assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
@@ -287,7 +299,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
         read_demonstration(path.parent)
     assert summary(path).demonstration.places == Scene().via_points()
     assert summary(path).demonstration.person == "Ada"
-    assert Recorded(path).settings == Settings()
+    assert PoseRecording(path).settings == Settings()
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
     assert main(["record", "--list", *folder]) == 1
@@ -304,17 +316,17 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        ([], 2, "a take's name needed, or --list"),
-        (["a", "--list"], 2, "a take's name needed, or --list"),
+        ([], 2, "either the name of a take or --list needed"),
+        (["a", "--list"], 2, "either the name of a take or --list needed"),
         (["--list", "--folder", "nofolder"], 1, "nofolder does not exist: a folder of takes needed (--folder)"),
         (["../a", "--show"], 2, "accepted as a take's name"),
         (["a", "--delete"], 1, "no take 'a' in "),
-        (["there"], 1, "is there already: another name needed, or --delete it first"),
-        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed: a.png, say"),
-        (["a", "--trim", "3", "1"], 2, "the first below the second, needed"),
+        (["there"], 1, "exists already: give another name, or --delete it first"),
+        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed, like a.png"),
+        (["a", "--trim", "3", "1"], 2, "needed, the first below the second"),
         (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
         (["a", "--rest", "nan"], 2, "--rest nan: 0.2 to 60 s accepted"),
-        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Where no daemon runs, --listen tcp/127.0.0.1:7447 takes its place"),
+        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
     ],
 )
 def test_what_cannot_be_meant_is_said(
@@ -362,7 +374,7 @@ def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     taken.write(tmp_path / "a.mcap")
     got = read_demonstration(tmp_path / "a.mcap")
     assert got.conducts == who
-    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(Recorded(tmp_path / "a.mcap").topics)
+    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(PoseRecording(tmp_path / "a.mcap").topics)
     np.testing.assert_array_equal(got.left, got.right)
     lines = table(summary(tmp_path / "a.mcap")).splitlines()
     assert any(f"the {who} hand conducts alone" in line for line in lines)

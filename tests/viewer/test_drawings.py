@@ -152,7 +152,7 @@ def test_of_several_files_the_last_is_pictured_and_that_is_said(
     files = [str(path) for path in sorted(tmp_path.glob("*.rrd"))]  # as a shell expands thirdhand-demo/*.rrd
     assert main(["view", *files, "--screenshot", str(tmp_path / "scene.png")]) == 0
     said = capsys.readouterr()
-    assert said.err == f"the picture is of {files[1]}, the last of 2 files\n"
+    assert said.err == f"the picture shows {files[1]}, the last of 2 files\n"
     with Image.open(tmp_path / "scene.png") as picture:
         assert picture.width > 1000
 

@@ -27,7 +27,7 @@ from service.core.skill.model import REGION_95
 from service.core.skill.pose import CLOSED
 from service.core.skill.skill import Skill
 from service.files.mcap_file import RecordingError
-from service.files.recording import OBJECTS
+from service.files.recording import OBJECTS_NOTE
 from service.learning.skill_file import with_file
 from service.settings.config import WAM, Settings, parse
 from service.viewer.banner import banner
@@ -82,7 +82,7 @@ def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
         if i % (rate_hz // 25) == 0:
             where, look = (0.5, 0.1, 1e-5 * i), ((0.0, 0.0, 0.0, 1.0), (0.08, 0.05, 0.002), (0.0, 0.5, 0.0, 1.0))
             things = [SceneObject(name, "box", "base", where, *look) for name in ("board", "glass", "iron")]
-            one.note(OBJECTS, msgspec.json.encode(things).decode(), i * period_ns)
+            one.note(OBJECTS_NOTE, msgspec.json.encode(things).decode(), i * period_ns)
         one.add(shown, i * period_ns, measured)
         if i % (10 * rate_hz) == 10 * rate_hz - 1:
             one.flush()
@@ -446,13 +446,13 @@ def test_errors_say_what_is_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["a.rrd", "--screenshot", "."], "is a folder, the name of a file needed"),
+        (["a.rrd", "--screenshot", "."], "is a folder; the name of a file needed"),
         (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
-        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "seconds from 0 on"),
-        (["a.rrd", "--time", "3"], "of a --screenshot, needed"),
+        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
+        (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
         (["a.rrd", "--web"], "thirdhand view live --web"),
-        (["live", "a.rrd"], "live beside 1 files; either live alone or files needed"),
+        (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
         (["press.npz", "a.rrd"], "press.npz is neither"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),

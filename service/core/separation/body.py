@@ -18,7 +18,7 @@ from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.core.numerics import CAPSULE_FITS, TOLERANCE
 from service.core.separation.tuning import CAPSULE_EXCESS_M, LEAST_TOOL_M, OWN_CLEARANCE_M
 from service.settings.config import Settings
-from service.settings.urdf import Joint, Shape, Urdf
+from service.settings.urdf import Shape, Urdf, UrdfJoint
 
 
 def own_clearance(settings: Settings) -> float:
@@ -126,7 +126,7 @@ def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
     )
 
 
-def _origin(joint: Joint) -> Vector:
+def _origin(joint: UrdfJoint) -> Vector:
     """Pose (3, 4) of a joint in its parent link."""
     return np.column_stack((rotation(joint.rotation), joint.translation))
 

@@ -31,7 +31,7 @@ from service.files.recording import Recording
 from service.files.shipped import cell_of
 from service.settings.config import Settings, robot_description
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
-from sim.faulty_cell import Command, Event, Fault, FaultyCell, Network
+from sim.faulty_cell import Command, Fault, FaultTimes, FaultyCell, Network
 from sim.parts import PartError
 from sim.script import Array
 
@@ -170,7 +170,7 @@ def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
     return float(times[rest]), float(np.linalg.norm(np.diff(places[: rest + 1], axis=0), axis=1).sum())
 
 
-def figures(cell: FaultyCell, event: Event, fault: Fault, recorded: Recorded, steps: Array) -> dict[str, Any]:
+def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorded, steps: Array) -> dict[str, Any]:
     """The figures of one fault; `steps` (T, 5) are the arm's: time [s], tool [m], speed [m/s]."""
     period_ms = 1e3 * cell.settings.period_s
     until = event.mended_s if fault.stops else event.ended_s
@@ -272,7 +272,7 @@ def suffered(
 
 def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Callable[[str], None]) -> None:
     """Cause some faults in one running cell, and add their results."""
-    events: list[Event] = []
+    events: list[FaultTimes] = []
     with cell:
         for name in names:
             say(name)

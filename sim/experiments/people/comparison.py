@@ -39,7 +39,7 @@ from sim.experiments.rivals.promp import InteractionProMP
 from sim.experiments.rivals.service import Service, ServiceAsPaper
 from sim.experiments.workers import shared_out
 from sim.people import Group, Places, person
-from sim.sessions import BREAKING, Shown, breaking, demonstrations, session
+from sim.sessions import BREAKING, SessionDemonstration, breaking, demonstrations, session
 
 SEEDS = EXPERIMENTS["people"].seeds
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
@@ -108,7 +108,7 @@ class Task(NamedTuple):
 
 
 @functools.cache
-def _taught() -> list[Shown]:
+def _taught() -> list[SessionDemonstration]:
     return demonstrations(DEMONSTRATORS)
 
 

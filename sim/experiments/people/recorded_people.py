@@ -13,7 +13,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from sim.experiments.people.moving_hands import hands_in
 from sim.experiments.results import Array, ExperimentError
-from sim.people import Person, Tracker, person
+from sim.people import Person, TrackerModel, person
 from sim.sessions import SHAPE_STEPS
 
 SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach lies between slow moments, and is at least this long
@@ -38,7 +38,7 @@ def _of_file(path: Path, number: int) -> Person | None:
     reaches = [one for side in (0, 3) for one in _reaches(smooth[:, side : side + 3], rate)]
     if not reaches:
         return None
-    tracker = Tracker(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
+    tracker = TrackerModel(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
     return person("tuning", number)._replace(name=f"recorded {number}", tracker=tracker, shapes=reaches)
 
 

@@ -24,7 +24,7 @@ from sim.experiments.results import Array
 from sim.experiments.rivals.method import DependsOn, Law, Learn, Observed, Predicted
 from sim.experiments.rivals.service import SEED, joined
 from sim.people import Places
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 from sim.teach import places_of
 
 COVARIANCE_EVERY = 4  # ticks from one covariance to the next: as often as a slow tracker sends
@@ -134,7 +134,7 @@ class GaussianProcess:
     own_m: float = 0.0  # least deviation of a demonstration's own function
     gate: float = 1.5  # hands are far beyond this multiple of the largest held-out deviation
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedProcess:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedProcess:
         """The process with its kernels."""
         rows = [np.linspace(0, len(one.times) - 1, self.each).astype(int) for one in demonstrations]
         inputs = np.concatenate([one.hands[some] for one, some in zip(demonstrations, rows, strict=True)])
@@ -217,7 +217,7 @@ class SampleProcess:
     every: int = 20
     ell: float | None = None
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedSamples:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedSamples:
         """The process with its kernel."""
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

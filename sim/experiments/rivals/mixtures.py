@@ -13,7 +13,7 @@ from sim.experiments.results import Array
 from sim.experiments.rivals.method import DependsOn, Observed, Predicted
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 
 SEED = EXPERIMENTS["people"].seeds.method
 # Hands are far below this quantile of the demonstrations' log densities, less a slack [nat].
@@ -33,12 +33,12 @@ def frames(places: Places) -> Array:
     )
 
 
-def joined(shown: Shown) -> Array:
+def joined(shown: SessionDemonstration) -> Array:
     """Hands and tool (T, 9) [m]."""
     return np.hstack([shown.hands, shown.tool])
 
 
-def path_share(shown: Shown) -> Array:
+def path_share(shown: SessionDemonstration) -> Array:
     """Share (T,) of the path of hands and tool; at rest it does not grow."""
     window = np.ones(13) / 13  # half a second
     x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
@@ -53,7 +53,7 @@ class MixtureRegression:
 
     components: int = 10
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedMixture:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedMixture:
         """The mixture, by EM."""
         samples = np.concatenate([joined(one) for one in demonstrations])
         mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
@@ -123,7 +123,7 @@ class TaskParameterised:
     regularization_m: float = 0.02
     iterations: int = 40
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedFrames:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedFrames:
         """The mixture, by EM from equal spans of the way; the frames share responsibilities."""
         local = np.concatenate([joined(one)[:, None] - frames(one.places) for one in demonstrations])  # (M, 4, 9)
         phase = 0.999 * np.concatenate([path_share(one) for one in demonstrations])

@@ -13,7 +13,7 @@ from sim.experiments.results import Array
 from sim.experiments.rivals.gaussian_process import Kernel, PlacedProcess
 from sim.experiments.rivals.method import DependsOn, Observed, Predicted
 from sim.people import Places
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 from sim.teach import places_of
 
 FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])  # d tool / d hands where the tool follows the left hand
@@ -26,7 +26,7 @@ class NoDemonstrations:
     ell: float = 5.0  # [1/m²] of exp(-ell |s - s'|²)
     deviation_m: float = 0.2  # deviation of the tool far from all via-points
 
-    def learn(self, demonstrations: Sequence[Shown]) -> NoDemonstrations:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> NoDemonstrations:
         """Nothing is learned."""
         return self
 
@@ -44,7 +44,7 @@ class LookUp:
     power: float = 4.0
     deviation_m: float = 0.03
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LookUp:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LookUp:
         """Nothing is learned."""
         return self
 

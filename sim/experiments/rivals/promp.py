@@ -14,7 +14,7 @@ from sim.experiments.rivals.method import DependsOn, Law, Observed, Predicted
 from sim.experiments.rivals.mixtures import frames, joined, log_normal, path_share, threshold
 from sim.people import Places
 from sim.scene import Scene
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 from sim.teach import places_of
 
 BASES, EXACT_STD_M = 20, 0.0001  # basis functions of each axis over time; deviation of a via-point
@@ -30,7 +30,7 @@ class ProMPOverTime:
     speed.
     """
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedOverTime:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedOverTime:
         """From demonstrations with even and equal periods."""
         length = min(len(one.tool) for one in demonstrations)
         times = np.linspace(0.0, (length - 1) * float(demonstrations[0].times[1]), length)
@@ -97,7 +97,7 @@ class InteractionProMP:
     cells: int = 100
     sharpness: float = 0.1  # weight of an observation: consecutive ones are correlated
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedInteraction:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedInteraction:
         """The distribution of the weights."""
         weights, residuals, at = [], [], []
         for one in demonstrations:
@@ -123,7 +123,7 @@ class InteractionProMP:
         rows = np.exp(-0.5 * ((phase[:, None] - centres) / width) ** 2)
         return np.asarray(rows / rows.sum(axis=1, keepdims=True))
 
-    def phase(self, one: Shown) -> Array:
+    def phase(self, one: SessionDemonstration) -> Array:
         """The phase (T,) of a demonstration's samples."""
         if not self.by_length:
             return np.linspace(0.0, 1.0, len(one.times))

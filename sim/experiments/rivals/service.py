@@ -18,7 +18,7 @@ from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.results import Array
 from sim.experiments.rivals.method import DependsOn, Law, Observed, Predicted
 from sim.people import Places
-from sim.sessions import Shown
+from sim.sessions import SessionDemonstration
 from sim.teach import places_of, recorded
 
 COMPONENTS, POINTS, SEED = 10, 200, EXPERIMENTS["statistics"].seeds.method
@@ -29,7 +29,7 @@ PAPER_ELL, PAPER_LAMBDA, PAPER_VIA_STD_M = 0.5, 2.0, 0.001
 class Service:
     """The skill that the service learns by default, with the start among its via-points."""
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """By `service.learning`."""
         return LearnedByService(learn([recorded(one) for one in demonstrations]), start=True)
 
@@ -43,7 +43,7 @@ class ServiceAsPaper:
     spread_m: float = 0.01
     components: int = 10
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedByService:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """The skill with these parameters."""
         taken = [recorded(one) for one in demonstrations]
         return LearnedByService(
@@ -69,7 +69,7 @@ class Paper:
     variance 1e-6 m².
     """
 
-    def learn(self, demonstrations: Sequence[Shown]) -> LearnedAsPaper:
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedAsPaper:
         """A mixture by EM, its regression at sampled inputs, and a KMP of that."""
         samples = joined(demonstrations)
         mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED)
@@ -100,6 +100,6 @@ class LearnedAsPaper:
         return Law(predict, DependsOn.HANDS)
 
 
-def joined(demonstrations: Sequence[Shown]) -> Array:
+def joined(demonstrations: Sequence[SessionDemonstration]) -> Array:
     """Hands and tool (T, 9) [m] of all demonstrations."""
     return np.concatenate([np.hstack([one.hands, one.tool]) for one in demonstrations])
