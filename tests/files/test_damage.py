@@ -154,7 +154,7 @@ def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp
     assert len(read_demonstration(path, say=said.append).stamps_ns) == 150
     (line,) = said
     assert "cut at byte" in line
-    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose are there")
+    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose were read")
 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])

@@ -134,7 +134,7 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstr
         (lambda rows: [row[:1] for row in rows], "frame 1 of 20 is at nan s"),
         (lambda rows: [[row[0], f"{row[1]}e12", *row[2:]] for row in rows], "frame 2 of 20 is at .* s, up to"),
         (lambda rows: rows[::-1], "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed"),
-        (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit that the file names"),
+        (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit in the file"),
     ],
 )
 def test_frames_of_motive_that_are_none_are_refused_with_what_to_do(
@@ -192,7 +192,7 @@ def lerobot(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "made", "words"),
     [
-        ("set", lerobot, r"set is a data set of LeRobot: .*docs/arrays\.md"),
+        ("set", lerobot, r"set is a data set of LeRobot, .*docs/arrays\.md"),
         ("a.csv", lambda path: path.write_text("t,x\n0,1\n"), r"is not a CSV file as Motive exports it .*docs/arrays"),
         ("b.csv", lambda path: path.write_bytes(b""), "is not a CSV file as Motive exports it"),
         ("c.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not a CSV file that can be read"),

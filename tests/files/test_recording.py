@@ -118,7 +118,7 @@ def test_errors_name_the_file_what_is_wrong_and_what_there_is(tmp_path: Path) ->
         Recording.open(tmp_path / "a.mcap")
     write_demonstration(tmp_path / "demo.mcap", Demonstration(np.arange(3) * 10, *np.ones((3, 3, 7))))
     (tmp_path / "notes.mcap").write_text("not an MCAP file at all", encoding="utf-8")
-    with pytest.raises(RecordingError, match=r"There are: demo.mcap, notes.mcap\."):
+    with pytest.raises(RecordingError, match=r"Its folder has: demo.mcap, notes.mcap\."):
         Recording.open(tmp_path / "a.mcap")
     with pytest.raises(RecordingError, match=r"notes.mcap is not an MCAP file"):
         Recording.open(tmp_path / "notes.mcap")

@@ -129,7 +129,7 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
     np.testing.assert_allclose(got.left[:, 3:], np.tile(y_up.as_quat(), (40, 1)), atol=1e-12)
     np.testing.assert_allclose(got.tool[:, 1], WAY)
     assert "left is /tf:LeftWrist; right is /tf:RightWrist; tool is /arm/tcp" in said[0]
-    assert "hands/left, hands/right brought to frame base" in said[0]
+    assert "hands/left, hands/right transformed to frame base" in said[0]
     ours = {"/c/hands/left": moving(stamped, "base", 0.3, 0.0), "/c/hands/right": moving(stamped, "mocap", 300.0, 0.0)}
     mixed = read_demonstration(bag(tmp_path / "mixed", {**ours, "/arm/tcp": tool}), settings=Settings(hands=hands))
     np.testing.assert_allclose(mixed.left[:, 2], WAY)
