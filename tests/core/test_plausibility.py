@@ -6,7 +6,7 @@ Each was an attack once: on hands here, on the arm in `test_arm_sources`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +16,13 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.messages import PoseStamped
-from service.contract.records import SIDES, Cause, Mode, Reason
+from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, copied, parameters
 from service.core.intake import plausibility, step
 from service.core.skill.skill import Skill
 from service.settings.config import HandSettings
-from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, frames, led
 from support.tracked import LEFT as LEFT_SIDE
 from support.tracked import STRAIGHT, Hands
 from support.wam import URDF
@@ -293,20 +293,13 @@ def test_any_samples_are_taken_or_counted_and_leave_a_state_that_can_be_calculat
 # --- in the core ---
 
 
-def told(until: int, contest: range, *, swap: bool = False) -> list[Tick]:
+def told(until: int, contest: range, *, swap: bool = False) -> Iterator[Tick]:
     """Ticks with hands at rest; between two sources take turns, or the hands' labels are mixed
     up in every other sample.
     """
-    ticks = []
-    for k in range(until):
-        inbox = []
-        if k % 5 == 0:
-            left, right = LEFT, RIGHT
-            if k in contest and k // 5 % 2:
-                left, right = (right, left) if swap else ((LEFT[0], LEFT[1] + 0.3, LEFT[2]), RIGHT)
-            inbox = [hand("left", left, k + 1), hand("right", right, k + 1)]
-        ticks.append(Tick(k, tuple(inbox)))
-    return ticks
+    rest = np.array((LEFT, RIGHT))
+    other = rest[::-1] if swap else np.add(rest, [(0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
+    return led(other if k in contest and k // 5 % 2 else rest for k in range(until))
 
 
 @pytest.mark.parametrize("swap", [False, True])
@@ -321,17 +314,13 @@ def test_while_two_sources_tell_of_a_hand_it_holds_and_then_goes_on(skill: Skill
     assert seen["mode"][-1] == Mode.FOLLOW
     still = seen["hands"][1000:, 0] - np.array(LEFT)
     assert np.abs(still).max() < 0.002
-    steps = np.abs(np.diff(seen["joints"], axis=0)).max()
-    assert steps <= 1.5 * 0.002 + 1e-9
+    assert_limits_hold(seen)
 
 
 def test_one_sudden_move_of_both_hands_is_followed_without_a_hold(skill: Skill) -> None:
-    ticks = []
-    for k in range(2000):
-        y = 0.09 if k >= 1000 else 0.0
-        inbox = [hand(side, (at[0], at[1] + y, at[2]), k + 1) for side, at in zip(SIDES, (LEFT, RIGHT), strict=True)]
-        ticks.append(Tick(k, tuple(inbox) if k % 16 == 0 else ()))
-    seen = frames(Controller(ASSUMED, replace(skill, threshold=math.inf), urdf=URDF), ticks)
+    hands = np.tile((LEFT, RIGHT), (2000, 1, 1))
+    hands[1000:, :, 1] += 0.09
+    seen = frames(Controller(ASSUMED, replace(skill, threshold=math.inf), urdf=URDF), led(hands, every=16))
     assert set(seen["reason"][50:].tolist()) == {Reason.NONE}
 
 

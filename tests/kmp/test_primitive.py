@@ -242,55 +242,20 @@ TWINS = Gaussians(np.zeros((2, 1)), np.full((2, 1, 1), 1e-20))
 ARRAYS = named_arrays.to_arrays(skill().adapt(*via(0, 2), tolerance=1.5))
 
 
-def fit(inputs=INPUTS, reference=REFERENCE, lambda_mean=1.0, **options):
-    return KMP.fit(inputs, reference, kernel=kernel, lambda_mean=lambda_mean, **options)
+def fit(inputs=INPUTS, reference=REFERENCE):
+    return KMP.fit(inputs, reference, kernel=kernel, lambda_mean=1.0)
 
 
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: fit(lambda_mean=0), "lambda_mean is 0, and must be finite and above 0"),
-        (lambda: fit(lambda_covariance=-1), "lambda_covariance is -1, and must be finite and above 0"),
-        (lambda: fit(prior_mean=[1, 2]), r"prior_mean: shape \(2,\) given, \(3,\) needed"),
-        (lambda: fit(inputs=np.zeros(3)), r"inputs: shape \(3,\) given, \(N, I\) needed"),
-        (lambda: fit(inputs=np.full((3, 4), np.inf)), r"inputs\[0, 0\] is inf, and every number must be finite"),
-        (lambda: fit(inputs=INPUTS[:2]), "3 normals over 3 outputs given for 2 inputs; 2 over 3 needed"),
-        (lambda: fit(inputs=np.empty((0, 4))), "inputs: no reference point given, at least 1 needed"),
-        (
-            lambda: fit(inputs=[[1.0], [1.0]], reference=TWINS),
-            r"not positive definite to working precision at point 1, with lambda 1",
-        ),
-        (lambda: fit().mean(np.zeros(4)), r"queries: shape \(4,\) given, \(M, 4\) needed"),
-        (lambda: fit().predict(np.zeros((1, 3))), r"queries: shape \(1, 3\) given, \(M, 4\) needed"),
-        (lambda: fit().jacobian(np.zeros((1, 4))), r"query: shape \(1, 4\) given, \(4,\) needed"),
-        (lambda: fit().curvature(np.zeros(4), np.zeros(3)), r"direction: shape \(3,\) given, \(4,\) needed"),
-        (lambda: fit().mean([[0, np.nan, 0, 0]]), r"queries\[0, 1\] is nan, and every number must be finite"),
-        (lambda: fit().mean([[0, 0, np.inf, 0]]), r"queries\[0, 2\] is inf, and every number must be finite"),
-        (lambda: fit().predict([[0, np.nan, 0, 0]]), r"queries\[0, 1\] is nan, and every number must be finite"),
-        (lambda: fit().predict([[0, 1, 0, 0], [0, np.inf, 0, 0]]), r"queries\[1, 1\] is inf, and every number"),
-        (lambda: fit().uncertainty([[0, -np.inf, 0, 0]]), r"queries\[0, 1\] is -inf, and every number"),
-        (lambda: fit().jacobian([0, np.nan, 0, 0]), r"query\[1\] is nan, and every number must be finite"),
-        (lambda: fit().curvature(np.zeros(4), [0, 0, 0, np.nan]), r"direction\[3\] is nan, and every number"),
-        (lambda: fit().adapt(*via(0, 1), tolerance=-1), "tolerance is -1, and must not be below 0"),
-        (lambda: fit().adapt(*via(0, 1), tolerance=np.nan), "tolerance is nan"),
+        (lambda: fit(INPUTS[:2]), "3 normals over 3 outputs given for 2 inputs; 2 over 3 needed"),
+        (lambda: fit([[1.0], [1.0]], TWINS), "not positive definite to working precision at point 1, with lambda 1"),
         (lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1), r"inputs: shape \(1, 2\) given, \(V, 4\) needed"),
-        (
-            lambda: fit().adapt(*via(0, 1, outputs=2), tolerance=1),
-            "1 normals over 2 outputs given for 1 inputs; 1 over 3 needed",
-        ),
-        (
-            lambda: named_arrays.from_arrays({"ell": np.array(1.0)}),
-            "The primitive's arrays lack base_inputs, base_mean, .* Needed are",
-        ),
-        (
-            lambda: named_arrays.from_arrays(ARRAYS | {"lambda_mean": np.ones(2)}),
-            r"lambda_mean: shape \(2,\) given, \(\) needed",
-        ),
+        (lambda: fit().adapt(*via(0, 1, outputs=2), tolerance=1), "1 normals over 2 outputs given for 1 inputs"),
+        (lambda: named_arrays.from_arrays({"ell": np.array(1.0)}), "arrays lack base_inputs, base_mean, .* Needed are"),
         (lambda: named_arrays.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
-        (
-            lambda: named_arrays.from_arrays(ARRAYS | {"replaced": np.array([99])}),
-            r"replaced: \[99\] given, ascending indices of the 30 base",
-        ),
+        (lambda: named_arrays.from_arrays(ARRAYS | {"replaced": np.array([99])}), r"replaced: \[99\] given, ascending"),
     ],
 )
 def test_what_cannot_be_done_is_refused_with_what_could(call, says):

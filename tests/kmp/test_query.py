@@ -152,24 +152,6 @@ def test_an_input_at_rest_gives_an_output_at_rest():
     np.testing.assert_array_equal(found.acceleration, 0)
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"query": np.zeros(2)}, r"query: shape \(2,\) given, \(3,\) needed"),
-        ({"query": np.zeros((1, 3))}, r"query: shape \(1, 3\) given, \(3,\) needed"),
-        ({"velocity": np.zeros(4)}, r"velocity: shape \(4,\) given, \(3,\) needed"),
-        ({"acceleration": [[0.0]]}, r"acceleration: shape \(1, 1\) given, \(3,\) needed"),
-        ({"query": [0, np.inf, 0]}, r"query\[1\] is inf, and every number must be finite"),
-        ({"velocity": [0, 0, np.nan]}, r"velocity\[2\] is nan, and every number must be finite"),
-        ({"acceleration": [-np.inf, 0, 0]}, r"acceleration\[0\] is -inf, and every number must be finite"),
-    ],
-)
-def test_what_is_no_motion_is_refused_by_its_name(change, says):
-    rest = {"query": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
-    with pytest.raises(ValueError, match=says):
-        primitive("one length", "dense", False).predict_motion(**(rest | change))
-
-
 def test_numbers_too_large_to_square_are_still_finite():
     one = primitive("one length", "dense", False)
     with np.errstate(over="ignore"):
