@@ -111,6 +111,31 @@ def smooth(u: Vector) -> Vector:
     return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u * u))
 
 
+@pytest.fixture(scope="module")
+def followed(taught: Skill) -> np.ndarray:
+    """A tenth of a second in which the arm follows resting hands."""
+    return frames(Controller(ASSUMED, taught, urdf=robot_description(ASSUMED)), resting(0, 50))
+
+
+@pytest.mark.parametrize(
+    ("field", "added", "words"),
+    [
+        ("target", np.nan, "target"),
+        ("joints", 9.0, "outside the limits"),
+        ("joint_velocities", 9.0, "speed"),
+        ("joint_accelerations", 50.0, "acceleration"),
+        ("joint_accelerations", 5.0, "jerk"),
+        ("joints", 2e-6, "a jump"),
+    ],
+)
+def test_a_limit_that_is_passed_is_found(followed: np.ndarray, field: str, added: float, words: str) -> None:
+    spoilt = followed.copy()
+    spoilt[field][-1] += added
+    assert_limits_hold(followed)
+    with pytest.raises(AssertionError, match=words):
+        assert_limits_hold(spoilt)
+
+
 # --- legal hands ---
 
 

@@ -1,12 +1,9 @@
 """Linear inequality constraints: obeyed to 1e-9, at the least cost, and kept thereafter."""
 
-import pickle
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-import kmp
 from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
 
 T = np.linspace(0, 2, 50)[:, None]
@@ -115,18 +112,6 @@ def test_everything_else_is_predicted_as_ever():
     np.testing.assert_allclose(skill.predict([s]).covariance, base().predict([s]).covariance, atol=1e-12)
     assert skill.predict_joint(T[:5]).covariance.shape == (1, 10, 10)
     assert (skill.uncertainty(T).distance >= -1e-9).all()
-
-
-@pytest.mark.parametrize("adapted", [False, True])
-def test_files_and_pickles_give_it_back_bit_for_bit(tmp_path, adapted):
-    skill = base().constrained(LOW)
-    if adapted:
-        skill = skill.adapt([[1.3]], Gaussians([[0.5, 0.1]], [1e-8 * np.eye(2)]), tolerance=0.03)
-    kmp.save(tmp_path / "skill", skill, input_unit="s", output_unit="m")
-    for again in (kmp.load(tmp_path / "skill").primitive, pickle.loads(pickle.dumps(skill))):
-        assert np.array_equal(again.mean(T), skill.mean(T))
-        assert np.array_equal(again.predict(T).covariance, skill.predict(T).covariance)
-        assert violation(again.adapt([[0.1]], Gaussians([[0.3, 0.9]], [1e-4 * np.eye(2)]), tolerance=0)) < 1e-9
 
 
 def test_a_low_rank_is_solved_anew_for_constraints():

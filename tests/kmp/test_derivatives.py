@@ -1,12 +1,10 @@
 """Derivatives as observations: a via-point that carries its Jacobian, and velocities."""
 
-import pickle
 import warnings
 
 import numpy as np
 import pytest
 
-import kmp
 from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed, named_arrays
 from kmp.functionals import Functionals
 from kmp.kernel import between, variances
@@ -177,19 +175,6 @@ def test_a_database_may_hold_derivatives_from_the_start(representation):
     np.testing.assert_allclose(one.mean(near), named_arrays.from_arrays(named_arrays.to_arrays(one)).mean(near), atol=0)
     again = one.refitted(one.reference)
     assert np.array_equal(again.mean(near), one.mean(near))
-
-
-@pytest.mark.parametrize("representation", ["dense", "low_rank"])
-def test_files_and_pickles_give_it_back_bit_for_bit_and_more_can_be_taught(tmp_path, representation):
-    one = taught(base(representation))
-    kmp.save(tmp_path / "skill", one, input_unit="m", output_unit="m")
-    for again in (kmp.load(tmp_path / "skill").primitive, pickle.loads(pickle.dumps(one))):
-        assert np.array_equal(again.mean(S), one.mean(S))
-        assert np.array_equal(again.predict(PLACE).covariance, one.predict(PLACE).covariance)
-        more = Gaussians(TRUTH(S[5:6]) + 0.1, [1e-6 * np.eye(3)])
-        a, b = (x.adapt(S[5:6], more, tolerance=0.1) for x in (one, again))
-        assert np.array_equal(a.mean(S), b.mean(S))
-        np.testing.assert_allclose(a.jacobian(PLACE[0]), FOLLOW[0], atol=1e-4)
 
 
 def test_so_many_derivatives_that_the_low_rank_solution_is_fitted_anew():

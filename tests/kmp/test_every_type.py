@@ -124,6 +124,36 @@ def test_a_pickle_leaves_out_the_factors_and_the_copy_makes_them_again(represent
     assert same(again.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0), one.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0))
 
 
+LOW = KMP.fit(S, R, kernel=GaussianKernel([1.0, 2.0]), lambda_mean=1.0, representation="low_rank")
+AFFINE = {"prior_mean": AffineMean(S[:2], S[2]), "representation": "low_rank"}
+PRIMITIVES = [
+    *(value for value in VALUES if isinstance(value, KMP)),
+    *(LOW, LOW.adapt_jacobian(S[:1], [np.eye(2)], deviation=1.0)),
+    CONSTRAINED.adapt(S[5:6], R[5:6], tolerance=0.01),
+    KMP.fit(S, R, kernel=K, lambda_mean=1.0, **AFFINE).adapt(S[:1] + 0.1, R[:1], tolerance=0.2),
+]
+
+
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
+@pytest.mark.parametrize("one", PRIMITIVES, ids=repr)
+def test_a_primitive_that_was_stored_or_pickled_predicts_and_is_adapted_as_before(tmp_path, one):
+    kmp.save(tmp_path / "skill", one, input_unit="m", output_unit="m, m/s")
+    stored = kmp.load(tmp_path / "skill")
+    assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
+    queries, place = one.inputs[:5] + 0.1, one.inputs[3:4] + 0.05
+    desired = Gaussians(one.mean(place) + 0.01, [0.01 * np.eye(one.outputs)])
+    for again in (stored.primitive, pickle.loads(pickle.dumps(one))):
+        assert again.representation == one.representation
+        adapted = (primitive.adapt(place, desired, tolerance=0.01) for primitive in (again, one))
+        for a, b in ((again, one), (again.base, one.base), tuple(adapted)):
+            for many in (queries, queries[:1]):
+                assert np.array_equal(a.mean(many), b.mean(many))
+                assert np.array_equal(a.predict(many).covariance, b.predict(many).covariance)
+            assert np.array_equal(a.jacobian(queries[0]), b.jacobian(queries[0]))
+            motion = queries[0], queries[1], queries[2]
+            assert all(map(np.array_equal, a.predict_motion(*motion), b.predict_motion(*motion)))
+
+
 def test_all_types_that_the_package_offers_are_among_them():
     types = {name for name in kmp.__all__ if isinstance(getattr(kmp, name), type)}
     offered = {n for n in types if not issubclass(getattr(kmp, n), Warning)} - {"Stored"}

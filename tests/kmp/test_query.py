@@ -1,7 +1,5 @@
 """One query: mean, motion and covariance, with every kernel and every solution."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -129,13 +127,6 @@ def test_shapes_are_those_of_one_query(skill):
     assert found.covariance.shape == (outputs, outputs)
     assert found.jacobian.shape == (outputs, skill.inputs.shape[1])
     assert found.curvature.shape == (outputs,)
-
-
-def test_a_copy_in_another_process_gives_the_same_bits(skill):
-    query = moving(skill)
-    found = skill.predict_motion(*query)
-    again = pickle.loads(pickle.dumps(skill)).predict_motion(*query)
-    assert all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
 
 
 def test_what_one_query_touches_is_contiguous_and_read_only(skill):
