@@ -23,10 +23,18 @@ def test_the_chain_to_the_tool_has_the_joints_in_order_with_their_limits() -> No
     assert (joints[3].lower, joints[3].upper, joints[3].velocity) == (-0.9, 3.1, 2.0)
 
 
+TILTED = sliding_urdf().replace('<axis xyz="0 1 0"/>', '<axis xyz="0.6 0.8 0"/>')
+
+
 @pytest.mark.parametrize(
     ("description", "plate", "around"),
-    [(URDF, "tool_plate", 0.0), (continuous_urdf(), "tool0", 20.0), (sliding_urdf(), "tool0", 0.0)],
-    ids=["wam", "continuous", "sliding"],
+    [
+        (URDF, "tool_plate", 0.0),
+        (continuous_urdf(), "tool0", 20.0),
+        (sliding_urdf(), "tool0", 0.0),
+        (TILTED, "tool0", 0.0),
+    ],
+    ids=["wam", "continuous", "sliding", "tilted"],
 )
 def test_link_frames_are_where_another_implementation_has_them(description: str, plate: str, around: float) -> None:
     urdf = Urdf(description)
