@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import kmp
+from support import tiers
 from support.paths import ROOT
 
 PACKAGES = ("kmp", "service", "sim")
@@ -257,6 +258,13 @@ def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
             elif isinstance(node, ast.Constant) and re.search(PRIVATE, str(node.value)):
                 found.append(f"{named(path)}: {node.value}")
     assert found == []
+
+
+def test_every_test_that_a_tier_names_exists() -> None:
+    for test in {*tiers.RESEARCH, *tiers.UNCOMPILED, *tiers.SLOW, *tiers.SMOKE}:
+        place, *names = test.split("[")[0].split("::")
+        assert (ROOT / "tests" / place).exists(), test
+        assert all(name in (ROOT / "tests" / place).read_text(encoding="utf-8") for name in names), test
 
 
 def test_everything_that_the_mathematics_offers_is_there_and_sorted() -> None:

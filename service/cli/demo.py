@@ -36,9 +36,14 @@ class DemoError(ExplainedError):
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Run the demo; exit code 0 if the task succeeded and the recording is complete, else 1."""
+    """Run the demo, print its report and return its exit code."""
     report = run(args.output, scene=args.scene, arm=args.arm, engine=args.engine, rate_hz=args.rate, say=say)
     print(json.dumps(report, indent=2) if args.json else text(report))
+    return exit_code(report)
+
+
+def exit_code(report: dict[str, Any]) -> int:
+    """Exit code 0 only if the task succeeded and the recording is complete."""
     return 0 if report["success"] and not report["missing"] else 1
 
 

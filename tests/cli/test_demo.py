@@ -11,18 +11,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import EVENT_TITLES, text
+from service.cli.demo import EVENT_TITLES, exit_code, text
 from service.settings.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
 
-pytestmark = pytest.mark.timed
+timed = pytest.mark.timed
 SCENE = """
 handover = [0.68, -0.20, 0.36]
 glass = [0.44, 0.31, 0.22]
@@ -31,6 +32,7 @@ seed = 7
 """
 
 
+@timed
 def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
     arguments = ["demo", "--json", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")]
@@ -53,6 +55,7 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
             left -= {next(decoded).channel.topic}
 
 
+@timed
 def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
     """Its URDF lies beside it, and both are named by a relative path."""
     (tmp_path / "my").mkdir()
@@ -70,6 +73,7 @@ def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
     assert report["rate_hz"] == pytest.approx(1000, rel=0.05)
 
 
+@timed
 def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")
     done = thirdhand("demo", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
@@ -77,8 +81,11 @@ def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) 
     assert "handover" in done.stderr
 
 
+@timed
 def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) -> None:
-    """Its scribe is killed while the nominal scene is played; another takes its place."""
+    """The scribe of the nominal scene is killed; another one takes its place. On a busy machine the
+    events may be missed besides: that missing ticks alone fail a demo is tested below.
+    """
     command = [sys.executable, "-m", "service", "demo", "--json", "--output", str(tmp_path)]
     with (tmp_path / "said").open("w") as errors:
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT)
@@ -91,23 +98,44 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     out, _ = demo.communicate(timeout=100)
     assert demo.returncode == 1
     report = json.loads(out)
-    assert all(event["reached"] for event in report["events"].values())
     assert re.fullmatch(r"[1-9]\d* of \d+ ticks are not recorded", report["missing"])
     assert f"The recording is not complete: {report['missing']}." in text(report)
 
 
-def test_each_cause_of_a_failed_demo_is_printed_once() -> None:
-    bench, loop = "the bench missed 400 of its 9000 periods", "the loop was up to 45 ms late"
-    held = f"the arm held (stale_hand) from 1.0 s on, for 9.0 s: this machine was too busy, {loop}; no hand was seen"
-    whys = (None, held, held)
+def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, Any]:
+    """The report of a demo: an event is reached unless there is a reason why not."""
     events = {
         name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0} | ({"why": why} if why else {})
         for name, why in zip(EVENT_TITLES, whys, strict=True)
     }
     few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
     figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}
-    report = {"success": False, "events": events, **figures, "realtime": True, "missing": ""}
-    shown = text(report | {"busy": f"{bench}, {loop}", "recording": "a.mcap", "rrd": "a.rrd"})
+    files = {"recording": "a.mcap", "rrd": "a.rrd"}
+    told = {"success": not any(whys), "events": events, "realtime": True, "missing": missing, "busy": ""}
+    return told | figures | files | more
+
+
+@pytest.mark.parametrize(
+    ("why", "missing", "code"),
+    [
+        (None, "", 0),
+        (None, "1 of 9000 ticks are not recorded", 1),
+        ("the arm held", "", 1),
+        ("the arm held", "1 of 9000 ticks are not recorded", 1),
+    ],
+)
+def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | None, missing: str, code: int) -> None:
+    report = report_of(None, None, why, missing=missing)
+    assert exit_code(report) == code
+    shown = text(report)
+    assert shown.endswith("held it over the board.") == (why is None)
+    assert (f"The recording is not complete: {missing}." in shown) == bool(missing)
+
+
+def test_each_cause_of_a_failed_demo_is_printed_once() -> None:
+    bench, loop = "the bench missed 400 of its 9000 periods", "the loop was up to 45 ms late"
+    held = f"the arm held (stale_hand) from 1.0 s on, for 9.0 s: this machine was too busy, {loop}; no hand was seen"
+    shown = text(report_of(None, held, held, busy=f"{bench}, {loop}"))
     for cause in (held, bench, loop):
         assert shown.count(cause) == 1
     assert shown.count("for the same reason") == 1

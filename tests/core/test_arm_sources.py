@@ -14,69 +14,22 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.records import Cause, Mode, Reason
-from service.core.controller import Controller
-from service.core.frame import Event, Tick, order
+from service.core.frame import Event, order
 from service.core.skill.skill import Skill
 from service.settings.config import Settings
-from support.in_process import LEFT, RIGHT, arm, hand
-from support.wam import URDF
+from support.in_process import Loop, arm, assert_limits_hold, stamp_ns
 
 SETTINGS = Settings()
 POSTURE = SETTINGS.arm.posture
 ELSEWHERE = (POSTURE[0] + 1.2, *POSTURE[1:])
-PERIOD_S, HOUR_NS = SETTINGS.period_s, 3600 * 10**9
-LOWER, UPPER, VELOCITY = (np.array(x) for x in (SETTINGS.joints.lower, SETTINGS.joints.upper, SETTINGS.joints.velocity))
+HOUR_NS = 3600 * 10**9
+LOWER, UPPER = np.array(SETTINGS.joints.lower), np.array(SETTINGS.joints.upper)
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "10"))
 
 
-def stamp(k: int) -> int:
-    return 10**12 + round(k * PERIOD_S * 1e9)
-
-
-class Cell:
-    """A controller with an arm that goes where it is told, and what others say besides."""
-
-    def __init__(self, skill: Skill, posture: tuple[float, ...] = POSTURE) -> None:
-        self.controller = Controller(SETTINGS, skill, urdf=URDF)
-        self.joints = posture
-        self.index = 0
-        self.seen: list[np.void] = []
-
-    def run(self, ticks: int, strangers: dict[int, Event] | None = None, *, every: int = 5) -> np.ndarray:
-        """Frames of so many more ticks; a stranger's event by its tick, counted from here."""
-        first = len(self.seen)
-        for k in range(ticks):
-            inbox = []
-            if self.index % 5 == 0:
-                inbox = [hand("left", LEFT, self.index + 1), hand("right", RIGHT, self.index + 1)]
-            if every and self.index % every == 0:
-                inbox.append(arm(self.joints, stamp(self.index)))
-            if strangers and k in strangers:
-                inbox.append(strangers[k])
-            frame = self.controller.step(Tick(self.index, tuple(inbox)))
-            if frame["commanded"]:
-                self.joints = tuple(frame["joints"].tolist())
-            self.seen.append(frame)
-            self.index += 1
-        return np.array(self.seen[first:])
-
-    @property
-    def rejected(self) -> dict[Cause, int]:
-        return {cause: int(n) for cause, n in zip(Cause, self.seen[-1]["rejected"], strict=True) if n}
-
-
-def no_command_jumps(seen: np.ndarray) -> None:
-    """What is commanded tick after tick is no farther apart than the joints' speed allows."""
-    both = (seen["commanded"][1:] == 1) & (seen["commanded"][:-1] == 1)
-    steps = np.abs(np.diff(seen["joints"], axis=0))[both]
-    assert (steps <= VELOCITY * PERIOD_S + 1e-9).all(), steps.max(axis=0)
-
-
-def no_command_leaves(seen: np.ndarray) -> None:
-    """What is commanded lies within the limits, or nearer to them than what was before."""
-    q = seen["joints"][seen["commanded"] == 1]
-    outside = np.maximum(np.maximum(LOWER - q, q - UPPER), 0.0)
-    assert (np.diff(outside, axis=0) <= 1e-12).all()
+def rejected(loop: Loop) -> dict[Cause, int]:
+    """How many samples were rejected, by cause."""
+    return {cause: int(n) for cause, n in zip(Cause, loop.steps[-1][1]["rejected"], strict=True) if n}
 
 
 @pytest.mark.parametrize("ahead_ns", [10**9, HOUR_NS])
@@ -84,58 +37,58 @@ def no_command_leaves(seen: np.ndarray) -> None:
 def test_one_state_stamped_ahead_neither_faults_nor_moves_nor_locks_out(
     skill: Skill, ahead_ns: int, posture: tuple[float, ...]
 ) -> None:
-    cell = Cell(skill)
-    cell.run(500)
-    seen = cell.run(1000, {3: arm(posture, stamp(503) + ahead_ns), 200: order("reset")})
+    loop = Loop(SETTINGS, skill)
+    loop.run(500, every=5)
+    seen = loop.run(1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5)
     assert set(seen["reason"].tolist()) == {Reason.NONE}
-    assert cell.rejected == {Cause.AHEAD: 1}
-    no_command_jumps(np.array(cell.seen))
+    assert rejected(loop) == {Cause.AHEAD: 1}
+    assert_limits_hold(loop.frames)
 
 
 def test_a_state_stamped_an_hour_ahead_before_a_reset_is_not_started_from(skill: Skill) -> None:
     """The attack: fault, then a stranger's posture an hour ahead, then `reset`."""
-    cell = Cell(skill)
-    cell.run(500)
-    off = tuple(q + 0.15 for q in cell.joints)
-    fault = cell.run(300, {k: arm(off, stamp(500 + k)) for k in range(0, 300, 5)}, every=0)
+    loop = Loop(SETTINGS, skill)
+    loop.run(500, every=5)
+    off = tuple(q + 0.15 for q in loop.joints)
+    fault = loop.run(300, {k: arm(off, stamp_ns(500 + k)) for k in range(0, 300, 5)}, every=0)
     assert fault["reason"][-1] == Reason.ARM_ERROR
-    seen = cell.run(600, {10: arm(ELSEWHERE, stamp(810) + HOUR_NS), 11: order("reset")})
+    seen = loop.run(600, {10: arm(ELSEWHERE, stamp_ns(810) + HOUR_NS), 11: order("reset")}, every=5)
     assert seen["mode"][-1] == Mode.FOLLOW
-    assert np.abs(seen["joints"][:, 0] - cell.seen[799]["joints"][0]).max() < 0.2
-    no_command_jumps(seen)
-    assert cell.rejected[Cause.AHEAD] == 1
+    assert np.abs(seen["joints"][:, 0] - loop.frames[799]["joints"][0]).max() < 0.2
+    assert_limits_hold(seen)
+    assert rejected(loop)[Cause.AHEAD] == 1
 
 
 @pytest.mark.parametrize("every", [5, 2])
 def test_two_arms_that_take_turns_are_not_believed_to_be_ready(skill: Skill, every: int) -> None:
-    cell = Cell(skill)
-    seen = cell.run(2000, {k: arm(ELSEWHERE, stamp(k) + 1) for k in range(0, 2000, every)})
+    loop = Loop(SETTINGS, skill)
+    seen = loop.run(2000, {k: arm(ELSEWHERE, stamp_ns(k) + 1) for k in range(0, 2000, every)}, every=5)
     assert not seen["commanded"].any()
     assert seen["reason"][-1] == Reason.TWO_SOURCES
-    assert cell.rejected[Cause.JUMPED] > 300
+    assert rejected(loop)[Cause.JUMPED] > 300
 
 
 def test_a_second_arm_while_following_is_refused_and_holds_until_it_ends(skill: Skill) -> None:
-    cell = Cell(skill)
-    cell.run(500)
-    seen = cell.run(1500, {k: arm(ELSEWHERE, stamp(500 + k) + 1) for k in range(0, 1500, 5)})
+    loop = Loop(SETTINGS, skill)
+    loop.run(500, every=5)
+    seen = loop.run(1500, {k: arm(ELSEWHERE, stamp_ns(500 + k) + 1) for k in range(0, 1500, 5)}, every=5)
     assert set(seen["reason"].tolist()) == {Reason.NONE, Reason.TWO_SOURCES}
     assert seen["commanded"].all()
     assert np.abs(seen["joints"] - seen["joints"][0]).max() < 0.1
-    after = cell.run(1500)
+    after = loop.run(1500, every=5)
     assert after["mode"][-1] == Mode.FOLLOW
-    no_command_jumps(np.array(cell.seen))
+    assert_limits_hold(loop.frames)
 
 
 def test_a_joint_that_jumps_is_refused_until_its_arm_would_be_silent_and_then_a_fault(skill: Skill) -> None:
-    cell = Cell(skill)
-    cell.run(1000)
-    other = (cell.joints[0] - 1.2, *cell.joints[1:])
-    seen = cell.run(200, {k: arm(other, stamp(1000 + k)) for k in range(0, 200, 5)}, every=0)
+    loop = Loop(SETTINGS, skill)
+    loop.run(1000, every=5)
+    other = (loop.joints[0] - 1.2, *loop.joints[1:])
+    seen = loop.run(200, {k: arm(other, stamp_ns(1000 + k)) for k in range(0, 200, 5)}, every=0)
     assert set(seen["reason"][:45].tolist()) == {Reason.NONE}
     assert set(seen["reason"][45:].tolist()) == {Reason.ARM_ERROR}
     assert not seen["commanded"][-1]
-    no_command_jumps(seen)
+    assert_limits_hold(seen)
 
 
 @pytest.mark.parametrize(("joint", "value"), [(0, 2.6 + 0.15), (3, -0.9 - 0.05), (5, 1.5707 + 1e-4)])
@@ -144,12 +97,11 @@ def test_an_arm_a_little_outside_its_limits_is_brought_back_and_then_followed(
 ) -> None:
     start = list(POSTURE)
     start[joint] = value
-    cell = Cell(skill, tuple(start))
-    seen = cell.run(1800)
+    loop = Loop(SETTINGS, skill, tuple(start))
+    seen = loop.run(1800, every=5)
     sent = seen[seen["commanded"] == 1]
     assert np.abs(sent["joints"][0] - start).max() < 1e-3
-    no_command_leaves(seen)
-    no_command_jumps(seen)
+    assert_limits_hold(seen)
     outside = ((sent["joints"] < LOWER) | (sent["joints"] > UPPER)).any(axis=1)
     assert set(sent["reason"][outside].tolist()) == {Reason.ARM_NOT_READY}
     assert np.abs(sent["joint_velocities"][outside]).max() < 0.11
@@ -158,33 +110,33 @@ def test_an_arm_a_little_outside_its_limits_is_brought_back_and_then_followed(
 
 
 def test_an_operators_hold_stops_the_way_back_and_lets_it_go_on(skill: Skill) -> None:
-    cell = Cell(skill, (2.75, *POSTURE[1:]))
-    cell.run(300)
-    held = cell.run(500, {0: order("hold")})
+    loop = Loop(SETTINGS, skill, (2.75, *POSTURE[1:]))
+    loop.run(300, every=5)
+    held = loop.run(500, {0: order("hold")}, every=5)
     assert np.abs(held["joint_velocities"][100:]).max() == 0.0
     assert held["joints"][-1, 0] > 2.6
-    seen = cell.run(1500, {0: order("resume")})
+    seen = loop.run(1500, {0: order("resume")}, every=5)
     assert seen["mode"][-1] == Mode.FOLLOW
-    no_command_leaves(np.array(cell.seen))
+    assert_limits_hold(loop.frames)
 
 
 @pytest.mark.parametrize("value", [2.81, -2.81, 6.0])
 def test_an_arm_far_outside_its_limits_is_never_commanded(skill: Skill, value: float) -> None:
-    cell = Cell(skill, (value, *POSTURE[1:]))
-    seen = cell.run(400)
+    loop = Loop(SETTINGS, skill, (value, *POSTURE[1:]))
+    seen = loop.run(400, every=5)
     assert not seen["commanded"].any()
     assert set(seen["reason"].tolist()) == {Reason.ARM_NOT_READY}
-    assert cell.rejected == {Cause.OUT_OF_RANGE: 80}
+    assert rejected(loop) == {Cause.OUT_OF_RANGE: 80}
 
 
 def test_an_arm_that_moves_is_not_ready_before_it_rests(skill: Skill) -> None:
-    cell = Cell(skill)
-    moving = {k: arm((POSTURE[0] + 0.001 * k, *POSTURE[1:]), stamp(k)) for k in range(0, 400, 5)}
-    assert not cell.run(400, moving, every=0)["commanded"].any()
-    cell.joints = (POSTURE[0] + 0.4, *POSTURE[1:])
-    seen = cell.run(200)
+    loop = Loop(SETTINGS, skill)
+    moving = {k: arm((POSTURE[0] + 0.001 * k, *POSTURE[1:]), stamp_ns(k)) for k in range(0, 400, 5)}
+    assert not loop.run(400, moving, every=0)["commanded"].any()
+    loop.joints = np.array((POSTURE[0] + 0.4, *POSTURE[1:]))
+    seen = loop.run(200, every=5)
     assert seen["commanded"][-1]
-    assert np.abs(seen["joints"][-1] - cell.joints).max() < 0.1
+    assert np.abs(seen["joints"][-1] - loop.joints).max() < 0.1
 
 
 STRANGERS = st.tuples(
@@ -203,15 +155,14 @@ def test_no_stranger_makes_a_command_jump(
     skill: Skill, stranger: tuple[int, int, int, list[float], int, int], resets: list[int], every: int
 ) -> None:
     period, phase, offset_ns, way, begin, count = stranger
-    cell = Cell(replace(skill, threshold=np.inf))
+    loop = Loop(SETTINGS, replace(skill, threshold=np.inf))
     other = tuple((np.clip(np.array(POSTURE) + way, LOWER - 0.1, UPPER + 0.1)).tolist())
     said: dict[int, Event] = {
-        k: arm(other, stamp(k) + offset_ns) for k in range(begin, begin + count) if k % period == phase % period
+        k: arm(other, stamp_ns(k) + offset_ns) for k in range(begin, begin + count) if k % period == phase % period
     }
-    cell.run(1600, said | {k: order("reset") for k in resets}, every=every)
-    seen = np.array(cell.seen)
-    no_command_jumps(seen)
-    no_command_leaves(seen)
+    loop.run(1600, said | {k: order("reset") for k in resets}, every=every)
+    seen = loop.frames
+    assert_limits_hold(seen)
     # what is adopted anew was told alone for a tenth of a second
     begins = np.flatnonzero(np.diff(seen["commanded"].astype(int)) == 1) + 1
     real = [k for k in range(1600) if k % every == 0]

@@ -22,42 +22,25 @@ from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import TOOL_FROM_HAND, Scene
 from sim.script import HandScript
-from support.in_process import ASSUMED, LEFT, RIGHT, arm, frames, hand, resting, ticks_of
+from support.in_process import (
+    ASSUMED,
+    LEFT,
+    RIGHT,
+    Loop,
+    arm,
+    assert_limits_hold,
+    frames,
+    hand,
+    led,
+    resting,
+    script_hands,
+    ticks_of,
+)
 from support.paths import RECORDINGS
-from support.wam import FRAME, URDF
+from support.wam import URDF
 
 PERIOD_S = 0.002
 POSTURE = Settings().arm.posture
-
-
-@pytest.fixture(scope="module")
-def taught(skill: Skill) -> Skill:
-    return adapted(skill, Scene().via_points(), tolerance=0.05)
-
-
-def limits_hold(seen: np.ndarray) -> None:
-    """Every number is finite and every joint within its limits, as commanded and by differences of
-    what was commanded.
-    """
-    limits = Settings().joints
-    for name in FRAME.names or ():
-        if FRAME[name].base.kind == "f":
-            assert np.isfinite(seen[name]).all(), name
-    sent = seen[seen["commanded"] == 1]
-    assert (sent["joints"] >= np.array(limits.lower)).all()
-    assert (sent["joints"] <= np.array(limits.upper)).all()
-    assert (np.abs(sent["joint_velocities"]) <= np.array(limits.velocity)).all()
-    assert (np.abs(sent["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
-    jerk = np.diff(sent["joint_accelerations"], axis=0) / PERIOD_S
-    assert (np.abs(jerk) <= np.array(limits.jerk) * (1 + 1e-6)).all()
-
-
-def no_jump(seen: np.ndarray) -> None:
-    """Consecutive commands are no farther apart than their velocities say."""
-    sent = seen[seen["commanded"] == 1]
-    way = np.diff(sent["joints"], axis=0)
-    mean = (sent["joint_velocities"][1:] + sent["joint_velocities"][:-1]) / 2
-    assert np.abs(way - mean * PERIOD_S).max() < 1e-6
 
 
 def modes(seen: np.ndarray) -> list[tuple[str, str]]:
@@ -69,8 +52,7 @@ def modes(seen: np.ndarray) -> list[tuple[str, str]]:
 def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Skill) -> None:
     script = HandScript(Scene(), seed=5)
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
-    limits_hold(seen)
-    no_jump(seen)
+    assert_limits_hold(seen)
     assert modes(seen[1:]) == [("follow", "none")]
     time_s = np.arange(len(seen)) * PERIOD_S - 1.5
     for (begin, end), goal in zip(script.scene.dwells, (None, script.scene.glass, script.scene.carry), strict=True):
@@ -141,8 +123,7 @@ def test_the_tool_goes_on_while_one_hand_is_out_of_sight_for_a_moment(
     away = range(3300, 3500)
     ticks = unseen(ticks[: away.stop + 500], away, f"hands/{side}")
     going, held = (frames(Controller(without(ms), taught, urdf=URDF), ticks) for ms in (500.0, 0.0))
-    limits_hold(going)
-    no_jump(going)
+    assert_limits_hold(going)
     assert modes(going[1:]) == [("follow", "none")]
     assert modes(held[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
     off, off_held = (
@@ -156,7 +137,7 @@ def test_it_waits_at_once_where_the_hand_that_is_not_seen_matters_much(
 ) -> None:
     ticks = unseen(moving[0][:2400], range(1700, 2400), "hands/left")
     seen = frames(Controller(without(1000.0), taught, urdf=URDF), ticks)
-    no_jump(seen)
+    assert_limits_hold(seen)
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand")]
     needed = np.flatnonzero(seen["reason"] == Reason.STALE_HAND)[-1] + 1 - np.sum(seen["reason"] == Reason.STALE_HAND)
     assert 1700 + 50 < needed < 1700 + 490
@@ -198,8 +179,7 @@ def test_hands_that_fall_silent_bring_a_hold_within_100_ms_and_comes_back_withou
     silent = range(1500, 1900)
     ticks = unseen(ticks_of(script), silent, "hands/left", "hands/right")
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
-    limits_hold(seen)
-    no_jump(seen)
+    assert_limits_hold(seen)
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
     held = np.flatnonzero(seen["mode"] == Mode.HOLD)
     assert held[1] - (silent.start - 5) <= 50 + 1
@@ -213,15 +193,10 @@ def test_without_hands_it_holds_and_says_so(taught: Skill) -> None:
 
 
 def test_hands_far_from_the_demonstrations_are_not_followed_until_they_are_clearly_nearer(taught: Skill) -> None:
-    def at(k: int) -> tuple[float, float, float]:
-        return (LEFT[0], LEFT[1], LEFT[2] + (0.5 if 400 <= k < 800 else 0.0))
-
-    ticks = [
-        Tick(k, (hand("left", at(k), k + 1), hand("right", RIGHT, k + 1)) if k % 5 == 0 else ()) for k in range(1600)
-    ]
-    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
-    limits_hold(seen)
-    no_jump(seen)
+    hands = np.tile((LEFT, RIGHT), (1600, 1, 1))
+    hands[400:800, 0, 2] += 0.5
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), led(hands))
+    assert_limits_hold(seen)
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
 
 
@@ -231,7 +206,7 @@ def test_an_operator_holds_and_resumes(taught: Skill) -> None:
         Controller(ASSUMED, taught, urdf=URDF), resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ())
     )
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
-    no_jump(seen)
+    assert_limits_hold(seen)
 
 
 def test_nothing_is_commanded_before_the_arm_has_told_where_it_is(taught: Skill) -> None:
@@ -247,65 +222,50 @@ def test_nothing_is_commanded_before_the_arm_has_told_where_it_is(taught: Skill)
     assert np.abs(after["joints"][0] - start).max() < 1e-3
 
 
-def follow(controller: Controller, first: int, count: int, *, offset: float = 0.0, speed: float = 0.0) -> np.ndarray:
-    """Frames with an arm that does as it was told the tick before, or is off by an offset, or moves
-    at a speed.
-    """
-    out = []
-    joints = tuple(controller.state["joints"][0].tolist())
-    for tick in resting(first, count):
-        measured = tuple(q + offset for q in joints)
-        event = arm(measured, tick.index + 1, (speed,) * 7)
-        frame = controller.step(Tick(tick.index, (*tick.inbox, event)))
-        joints = tuple(frame["joints"].tolist())
-        out.append(frame)
-    return np.array(out)
+@pytest.fixture
+def loop(taught: Skill) -> Loop:
+    """A loop whose arm has followed for 300 ticks."""
+    loop = Loop(Settings(), taught)
+    assert modes(loop.run(300))[-1] == ("follow", "none")
+    return loop
 
 
-def test_an_arm_that_does_not_follow_is_a_fault_until_reset(taught: Skill) -> None:
-    controller = Controller(Settings(), taught, urdf=URDF)
-    assert modes(follow(controller, 0, 300))[-1] == ("follow", "none")
-    seen = follow(controller, 300, 400, offset=0.15)
+def test_an_arm_that_does_not_follow_is_a_fault_until_reset(loop: Loop) -> None:
+    loop.reports = lambda q, dq: (q + 0.15, dq)
+    seen = loop.run(400)
     assert modes(seen) == [("fault", "arm_error")]
     assert not seen["commanded"][-1]
-    limits_hold(seen)
-    controller.step(Tick(700, (order("reset"),)))
-    assert modes(follow(controller, 701, 100))[-1] == ("follow", "none")
+    assert_limits_hold(seen)
+    loop.reports = lambda q, dq: (q, 0.0 * dq)
+    assert modes(loop.run(100, {0: order("reset")}))[-1] == ("follow", "none")
 
 
-def test_an_arm_that_falls_silent_while_followed_is_a_fault(taught: Skill) -> None:
-    controller = Controller(Settings(), taught, urdf=URDF)
-    follow(controller, 0, 300)
-    seen = frames(controller, resting(300, 300))
+def test_an_arm_that_falls_silent_while_followed_is_a_fault(loop: Loop) -> None:
+    seen = loop.run(300, every=0)
     assert modes(seen) == [("follow", "none"), ("fault", "arm_silent")]
     assert np.argmax(seen["mode"] == Mode.FAULT) <= 50
 
 
-def test_a_tool_measured_too_fast_is_a_fault(taught: Skill) -> None:
-    controller = Controller(Settings(), taught, urdf=URDF)
-    follow(controller, 0, 300)
-    assert modes(follow(controller, 300, 10, speed=2.0))[-1] == ("follow", "none")
-    assert modes(follow(controller, 310, 1))[-1] == ("follow", "none")
-    assert modes(follow(controller, 311, 20, speed=2.0))[-1] == ("fault", "tool_speed")
+def test_a_tool_measured_too_fast_is_a_fault(loop: Loop) -> None:
+    loop.reports = lambda q, dq: (q, 0.0 * dq + 2.0)
+    assert modes(loop.run(10))[-1] == ("follow", "none")
+    loop.reports = lambda q, dq: (q, 0.0 * dq)
+    assert modes(loop.run(1))[-1] == ("follow", "none")
+    loop.reports = lambda q, dq: (q, 0.0 * dq + 2.0)
+    assert modes(loop.run(20))[-1] == ("fault", "tool_speed")
 
 
 def test_a_reset_while_the_arm_still_moves_lets_it_come_to_rest_first(taught: Skill) -> None:
-    controller = Controller(Settings(), taught, urdf=URDF)
-    out: list[np.ndarray] = []
-    joints, was_fault = POSTURE, False
-    for tick in list(ticks_of(HandScript(Scene(), seed=11), wait_s=0.5))[:3000]:
-        lies = 1400 <= tick.index < 1420
-        inbox = [*tick.inbox, arm(joints, tick.index + 1, (9.0,) * 7 if lies else (0.0,) * 7)]
-        if was_fault and tick.index % 7 == 0:
-            inbox.append(order("reset"))
-        frame = controller.step(Tick(tick.index, tuple(inbox)))
+    loop, was_fault = Loop(Settings(), taught), False
+    loop.hands = script_hands(HandScript(Scene(), seed=11), wait_s=0.5)
+    for k in range(3000):
+        velocity = 9.0 if 1400 <= k < 1420 else 0.0
+        loop.reports = lambda q, dq, velocity=velocity: (q, 0.0 * dq + velocity)
+        frame = loop.step(*([order("reset")] if was_fault and k % 7 == 0 else []))
         was_fault = frame["mode"] == Mode.FAULT
-        joints = tuple(frame["joints"].tolist())
-        out.append(frame)
-    seen = np.array(out)
+    seen = loop.frames
     assert [reason for _, reason in modes(seen)][-3:] == ["tool_speed", "arm_not_ready", "none"]
-    limits_hold(seen)
-    no_jump(seen)
+    assert_limits_hold(seen)
 
 
 def test_reset_without_a_fault_changes_nothing(taught: Skill) -> None:
@@ -322,26 +282,16 @@ def test_a_new_skill_is_adopted_at_its_tick_and_approached_within_the_limits(ski
     seen = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
     assert controller.skill is moved
     assert controller.state["skill"].tobytes() == moved.digest
-    limits_hold(seen)
-    no_jump(seen)
+    assert_limits_hold(seen)
 
 
 def test_jumping_and_noisy_hands_never_make_a_command_outside_the_limits_nor_a_fault(taught: Skill) -> None:
     random = np.random.default_rng(3)
-    places = np.array([LEFT, (0.62, -0.28, 0.3), (0.75, 0.0, 0.06)])
-    ticks = []
-    for k in range(3000):
-        inbox = []
-        if k % 3 == 0:
-            left = places[(k // 400) % 3] + random.normal(0, 0.01, 3)
-            inbox = [
-                hand("left", tuple(left.tolist()), k + 1),
-                hand("right", tuple((np.array(RIGHT) + random.normal(0, 0.01, 3)).tolist()), k + 1),
-            ]
-        ticks.append(Tick(k, tuple(inbox)))
-    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
-    limits_hold(seen)
-    no_jump(seen)
+    hands = np.tile((LEFT, RIGHT), (3000, 1, 1))
+    hands[:, 0] = np.array([LEFT, (0.62, -0.28, 0.3), (0.75, 0.0, 0.06)])[np.arange(3000) // 400 % 3]
+    hands += random.normal(0, 0.01, hands.shape)
+    seen = frames(Controller(ASSUMED, taught, urdf=URDF), led(hands, every=3))
+    assert_limits_hold(seen)
     assert (seen["mode"] != Mode.FAULT).all()
     assert (seen["flags"] & Flag.SPEED_LIMITED).any()
 
@@ -363,8 +313,7 @@ def test_missed_ticks_move_the_arm_by_one_period(taught: Skill) -> None:
         for t in list(ticks_of(HandScript(Scene(), seed=9)))[:3000]
     ]
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks)
-    limits_hold(seen)
-    no_jump(seen)
+    assert_limits_hold(seen)
 
 
 def test_ticks_must_grow(taught: Skill) -> None:

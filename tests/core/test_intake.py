@@ -12,6 +12,7 @@ import pytest
 from service.contract.messages import PoseStamped
 from service.contract.records import Cause
 from service.core.geometry import rotation
+from service.core.intake.far_away import too_far
 from service.settings.config import HandSettings
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
@@ -302,3 +303,17 @@ def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with
     assert not hands.heard()
     hands.arm(5)
     assert hands.heard()
+
+
+# --- positions that are too far away: the unit that was meant ---
+
+
+@pytest.mark.parametrize(
+    ("position", "unit"), [((98.0, -32.0, 6.0), "cm"), ((980.0, -320.0, 60.0), "mm"), ((40.0, 30.0, 20.0), "cm")]
+)
+def test_the_unit_that_fits_best_is_named(position: tuple[float, ...], unit: str) -> None:
+    assert f"which looks like {unit};" in too_far(position, "m")
+
+
+def test_no_unit_is_named_where_none_fits() -> None:
+    assert "looks like" not in too_far((1e6, 0.0, 0.0), "m")

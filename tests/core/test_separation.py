@@ -29,13 +29,12 @@ from service.core.separation.step import allowed_speed
 from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS
 from service.core.skill.skill import Skill
 from service.files.shipped import shipped_skill
-from service.learning.via_points import adapted
 from service.settings.config import Box, Obstacles, Settings, TableTop, robot_description
 from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
 from support.arms import MODELS, cell_of
-from support.in_process import ASSUMED, LEFT, RIGHT, frames, hand
+from support.in_process import ASSUMED, LEFT, RIGHT, frames, seen
 from support.wam import STATE, URDF
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
@@ -178,11 +177,6 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     return distance, speed, own, table
 
 
-@pytest.fixture(scope="module")
-def taught(skill: Skill) -> Skill:
-    return adapted(skill, Scene().via_points(), tolerance=0.05)
-
-
 def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5) -> Iterator[tuple[Tick, Vector]]:
     """Hands of the nominal scene from its handover on, the right of which is at a place from a time
     on, within a tenth of a second.
@@ -193,8 +187,7 @@ def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5)
         motions = script.truth(t)
         share = min(max((t - at_s) / 0.1, 0.0), 1.0)
         hands = np.array([motions.left.position, (1 - share) * motions.right.position + share * np.array(place)])
-        inbox = [hand(side, tuple(at.tolist()), k + 1) for side, at in zip(("left", "right"), hands, strict=True)]
-        yield Tick(k, tuple(inbox) if k % 5 == 0 else ()), hands
+        yield Tick(k, seen(hands, k) if k % 5 == 0 else ()), hands
 
 
 @pytest.mark.parametrize("arm", ARMS)

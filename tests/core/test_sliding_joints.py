@@ -12,19 +12,14 @@ import pytest
 
 from service.contract.records import Cause, Mode, Reason
 from service.core.arm.stage import Arm
-from service.core.controller import Controller
-from service.core.frame import Tick
 from service.core.geometry import place
 from service.core.separation.body import body_of
 from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
-from service.files.recording import Recorder
-from service.files.replay import replay
 from service.settings.config import Settings, robot_description
-from sim.closed_loop import hand_event, joints_event
 from sim.scene import Scene
 from sim.script import HandScript
-from support.in_process import LEFT, RIGHT
+from support.in_process import Loop, assert_limits_hold, assert_replays, script_hands
 from support.turning import ARMS, BEYOND, cell_in, sliding_cell
 
 
@@ -79,57 +74,23 @@ def test_separation_s_rows_are_the_speed_of_the_nearest_points(cell: Settings) -
             assert abs(after - before) <= step_s * separation.max_speed
 
 
-def session(cell: Settings, skill: Skill, path: Path | None = None, *, ticks: int = 3500) -> np.ndarray:
-    """The frames of a session with hands that move, and an arm that is where it was commanded."""
-    controller = Controller(cell, skill, urdf=robot_description(cell))
-    script, frames = HandScript(Scene(), seed=3), []
-    joints, speed = cell.arm.posture, (0.0,) * 7
-    recorder = path and Recorder(path, settings=cell, skill=skill.file, state=controller.state)
-    for k in range(ticks):
-        stamp_ns, inbox = (k + 1) * 2_000_000, []
-        if k % 5 == 0:
-            poses = [tuple(pose[:3].tolist()) for pose in script.sample(max(0.0, k * 0.002 - 1.5))]
-            inbox = [hand_event(side, pose, stamp_ns) for side, pose in zip(("left", "right"), poses, strict=True)]
-        tick = Tick(k, (*inbox, joints_event(cell.joints.names, joints, speed, stamp_ns)))
-        frame = controller.step(tick)
-        if recorder:
-            recorder.write(tick, frame, time_ns=stamp_ns)
-        if frame["commanded"]:
-            joints, speed = tuple(frame["joints"].tolist()), tuple(frame["joint_velocities"].tolist())
-        frames.append(frame)
-    if recorder:
-        recorder.close()
-    return np.array(frames)
-
-
 def test_it_follows_with_every_limit_held_and_replays(cell: Settings, skill: Skill, tmp_path: Path) -> None:
-    seen = session(cell, skill, tmp_path / "a.mcap")
+    loop = Loop(cell, skill)
+    loop.hands = script_hands(HandScript(Scene(), seed=3))
+    seen = loop.run(3500)
     assert (seen["mode"][1000:] == Mode.FOLLOW).all()
-    limits, sent = cell.joints, seen[seen["commanded"] != 0]
-    assert np.ptp(sent["joints"], axis=0)[0] > 0.05, "the rail is not used"
-    assert (sent["joints"] >= limits.lower).all()
-    assert (sent["joints"] <= limits.upper).all()
-    assert (np.abs(sent["joint_velocities"]) <= limits.velocity).all()
-    assert (np.abs(sent["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
-    jerk = np.abs(np.diff(sent["joint_accelerations"], axis=0)) / cell.period_s
-    assert (jerk <= np.array(limits.jerk) * (1 + 1e-6)).all()
+    assert np.ptp(seen["joints"][seen["commanded"] != 0], axis=0)[0] > 0.05, "the rail is not used"
+    assert_limits_hold(seen, cell)
     off_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)[1000:]
     assert np.sqrt(np.mean(off_mm**2)) < 1.0, off_mm.max()
-    assert replay(tmp_path / "a.mcap").text() == "3500 ticks, 3500 frames identical"
+    assert_replays(tmp_path / "a.mcap", cell, skill, loop.steps)
 
 
 @pytest.mark.parametrize(("off_m", "reason"), [(0.04, Reason.NONE), (0.06, Reason.ARM_ERROR)])
 def test_a_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, off_m: float, reason: Reason) -> None:
-    controller, names = Controller(cell, skill, urdf=robot_description(cell)), cell.joints.names
-    joints = cell.arm.posture
-    for k in range(300):
-        stamp_ns = (k + 1) * 2_000_000
-        pushed = (joints[0] + off_m * max(0, k - 200) / 100, *joints[1:])
-        hands = (hand_event("left", LEFT, stamp_ns), hand_event("right", RIGHT, stamp_ns)) if k % 5 == 0 else ()
-        frame = controller.step(Tick(k, (*hands, joints_event(names, pushed, (0.0,) * 7, stamp_ns))))
-        if frame["commanded"]:
-            joints = tuple(frame["joints"].tolist())
-    assert int(frame["reason"]) == reason
+    loop, rail = Loop(cell, skill), np.eye(7)[0]
+    loop.reports = lambda q, dq: (q + off_m * max(0, loop.index - 200) / 100 * rail, 0.0 * dq)
+    assert int(loop.run(300)["reason"][-1]) == reason
 
 
 @pytest.mark.parametrize(
@@ -138,19 +99,18 @@ def test_a_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, of
 def test_a_rail_outside_its_limits_is_brought_back_or_refused(
     cell: Settings, skill: Skill, rail_m: float, cause: Cause | None
 ) -> None:
-    controller, names = Controller(cell, skill, urdf=robot_description(cell)), cell.joints.names
-    joints, fastest = (rail_m, *cell.arm.posture[1:]), 0.0
-    for k in range(1500):
-        frame = controller.step(Tick(k, (joints_event(names, joints, (0.0,) * 7, (k + 1) * 2_000_000),)))
-        if frame["commanded"]:
-            joints = tuple(frame["joints"].tolist())
-            fastest = max(fastest, float(np.abs(frame["joint_velocities"]).max()))
+    loop = Loop(cell, skill, (rail_m, *cell.arm.posture[1:]))
+    loop.hands = lambda k: np.full((2, 3), 9.0)  # out of range: nothing is followed
+    loop.reports = lambda q, dq: (q, 0.0 * dq)
+    seen = loop.run(1500)
+    rejected = [int(seen["rejected"][-1][one]) for one in Cause if one != Cause.OUT_OF_RANGE]
+    assert not any(rejected)
     if cause is None:
-        assert not frame["rejected"].any()
-        assert joints[0] <= 0.3
-        assert fastest <= 0.06
+        assert loop.joints[0] <= 0.3
+        assert np.abs(seen["joint_velocities"][seen["commanded"] != 0]).max() <= 0.06
     else:
-        assert int(frame["rejected"][cause]) == 1500
+        assert not seen["commanded"].any()
+        assert int(seen["rejected"][-1][cause]) >= 1500
 
 
 def test_joints_beyond_the_plate_change_nothing(tmp_path: Path) -> None:

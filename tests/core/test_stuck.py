@@ -23,24 +23,15 @@ from service.core.frame import Event, Frame, Tick, Vector, order
 from service.core.separation.stage import Separation
 from service.core.skill.skill import Skill
 from service.core.way_out import WayOut
-from service.files.recording import Recorder
-from service.files.replay import replay
-from service.learning.via_points import adapted
 from service.settings.config import Settings, robot_description
-from sim.scene import Scene
 from support.arms import cell_of
-from support.in_process import ASSUMED, LEFT, RIGHT, arm, hand
+from support.in_process import ASSUMED, Loop, assert_limits_hold, assert_replays, seen
 from support.starts import free_postures
 from support.wam import URDF
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "4"))
 SOUGHT_S, AGAIN_S = 0.3, 2.0  # that a search takes, and until the next one
 THERE_M = 0.02
-
-
-@pytest.fixture(scope="module")
-def taught(skill: Skill) -> Skill:
-    return adapted(skill, Scene().via_points(), tolerance=0.05)
 
 
 class Run(NamedTuple):
@@ -68,8 +59,7 @@ def session(
     coming: dict[int, Event] = {}
     asked, every = -round(AGAIN_S / dt), max(1, round(0.02 / dt))
     for k in range(1, round(seconds / dt)):
-        seen = [hand(side, tuple(p.tolist()), k) for side, p in zip(("left", "right"), hands, strict=True)]
-        inbox = (*(seen if k % every == 1 else ()), *([coming.pop(k)] if k in coming else ()))
+        inbox = (*(seen(hands, k) if k % every == 1 else ()), *([coming.pop(k)] if k in coming else ()))
         frame = controller.step(Tick(k, inbox))
         steps.append((Tick(k, inbox), frame))
         now = controller.state
@@ -124,19 +114,12 @@ def test_where_it_is_stuck_that_is_said_within_a_second_and_a_way_out_is_gone(
     assert ran.there_s is not None
     assert 2 <= len(ran.ways[0]) <= WAY
     assert (frames["mode"][frames["reason"] == Reason.BLOCKED] == Mode.HOLD).all()
-    limits = cell.joints
-    assert (np.abs(frames["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
-    assert (frames["joints"] >= limits.lower).all()
-    assert (frames["joints"] <= limits.upper).all()
+    assert_limits_hold(frames, cell)
     separation = Separation(cell, URDF)
     assert min(separation.clearance(q.copy(), hands)[0] for q in frames["joints"][::5]) > -0.002
-    path = tmp_path / "stuck.mcap"
     state = start_state(cell, taught)
     state["joints"][0] = start
-    with Recorder(path, settings=cell, skill=taught.file, state=state) as recorder:  # type: ignore[attr-defined]
-        for tick, frame in ran.steps:
-            recorder.write(tick, frame, time_ns=tick.index * 4_000_000)
-    assert replay(path).text() == f"{len(frames)} ticks, {len(frames)} frames identical"
+    assert_replays(tmp_path / "stuck.mcap", cell, taught, ran.steps, state)
 
 
 def test_where_no_way_is_found_it_holds_until_the_target_is_another_one(
@@ -155,8 +138,9 @@ def test_a_way_that_begins_elsewhere_is_not_gone(taught: Skill, stuck: tuple[Set
     state["joints"][0] = start
     controller, far = Controller(cell, taught, state, urdf=URDF), json.dumps([(start + 0.5).tolist(), start.tolist()])
     for k in range(1, 2000):
-        seen = [hand(side, tuple(p.tolist()), k) for side, p in zip(("left", "right"), hands, strict=True)]
-        controller.step(Tick(k, (*(seen if k % 5 == 1 else ()), *([order("way", far)] if k % 100 == 0 else ()))))
+        controller.step(
+            Tick(k, (*(seen(hands, k) if k % 5 == 1 else ()), *([order("way", far)] if k % 100 == 0 else ())))
+        )
         assert not controller.state["way_count"]
 
 
@@ -169,20 +153,15 @@ def test_an_arm_that_stands_in_the_table_is_not_ready_until_it_is_out(skill: Ski
         depth, _, thing = separation.intrusion(q)
         if thing == 0 and 0.02 < depth < 0.1 and kinematics.at(q).position[0] > 0.3:
             break
-    controller = Controller(cell, skill, urdf=URDF)
-    seen, at = [], q
-    for k in range(1, 6000):
-        inbox = [hand("left", LEFT, k), hand("right", RIGHT, k)] if k % 5 == 0 else []
-        frame = controller.step(Tick(k, (*inbox, *([order("reset")] if k == 600 else ()), arm(tuple(at.tolist()), k))))
-        at = frame["joints"].copy() if frame["commanded"] else at
-        seen.append(frame)
-        if k < 600:
-            assert not frame["commanded"], "it moves before that was confirmed"
-            assert frame["reason"] in (Reason.ARM_NOT_READY, Reason.NO_HANDS)
-        if frame["mode"] == Mode.FOLLOW:
-            break
-    frames = np.array(seen)
-    assert frames["mode"][-1] == Mode.FOLLOW
-    assert separation.intrusion(at)[0] < 0.011
-    leaving = frames[600:-1]
+    loop = Loop(cell, skill, q)
+    loop.reports = lambda q, dq: (q, 0.0 * dq)
+    confirming = loop.run(600)
+    assert not confirming["commanded"].any(), "it moves before that was confirmed"
+    assert np.isin(confirming["reason"], (Reason.ARM_NOT_READY, Reason.NO_HANDS)).all()
+    frame = loop.step(order("reset"))
+    while frame["mode"] != Mode.FOLLOW:
+        assert loop.index < 6000
+        frame = loop.step()
+    assert separation.intrusion(loop.joints)[0] < 0.011
+    leaving = loop.frames[600:-1]
     assert np.linalg.norm(np.diff(leaving["tool"], axis=0), axis=1).max() / cell.period_s < 0.15

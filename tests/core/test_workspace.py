@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.contract.records import Mode
-from service.core.controller import Controller
 from service.core.frame import Vector
-from service.core.skill.skill import Skill, clamp, is_reachable
-from service.settings.config import Reach, robot_description
-from support.arms import cell_of
-from support.in_process import LEFT, RIGHT, frames, resting
+from service.core.skill.skill import clamp, is_reachable
+from service.settings.config import Reach
 
 REACH = Reach()
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -76,23 +70,3 @@ def test_what_is_inside_passes_unchanged() -> None:
     target = clamp(position, position, position, box=EVERYWHERE, reach=REACH)
     assert not target.clamped
     assert all(part.tolist() == position.tolist() for part in target[:3])
-
-
-@pytest.mark.parametrize("name", ["wam", "panda", "ur5"])
-@pytest.mark.parametrize("rate_hz", [250, 500, 1000])
-def test_the_arm_rests_at_a_target_on_a_side_of_the_workspace(name: str, rate_hz: int, skill: Skill) -> None:
-    """The box is drawn so that the target of resting hands lies beyond one, two or three sides."""
-    random = np.random.default_rng(rate_hz + len(name))
-    settings = msgspec.structs.replace(cell_of(name), rate_hz=rate_hz)
-    hands = np.array([[LEFT, np.zeros(3), np.zeros(3)], [RIGHT, np.zeros(3), np.zeros(3)]])
-    target = skill.predict(hands[:, 0], hands[:, 1], hands[:, 2]).position
-    box = np.stack([target - random.uniform(0.05, 0.2, 3), target + random.uniform(0.05, 0.2, 3)])
-    for axis in random.choice(3, random.integers(1, 4), replace=False):
-        side = random.integers(2)
-        box[side, axis] = target[axis] + (1 - 2 * side) * random.choice([0.0, 0.01, 0.03])
-    confined = replace(skill, workspace=box, threshold=math.inf)
-    controller = Controller(settings, confined, urdf=robot_description(settings))
-    got = frames(controller, resting(0, 6 * rate_hz, every=max(1, rate_hz // 100)))[-rate_hz // 2 :]
-    assert (got["mode"] == Mode.FOLLOW).all()
-    assert np.sqrt((got["joint_accelerations"] ** 2).mean()) <= 0.02
-    assert np.ptp(got["tool"], axis=0).max() <= 1e-5

@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,12 +21,12 @@ from service.client import Client, Tracker, UnreachableError, cells, endpoints, 
 from service.contract import cdr, channels, requests, ros2, ros2msg
 from service.contract.messages import PoseStamped
 from service.core.frame import definitions
+from support.cell import LEFT, RIGHT, until
 from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.wam import JOINT_NAMES
 
 NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
-LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
 
 
 class Lab(NamedTuple):
@@ -57,15 +57,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         finally:
             process.kill()
             process.communicate()
-
-
-def until(what: Callable[[], Any], within_s: float = 15.0) -> Any:
-    """What a call returns, once that is true."""
-    end = time.monotonic() + within_s
-    while not (found := what()):
-        assert time.monotonic() < end, "it did not come to hold"
-        time.sleep(0.05)
-    return found
 
 
 def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(

@@ -4,6 +4,7 @@ its topic carries, and what is missing is named.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -35,6 +36,28 @@ def state(*names: str, velocity: tuple[float, ...] | None = None, **others: floa
     return JointState(time.time_ns(), tuple(named), tuple(named.values()), given, unmeasured)
 
 
+@contextlib.contextmanager
+def published(daemon: Daemon, messages: Callable[[int], list[JointState]]) -> Iterator[None]:
+    """Within it messages are published every 4 ms, given how often that was."""
+    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
+
+    def publish() -> None:
+        k = 0
+        while not ended.wait(0.004):
+            for message in messages(k):
+                publisher.put(cdr.encode_joints(message))
+            k += 1
+
+    publishing = threading.Thread(target=publish)
+    publishing.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        publishing.join()
+        publisher.undeclare()
+
+
 CASES: dict[str, Callable[[int], list[JointState]]] = {
     "positions only": lambda k: [state(*JOINTS)],
     "fewer velocities than joints": lambda k: [state(*JOINTS, velocity=(0.0,) * 7, left_finger=0.1, right_finger=NAN)],
@@ -47,25 +70,10 @@ CASES: dict[str, Callable[[int], list[JointState]]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_arm_is_found_whatever_else_its_topic_carries(daemon: Daemon, case: str) -> None:
-    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
     daemon.until(lambda now: now["reason"] == "arm_not_ready")
     before = daemon.client.status().rejected
-
-    def publish() -> None:
-        k = 0
-        while not ended.wait(0.004):
-            for message in CASES[case](k):
-                publisher.put(cdr.encode_joints(message))
-            k += 1
-
-    with_publisher = threading.Thread(target=publish)
-    with_publisher.start()
-    try:
+    with published(daemon, CASES[case]):
         found = daemon.until(lambda now: now["reason"] == "no_hands")
-    finally:
-        ended.set()
-        with_publisher.join()
-        publisher.undeclare()
     lost = {cause: n - before.get(cause, 0) for cause, n in found["rejected"].items()}
     assert not any(lost.values()), lost
 
@@ -85,17 +93,6 @@ def test_a_part_of_the_arm_that_nobody_publishes_is_named(daemon: Daemon) -> Non
 
 
 def test_doctor_names_the_number_that_was_wrong(daemon: Daemon) -> None:
-    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
-
-    def publish() -> None:
-        while not ended.wait(0.004):
-            publisher.put(cdr.encode_joints(state(*JOINTS, velocity=(0.0,) * 6 + (math.inf,))))
-
-    with_publisher = threading.Thread(target=publish)
-    with_publisher.start()
-    try:
+    with published(daemon, lambda k: [state(*JOINTS, velocity=(0.0,) * 6 + (math.inf,))]):
         said = told("doctor", "--connect", daemon.endpoint, "--seconds", "1").stdout
-    finally:
-        ended.set()
-        with_publisher.join()
     assert f"rejected as not_finite: {JOINTS[6]} at inf rad/s; a finite number needed" in said

@@ -11,7 +11,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -25,7 +25,7 @@ from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.launch import launched
 from service.daemon.single_instance import NETWORK_BOUNDS
-from support.cell import LEFT, Tracker, thirdhand, told
+from support.cell import LEFT, Tracker, thirdhand, told, until
 
 CELL = "bench"
 INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", "objects")
@@ -102,15 +102,6 @@ def guarded(secrets: Path) -> Iterator[Guarded]:
     daemon.close()
 
 
-def within(what: Callable[[], bool]) -> bool:
-    end = time.monotonic() + 10
-    while not what():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
-
-
 @pytest.mark.parametrize("name", ROLES)
 def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path, name: str) -> None:
     role = ROLES[name]
@@ -139,7 +130,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         false_token = session.liveliness().declare_token(channels.presence(CELL, "f00"))
         false_answers = [session.declare_queryable(full[key], lambda query: query.drop()) for key in REQUESTS]
         seen = [observer.declare_subscriber(key, observe) for key in keys(OUTPUTS)]
-        assert within(lambda: Client(operator, CELL, timeout_s=1.0).ask("status") == {})
+        until(lambda: Client(operator, CELL, timeout_s=1.0).ask("status") == {})
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
             for key in streams:  # every input, and every output in the daemon's place
@@ -149,7 +140,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
             guarded.publish()
             time.sleep(0.05)
         own = {str(guarded.session.zid())}
-        assert within(lambda: living(session, CELL) == own | {"f00"})  # its own words it hears too
+        until(lambda: living(session, CELL) == own | {"f00"})  # its own words it hears too
         assert living(observer, CELL) == (own | {"f00"} if name == ROUTER else own)
         listed = session.liveliness().get(ros2.all_tokens(DOMAIN), timeout=5.0)
         assert len({str(reply.ok.key_expr) for reply in listed if reply.ok}) == 1 + len(TOPICS)
@@ -195,7 +186,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
             f"{CELL}/**", lambda s: said.setdefault(str(s.key_expr), set()).add(bytes(s.payload))
         )
         closing.callback(taken.undeclare)
-        assert within(lambda: Client(sessions["operator"], CELL, timeout_s=1.0).ask("status") == {})
+        until(lambda: Client(sessions["operator"], CELL, timeout_s=1.0).ask("status") == {})
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
             for name, session in sessions.items():
@@ -336,7 +327,7 @@ def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path
         ):
             client = Client(operating)
             client.ask("resume")
-            assert within(lambda: client.status().mode == "follow")
+            until(lambda: client.status().mode == "follow")
             operating.put("thirdhand/hands/left", cdr.encode_pose(PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))))
         assert service.stop() == 0
     written = [path for path in (tmp_path / "records").rglob("*") if path.is_file()]

@@ -16,10 +16,10 @@ from zenoh_ros2_sdk.session import ZenohSession
 from service.client import endpoints, open_session
 from service.contract import ros2, ros2msg
 from service.settings.config import Settings
-from support.cell import Tracker, serving
+from support.cell import Tracker, serving, until
 from support.wam import JOINT_NAMES
 
-DOMAIN, RATE_HZ, SECONDS = 11, 250, 20.0
+DOMAIN, RATE_HZ = 11, 250
 FORWARD, TRAJECTORY, STATES = "/arm/forward/commands", "/arm/jtc/joint_trajectory", "/arm/joint_states"
 CONFIGURATION = f"""
 rate_hz = {RATE_HZ}
@@ -53,13 +53,6 @@ DEFINITIONS = {  # of what this project says and never reads
         + "\nMSG: builtin_interfaces/Duration\nint32 sec\nuint32 nanosec\n"
     ),
 }  # fmt: skip
-
-
-def until(happens: Any, what: str) -> None:
-    end = time.monotonic() + SECONDS
-    while not happens():
-        assert time.monotonic() < end, what
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize("ends", ["stop", "failure"])

@@ -5,7 +5,7 @@ diagnostics, on the topics that the settings name.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,10 @@ from service.daemon.ros2_domain import Ros2Domain
 from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.shipped import cell_of
 from service.settings.config import Settings, parse, robot_description
-from support.cell import Tracker, serving, told
+from support.cell import Tracker, serving, told, until
 from support.wam import JOINT_NAMES
 
-DOMAIN, SECONDS = 12, 20.0
+DOMAIN = 12
 VIEWED = """
 [ros2]
 tf = "/tf"
@@ -51,13 +51,6 @@ state = "{{state}}"
 """
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 POSTURE = np.array(Settings().arm.posture) + 0.05
-
-
-def until(happens: Callable[[], Any], what: str) -> None:
-    end = time.monotonic() + SECONDS
-    while not happens():
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
 
 
 def key(topic: str) -> str:

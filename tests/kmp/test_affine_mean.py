@@ -1,7 +1,5 @@
 """A prior mean that goes with the input: the same as learning what is left of it, on every path."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from kmp import (
     LinearConstraints,
     PeriodicKernel,
     VelocityKernel,
-    named_arrays,
 )
 from kmp.functionals import Functionals
 from kmp.solution import mean_of
@@ -102,19 +99,13 @@ def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
-def test_it_is_stored_pickled_and_refitted_with_the_primitive(representation):
+def test_it_is_refitted_with_the_primitive(representation):
     prior, one, _ = both("one length", representation, "adapted")
-    queries = one.inputs[:7] + 0.1
-    for other in (
-        named_arrays.from_arrays(named_arrays.to_arrays(one)),
-        pickle.loads(pickle.dumps(one)),
-        one.refitted(one.base.reference),
-    ):
-        assert np.array_equal(other.mean(queries), one.mean(queries))
-        assert np.array_equal(other.prior_mean.matrix, prior.matrix)
-        assert np.array_equal(other.prior_mean.offset, prior.offset)
-        with pytest.raises(ValueError, match="read-only"):
-            other.prior_mean.matrix[0, 0] = 1.0
+    other = one.refitted(one.base.reference)
+    assert np.array_equal(other.mean(one.inputs[:7] + 0.1), one.mean(one.inputs[:7] + 0.1))
+    assert np.array_equal(other.prior_mean.matrix, prior.matrix)
+    with pytest.raises(ValueError, match="read-only"):
+        other.prior_mean.matrix[0, 0] = 1.0
 
 
 def test_far_from_the_data_it_extrapolates_and_is_as_unsure_as_any():
@@ -140,8 +131,6 @@ def test_one_that_does_not_go_with_the_kernel_is_refused(kernel, prior, says):
         KMP.fit(np.arange(3.0)[:, None], reference, kernel=kernel, lambda_mean=1.0, prior_mean=prior)
 
 
-def test_one_is_made_of_finite_numbers_that_go_together():
+def test_matrix_and_offset_have_as_many_outputs():
     with pytest.raises(ValueError, match=r"matrix of shape \(2, 2\) and offset of shape \(1,\) given"):
         AffineMean(np.eye(2), [0.0])
-    with pytest.raises(ValueError, match="must be finite"):
-        AffineMean([[np.nan]], [0.0])

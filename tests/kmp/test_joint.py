@@ -113,19 +113,8 @@ def test_a_rhythmic_skill_has_no_seam(representation):
     np.testing.assert_allclose(via.mean([[2 * np.pi - 0.02]]), [[0.2, 0.9]], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: fitted().predict_joint(np.empty((0, 1))), "queries: none given, at least 1 needed"),
-        (lambda: fitted().sample(QUERIES, 0, seed=0), "count is 0, and must be at least 1"),
-        (lambda: fitted().jacobians([0.0]), r"queries: shape \(1,\) given, \(M, 1\) needed"),
-        (lambda: PeriodicKernel(1.0, 0.0), "period is 0, and must be finite and above 0"),
-        (
-            lambda: KMP.fit([[0, 0]], Gaussians([[0]], [[[1]]]), kernel=PeriodicKernel(1.0, 1.0), lambda_mean=1),
-            "2 inputs given; a periodic kernel needs 1",
-        ),
-    ],
-)
-def test_what_cannot_be_done_is_refused_with_what_could(call, says):
-    with pytest.raises(ValueError, match=says):
-        call()
+def test_what_cannot_be_done_is_refused_with_what_could():
+    with pytest.raises(ValueError, match="queries: none given, at least 1 needed"):
+        fitted().predict_joint(np.empty((0, 1)))
+    with pytest.raises(ValueError, match="2 inputs given; a periodic kernel needs 1"):
+        KMP.fit([[0, 0]], Gaussians([[0]], [[[1]]]), kernel=PeriodicKernel(1.0, 1.0), lambda_mean=1)

@@ -1,7 +1,5 @@
 """Orientation: the tangent space against SciPy, signs, angular velocity, via-points."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -133,23 +131,12 @@ def test_adapting_to_nothing_changes_nothing():
     np.testing.assert_array_equal(same.mean([[0.7]]), one.mean([[0.7]]))
 
 
-def test_it_is_pickled_read_only():
-    again = pickle.loads(pickle.dumps(skill(velocity=False)))
-    assert not again.auxiliary.flags.writeable
-
-
 def test_what_cannot_be_done_is_refused_with_what_could():
     one = skill(velocity=False)
     q = drawn(0, 1)
     for call, says in (
         (lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]), r"quaternions\[0\] has norm 2, and must have 1"),
         (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
-        (lambda: OrientationKMP(one.primitive, [0, 0, 1.0]), r"auxiliary: shape \(3,\) given, \(4,\) needed"),
-        (lambda: one.adapt([[0.5]], q[:, :3], np.eye(3), tolerance=0), r"quaternions: shape \(1, 3\) given"),
-        (
-            lambda: one.adapt([[0.5]], q, np.eye(2), tolerance=0),
-            r"covariance: shape \(2, 2\) given, \(1, 3, 3\) needed",
-        ),
         (
             lambda: one.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
             "the skill has no rates; fit it with a VelocityKernel",

@@ -130,22 +130,13 @@ def test_rates_have_their_unit_a_period_goes_once_round_and_a_path_is_counted():
     assert "reference" not in axes[0].get_legend_handles_labels()[1]
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"plane": (0, 2)}, "plane is too large, and must be at most 1"),
-        ({"plane": 1}, "plane: int given, a list needed"),
-        ({"plane": (0,)}, "plane: .* given, the numbers of two outputs needed"),
-        ({"outputs": ["x"]}, "outputs: 1 names given, 2 needed"),
-        ({"axes": [1, 2]}, r"axes\[0\]: int given, Axes needed"),
-        ({"axes": [1]}, "axes: 1 given, 2 needed"),
-        ({"queries": [[1.0, 2.0]]}, r"queries: shape \(1, 2\) given"),
-        ({"label": 1}, "label: int given, str needed"),
-    ],
-)
-def test_wrong_calls_are_told(options, says):
-    with pytest.raises(ValueError, match=says):
-        PLAIN.plot(**options)
+def test_an_output_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="plane is too large, and must be at most 1"):
+        PLAIN.plot(plane=(0, 2))
+    with pytest.raises(ValueError, match="outputs: 1 names given, 2 needed"):
+        PLAIN.plot(outputs=["x"])
+    with pytest.raises(ValueError, match="axes: 1 given, 2 needed"):
+        PLAIN.plot(axes=[plt.subplots()[1]])
 
 
 def test_more_inputs_than_one_need_a_path():

@@ -1,7 +1,5 @@
 """One query: mean, motion and covariance, with every kernel and every solution."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -131,13 +129,6 @@ def test_shapes_are_those_of_one_query(skill):
     assert found.curvature.shape == (outputs,)
 
 
-def test_a_copy_in_another_process_gives_the_same_bits(skill):
-    query = moving(skill)
-    found = skill.predict_motion(*query)
-    again = pickle.loads(pickle.dumps(skill)).predict_motion(*query)
-    assert all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
-
-
 def test_what_one_query_touches_is_contiguous_and_read_only(skill):
     query = skill.inner.query
     for array in (query.centres, query.weights, query.weight_rows, query.stretch, query.prior_mean):
@@ -150,24 +141,6 @@ def test_an_input_at_rest_gives_an_output_at_rest():
     found = one.predict_motion(one.inputs[3], np.zeros(3), np.zeros(3))
     np.testing.assert_array_equal(found.velocity, 0)
     np.testing.assert_array_equal(found.acceleration, 0)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"query": np.zeros(2)}, r"query: shape \(2,\) given, \(3,\) needed"),
-        ({"query": np.zeros((1, 3))}, r"query: shape \(1, 3\) given, \(3,\) needed"),
-        ({"velocity": np.zeros(4)}, r"velocity: shape \(4,\) given, \(3,\) needed"),
-        ({"acceleration": [[0.0]]}, r"acceleration: shape \(1, 1\) given, \(3,\) needed"),
-        ({"query": [0, np.inf, 0]}, r"query\[1\] is inf, and every number must be finite"),
-        ({"velocity": [0, 0, np.nan]}, r"velocity\[2\] is nan, and every number must be finite"),
-        ({"acceleration": [-np.inf, 0, 0]}, r"acceleration\[0\] is -inf, and every number must be finite"),
-    ],
-)
-def test_what_is_no_motion_is_refused_by_its_name(change, says):
-    rest = {"query": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
-    with pytest.raises(ValueError, match=says):
-        primitive("one length", "dense", False).predict_motion(**(rest | change))
 
 
 def test_numbers_too_large_to_square_are_still_finite():

@@ -18,26 +18,6 @@ def primitives():
         yield KMP.fit(inputs[:, :1], reference, lambda_mean=1.5, **velocity)
 
 
-@pytest.mark.parametrize("number", range(6))
-@pytest.mark.parametrize("adapted", [False, True])
-def test_a_file_gives_the_primitive_and_its_units_back_bit_for_bit(tmp_path, number, adapted):
-    primitive = list(primitives())[number]
-    queries = np.linspace(-1, 1, 4 * primitive.inputs.shape[1]).reshape(4, -1)
-    if adapted:
-        via = Gaussians(primitive.mean(queries[:1]) + 0.05, [0.05 * np.eye(2)])
-        primitive = primitive.adapt(queries[:1], via, tolerance=0.3)
-    kmp.save(tmp_path / "skill", primitive, input_unit="m", output_unit="m, m/s")
-    stored = kmp.load(tmp_path / "skill")
-    assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
-    again = stored.primitive
-    assert again.representation == primitive.representation
-    for one in (queries, queries[:1]):
-        assert np.array_equal(again.mean(one), primitive.mean(one))
-        assert np.array_equal(again.predict(one).covariance, primitive.predict(one).covariance)
-    assert np.array_equal(again.jacobian(queries[0]), primitive.jacobian(queries[0]))
-    assert np.array_equal(again.base.mean(queries), primitive.base.mean(queries))
-
-
 def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
     (tmp_path / "text").write_text("no")
     with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):

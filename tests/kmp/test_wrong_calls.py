@@ -181,6 +181,8 @@ LEFT_OUT = {("product", "others"), ("take", "index"), ("__getitem__", "index"), 
 MADE_BY_THE_PACKAGE = {"Improvement", "Learned", "MotionPrediction", "Score", "Stored", "Uncertainty", "KMP"}
 OF_THE_KERNEL = {"check", "coordinates", "variances", "values", "blocks", "row", "jacobian", "curvature"}
 
+OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "direction", "offset"}
+WRONG_COLUMNS = {0, 1}  # places in the second list of `wrong_arrays`: one column more, and none
 OPTIONAL = {"lambda_covariance", "prior_mean", "directions", "angular_velocities", "velocity_covariance"}
 WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
 LONGEST = 450  # characters of a message
@@ -245,7 +247,18 @@ def wrong_values(name, right):
     if name == "reward":
         bad = (None, "text", np.nan, np.inf, 1j, S, [1.0, 2.0], object())
         return [one for one in objects if not callable(one)] + [lambda path, one=one: one for one in bad], []
-    return [*objects, "sparse", ["dense"], np.array(["dense"]), FRAME, K, (FRAME,), (FRAME, R), R], []
+    return [
+        *objects,
+        np.zeros((2, 6, 2)),
+        "sparse",
+        ["dense"],
+        np.array(["dense"]),
+        FRAME,
+        K,
+        (FRAME,),
+        (FRAME, R),
+        R,
+    ], []
 
 
 def calls():
@@ -253,6 +266,7 @@ def calls():
     for function, right in RIGHT.items():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
+            must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame  # which names its matrix
             for one in wrong:
                 if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(one, float):
                     continue  # one for all inputs
@@ -267,8 +281,8 @@ def calls():
                 if name == "velocity" and one is True:
                     continue
                 yield function, name, right, one, True
-            for one in other:
-                yield function, name, right, one, False
+            for place, one in enumerate(other):
+                yield function, name, right, one, must_fail and place in WRONG_COLUMNS
 
 
 def fault(function, name, right, value, must_fail):

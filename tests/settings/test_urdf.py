@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from service.core.arm.stage import Arm
+from service.settings.config import SettingsError, load, parse, robot_description
 from service.settings.urdf import Urdf, UrdfError, multiply
-from support.turning import continuous_urdf, sliding_urdf
+from sim.scene import Scene
+from support.arms import MODELS, cell_of, toml_of, urdf_of
+from support.turning import BEYOND, continuous_urdf, sliding_urdf
 from support.wam import JOINT_NAMES, URDF
 
 
@@ -17,27 +23,26 @@ def test_the_chain_to_the_tool_has_the_joints_in_order_with_their_limits() -> No
     assert (joints[3].lower, joints[3].upper, joints[3].velocity) == (-0.9, 3.1, 2.0)
 
 
-def test_link_frames_are_where_another_implementation_has_them() -> None:
-    urdf, model = Urdf(URDF), pin.buildModelFromXML(URDF)
-    data = model.createData()
-    q = np.random.default_rng(1).uniform(model.lowerPositionLimit, model.upperPositionLimit)
-    pin.framesForwardKinematics(model, data, q)
-    placed = {urdf.root: pin.SE3.Identity()}
-    for link in urdf.transforms(dict(zip(JOINT_NAMES, q.tolist(), strict=True))):
-        x, y, z, w = link.rotation
-        placed[link.child] = placed[link.parent] * pin.SE3(pin.Quaternion(w, x, y, z), np.array(link.translation))
-        expected = data.oMf[model.getFrameId(link.child)]
-        np.testing.assert_allclose(placed[link.child].homogeneous, expected.homogeneous, atol=1e-12)
+TILTED = sliding_urdf().replace('<axis xyz="0 1 0"/>', '<axis xyz="0.6 0.8 0"/>')
 
 
-@pytest.mark.parametrize("description", [continuous_urdf(), sliding_urdf()])
-def test_links_of_turning_and_sliding_joints_are_where_another_implementation_has_them(description: str) -> None:
+@pytest.mark.parametrize(
+    ("description", "plate", "around"),
+    [
+        (URDF, "tool_plate", 0.0),
+        (continuous_urdf(), "tool0", 20.0),
+        (sliding_urdf(), "tool0", 0.0),
+        (TILTED, "tool0", 0.0),
+    ],
+    ids=["wam", "continuous", "sliding", "tilted"],
+)
+def test_link_frames_are_where_another_implementation_has_them(description: str, plate: str, around: float) -> None:
     urdf = Urdf(description)
-    names = [joint.name for joint in urdf.movable("tool0")]
+    names = [joint.name for joint in urdf.movable(plate)]
     model = pin.buildModelFromXML(urdf.kinematics(names))
     data = model.createData()
     assert list(model.names)[1:] == names
-    q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + (0.0 if "rail_joint" in names else 20.0)
+    q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + around
     pin.framesForwardKinematics(model, data, q)
     placed = {urdf.root: pin.SE3.Identity()}
     for link in urdf.transforms(dict(zip(names, q.tolist(), strict=True))):
@@ -48,18 +53,8 @@ def test_links_of_turning_and_sliding_joints_are_where_another_implementation_ha
 
 
 def test_joints_beyond_the_plate_never_matter() -> None:
-    gripper = "".join(
-        f'<link name="{name}"/><joint name="{name}_joint" type="{kind}"><parent link="{parent}"/><child link="{name}"/>'
-        f"{more}</joint>"
-        for name, kind, parent, more in (
-            ("finger", "prismatic", "tool_plate", '<limit lower="0" upper="0.04" velocity="1" effort="1"/>'),
-            ("thumb", "prismatic", "tool_plate", '<mimic joint="finger_joint"/>'),
-            ("wheel", "continuous", "tool_plate", ""),
-            ("cart", "floating", "wam/base_link", ""),
-            ("sheet", "planar", "wam/base_link", ""),
-        )
-    )
-    urdf = Urdf(URDF.replace("</robot>", gripper + "</robot>").replace("wam/base_link", Urdf(URDF).root))
+    gripper = BEYOND.replace("tool0", "tool_plate").replace("base_link", Urdf(URDF).root)
+    urdf = Urdf(URDF.replace("</robot>", gripper + "</robot>"))
     assert urdf.movable("tool_plate") == Urdf(URDF).movable("tool_plate")
 
 
@@ -101,3 +96,48 @@ def test_what_cannot_be_used_is_refused_in_words(text: str, message: str) -> Non
         Urdf(text, origin="cell.urdf").movable("tool_plate")
     assert str(caught.value).startswith("cell.urdf: ")
     assert message in str(caught.value)
+
+
+# --- arms that we did not write: a Panda, its fingers locked, and a UR5 of six joints ---
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_names_limits_and_reach_come_from_the_description(name: str) -> None:
+    cell = cell_of(name)
+    arm = Arm(cell, robot_description(cell))
+    here = arm.at(np.array(cell.arm.posture))
+    position, rotation = here.position, here.rotation
+    assert position == pytest.approx(Scene().robot_start, abs=0.03)
+    assert rotation[:, 2] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)], abs=0.01)
+    assert len(cell.joints.names) == len(cell.joints.lower) == len(cell.arm.posture)
+    assert 0.3 < cell.reach.inner < cell.reach.outer < 1.4
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"plate": ""}, "[arm] plate: missing; the link that carries the tool needed, the last ones are"),
+        ({"plate": 'plate = "gripper"'}, "no link 'gripper'"),
+        ({"posture": ""}, "[arm] posture: missing; the URDF does not define it, 6 numbers needed"),
+        ({"jerk": ""}, "[joints] jerk: missing"),
+        ({"posture": "posture = [0, 0, 0]"}, "[arm] posture: 3 numbers, 6 needed, one for each of [joints] names"),
+        (
+            {"jerk": f"jerk = {[500] * 6}\nvelocity = {[9] * 6}"},
+            "[joints] velocity, entry 1: 9.0 given; up to 3.15",
+        ),
+        ({"jerk": f'jerk = {[500] * 6}\nnames = ["a", "b", "c", "d", "e", "f"]'}, "[joints] names: ['a', 'b'"),
+        ({"urdf": '[arm]\nurdf = "nowhere.urdf"'}, "/nowhere.urdf: No such file or directory"),
+    ],
+)
+def test_settings_that_do_not_fit_the_description_are_refused(changed: dict[str, str], message: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        parse(toml_of(MODELS["ur5"], **changed), origin="cell.toml")
+    assert str(caught.value).startswith("cell.toml: ")
+    assert message in str(caught.value)
+
+
+def test_a_description_is_looked_for_beside_the_settings(tmp_path: Path) -> None:
+    meshes = f'packages = ["{urdf_of(MODELS["ur5"]).parents[4]}"]'
+    (tmp_path / "arm.urdf").write_bytes(urdf_of(MODELS["ur5"]).read_bytes())
+    (tmp_path / "cell.toml").write_text(toml_of(MODELS["ur5"], urdf=f'[arm]\nurdf = "arm.urdf"\n{meshes}'))
+    assert load(tmp_path / "cell.toml").joints.names[0] == "shoulder_pan_joint"

@@ -45,6 +45,15 @@ def told(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), errors.getvalue())
 
 
+def until(what: Callable[[], Any], words: str = "it did not come to hold", *, within_s: float = 20.0) -> Any:
+    """What a call returns, once that is true."""
+    end = time.monotonic() + within_s
+    while not (found := what()):
+        assert time.monotonic() < end, words
+        time.sleep(0.02)
+    return found
+
+
 class Daemon:
     """A running `thirdhand serve` and a client's session to it."""
 

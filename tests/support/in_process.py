@@ -4,14 +4,19 @@ faster than real time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from service.core.controller import Controller, run
-from service.core.frame import Event, Frame, Tick
-from service.settings.config import Settings
+from service.contract.records import SIDES
+from service.core.controller import Controller, run, start_state
+from service.core.frame import Event, Frame, Record, Tick, Vector
+from service.core.skill.skill import Skill
+from service.files.recording import Recorder
+from service.files.replay import replay
+from service.settings.config import Settings, robot_description
 from sim.closed_loop import hand_event, joints_event
 from sim.script import HandScript
 from support.wam import JOINT_NAMES
@@ -30,28 +35,125 @@ def arm(joints: tuple[float, ...], stamp_ns: int, velocities: tuple[float, ...] 
     return joints_event(JOINT_NAMES, joints, velocities, stamp_ns)
 
 
+def seen(hands: Vector, k: int) -> tuple[Event, ...]:
+    """Samples of both hands (2, 3) [m] that arrive in tick k."""
+    return tuple(hand(side, tuple(at.tolist()), k + 1) for side, at in zip(SIDES, hands, strict=True))
+
+
+def nothing(k: int) -> tuple[Event, ...]:
+    """No event in tick k."""
+    return ()
+
+
+def led(
+    hands: Iterable[Vector], extra: Callable[[int], tuple[Event, ...]] = nothing, *, first: int = 0, every: int = 5
+) -> Iterator[Tick]:
+    """Ticks while the hands are at positions (T, 2, 3) [m], of which a tracker samples some."""
+    for k, at in enumerate(hands, first):
+        yield Tick(k, (*(seen(at, k) if k % every == 0 else ()), *extra(k)))
+
+
 def ticks_of(
     script: HandScript, *, wait_s: float = 1.5, tail_s: float = 0.5, period_s: float = 0.002, every: int = 5
 ) -> Iterator[Tick]:
     """Ticks with the script's hands, which first rest at their start for a while."""
-    for k in range(round((wait_s + script.duration_s + tail_s) / period_s)):
-        t = max(0.0, k * period_s - wait_s)
-        poses = [tuple(pose[:3].tolist()) for pose in script.sample(t)] if k % every == 0 else []
-        yield Tick(k, tuple(hand(side, pose, 1 + k) for side, pose in zip(("left", "right"), poses, strict=False)))
+    times = np.arange(round((wait_s + script.duration_s + tail_s) / period_s)) * period_s
+    return led((np.array(script.sample(max(0.0, t - wait_s)))[:, :3] for t in times), every=every)
 
 
 def resting(
-    first: int, count: int, extra: Callable[[int], tuple[Event, ...]] = lambda k: (), *, every: int = 5
+    first: int, count: int, extra: Callable[[int], tuple[Event, ...]] = nothing, *, every: int = 5
 ) -> list[Tick]:
     """Ticks with both hands resting at their start."""
-    return [
-        Tick(k, (*((hand("left", LEFT, k + 1), hand("right", RIGHT, k + 1)) if k % every == 0 else ()), *extra(k)))
-        for k in range(first, first + count)
-    ]
+    return list(led(np.tile((LEFT, RIGHT), (count, 1, 1)), extra, first=first, every=every))
 
 
-def frames(controller: Controller, ticks: Iterator[Tick] | list[Tick]) -> np.ndarray:
+def frames(controller: Controller, ticks: Iterable[Tick]) -> np.ndarray:
     """The frames (T,) of a controller that steps through ticks."""
     out: list[Frame] = []
     run(controller, ticks, [lambda _, frame: out.append(frame)])
     return np.array(out)
+
+
+def assert_limits_hold(seen: np.ndarray, cell: Settings = ASSUMED) -> None:
+    """Assert that every number is finite, that joints are within their limits or move inwards, and
+    that speeds, accelerations, jerks and consecutive commands are as their limits allow.
+    """
+    limits, dt = cell.joints, cell.period_s
+    for name in seen.dtype.names or ():
+        assert np.isfinite(seen[name]).all(), name
+    sent = seen[seen["commanded"] == 1]
+    q, dq, ddq = (sent[name] for name in ("joints", "joint_velocities", "joint_accelerations"))
+    outside = np.maximum(np.maximum(q - limits.upper, limits.lower - q), 0.0)
+    assert (np.diff(outside, axis=0, prepend=outside[:1]) <= 0.0).all(), "outside the limits"
+    assert (np.abs(dq) <= limits.velocity).all(), "speed"
+    assert (np.abs(ddq) <= np.array(limits.acceleration) * (1 + 1e-9)).all(), "acceleration"
+    assert (np.abs(np.diff(ddq, axis=0)) / dt <= np.array(limits.jerk) * (1 + 1e-6)).all(), "jerk"
+    moved = np.diff(q, axis=0) - 0.5 * dt * (dq[1:] + dq[:-1])
+    assert (np.abs(moved) <= 2e-9 + 0.25 * np.array(limits.jerk) * dt**3).all(), "a jump"
+
+
+class Loop:
+    """A controller and an arm that is where it was commanded, which reports its joints and their
+    velocities as `reports` says. The hands are where `hands` has them in a tick.
+    """
+
+    def __init__(self, cell: Settings, skill: Skill, start: Vector | tuple[float, ...] | None = None) -> None:
+        self.controller = Controller(cell, skill, urdf=robot_description(cell))
+        self.joints = np.array(cell.arm.posture if start is None else start)
+        self.speed = np.zeros(len(self.joints))
+        self.reports: Callable[[Vector, Vector], tuple[Vector, Vector]] = lambda q, dq: (q, dq)
+        self.hands: Callable[[int], Vector] = lambda k: np.array((LEFT, RIGHT))
+        self.index = 0
+        self.steps: list[tuple[Tick, Frame]] = []
+        self._names = cell.joints.names
+
+    @property
+    def frames(self) -> np.ndarray:
+        """All frames (T,) until now."""
+        return np.array([frame for _, frame in self.steps])
+
+    def step(self, *events: Event, is_heard: bool = True) -> Frame:
+        """One tick; in every fifth the hands are seen."""
+        k = self.index
+        inbox = list(seen(self.hands(k), k)) if k % 5 == 0 else []
+        if is_heard:
+            joints, speed = (tuple(part.tolist()) for part in self.reports(self.joints, self.speed))
+            inbox.append(joints_event(self._names, joints, speed, stamp_ns(k)))
+        tick = Tick(k, (*inbox, *events))
+        frame = self.controller.step(tick)
+        self.steps.append((tick, frame))
+        self.index += 1
+        if frame["commanded"]:
+            self.joints, self.speed = frame["joints"].copy(), frame["joint_velocities"].copy()
+        return frame
+
+    def run(self, ticks: int, events: Mapping[int, Event] | None = None, *, every: int = 1) -> np.ndarray:
+        """The frames of more ticks, with events by their ticks counted from here. The arm is heard
+        in every so many ticks, or never.
+        """
+        events = events or {}
+        for k in range(ticks):
+            self.step(*([events[k]] if k in events else []), is_heard=bool(every) and self.index % every == 0)
+        return self.frames[-ticks:]
+
+
+def stamp_ns(k: int) -> int:
+    """The stamp of what an arm reports in tick k."""
+    return 10**12 + 2_000_000 * k
+
+
+def script_hands(script: HandScript, *, wait_s: float = 1.5) -> Callable[[int], Vector]:
+    """Positions of both hands (2, 3) [m] in each tick of 2 ms; first they rest for a while."""
+    return lambda k: np.array(script.sample(max(0.0, 0.002 * k - wait_s)))[:, :3]
+
+
+def assert_replays(
+    path: Path, cell: Settings, skill: Skill, steps: list[tuple[Tick, Frame]], state: Record | None = None
+) -> None:
+    """Assert that ticks with their frames, recorded from a state on, replay identically."""
+    state = start_state(cell, skill) if state is None else state
+    with Recorder(path, settings=cell, skill=skill.file, state=state) as recorder:
+        for tick, frame in steps:
+            recorder.write(tick, frame, time_ns=stamp_ns(tick.index))
+    assert replay(path).text() == f"{len(steps)} ticks, {len(steps)} frames identical"

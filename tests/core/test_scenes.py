@@ -1,0 +1,392 @@
+"""Scenes: an arm, a tracker and hands of the kinds that people have. What must hold in each of them
+is asserted by `played`; each family of scenes adds what it is about.
+
+`THIRDHAND_EXAMPLES=300 pytest tests/core/test_scenes.py` draws more of each family.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import replace as replaced
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
+
+from service.contract.records import Mode, Reason
+from service.core.controller import Controller, start_state
+from service.core.frame import Tick, Vector, order
+from service.core.setpoint.tuning import HAND_BRAKE_MPS2
+from service.core.skill.skill import Skill
+from service.files.shipped import cell_of as shipped
+from service.learning.learn import learn
+from service.learning.skill_file import decoded
+from service.settings.config import Settings, robot_description
+from sim.scene import Scene
+from sim.script import HandScript
+from sim.teach import demonstrations
+from support.arms import MODELS, cell_of
+from support.in_process import (
+    ASSUMED,
+    LEFT,
+    RIGHT,
+    assert_limits_hold,
+    assert_replays,
+    frames,
+    led,
+    resting,
+    seen,
+    ticks_of,
+)
+from support.paths import RECORDINGS
+from support.starts import free_postures
+
+MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "0"))
+RISE, RISE_MPS = 1.01, 0.01  # docs/bounds.md: speed of the tool in a stop
+AT_REST_RADPS2 = 0.02  # root mean square of each joint
+PERIOD_S = ASSUMED.period_s
+NOISE_M = 0.0005  # of a tracker, each axis
+COMES_S = 2.0  # in which the tool comes to where the hands want it
+KNOWN_S = 2.0  # after which it is known how fast a slow hand moves
+FAST = butter(4, 4.0, "highpass", fs=1.0 / PERIOD_S, output="sos")
+
+
+def everywhere(skill: Skill) -> Skill:
+    """The skill, followed however far hands are from what was demonstrated."""
+    return replaced(skill, threshold=math.inf)
+
+
+def stored(name: str) -> Skill:
+    return everywhere(decoded((RECORDINGS / f"{name}.npz").read_bytes(), origin=name))
+
+
+def played(cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector | None = None) -> np.ndarray:
+    """The frames (T,) of a scene: without a fault, within every limit of the joints, and with the
+    tool within its speed limit, in stops too.
+    """
+    state = start_state(cell, skill)
+    if start is not None:
+        state["joints"][0] = start
+    found = frames(Controller(cell, skill, state, urdf=robot_description(cell)), ticks)
+    faults = found["mode"] == Mode.FAULT
+    assert not faults.any(), f"tick {faults.argmax()}: {Reason(found['reason'][faults.argmax()]).name}"
+    assert_limits_hold(found, cell)
+    speeds = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1) / cell.period_s
+    assert speeds[found["mode"][1:] == Mode.FOLLOW].max(initial=0.0) <= 1.001 * cell.tool.max_speed
+    assert speeds.max() <= RISE * cell.tool.max_speed + RISE_MPS
+    return found
+
+
+def changed(
+    cell: Settings,
+    *,
+    rate_hz: int = 500,
+    speed: float = 1.0,
+    acceleration: float = 1.0,
+    jerk: float = 1.0,
+    **tool: object,
+) -> Settings:
+    """A cell whose joints have a share of their speed, acceleration and jerk, with another tool."""
+    shares = {"velocity": speed, "acceleration": acceleration, "jerk": jerk}
+    limits = {name: tuple(share * x for x in getattr(cell.joints, name)) for name, share in shares.items()}
+    return replace(cell, rate_hz=rate_hz, tool=replace(cell.tool, **tool), joints=replace(cell.joints, **limits))
+
+
+def every(cell: Settings) -> int:
+    """Ticks between the samples of a tracker at 100 Hz."""
+    return max(1, round(0.01 * cell.rate_hz))
+
+
+def smooth(u: Vector) -> Vector:
+    """The share of its way that a reach of minimum jerk has gone at a share of its time."""
+    u = np.clip(u, 0.0, 1.0)
+    return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u * u))
+
+
+@pytest.fixture(scope="module")
+def followed(taught: Skill) -> np.ndarray:
+    """A tenth of a second in which the arm follows resting hands."""
+    return frames(Controller(ASSUMED, taught, urdf=robot_description(ASSUMED)), resting(0, 50))
+
+
+@pytest.mark.parametrize(
+    ("field", "added", "words"),
+    [
+        ("target", np.nan, "target"),
+        ("joints", 9.0, "outside the limits"),
+        ("joint_velocities", 9.0, "speed"),
+        ("joint_accelerations", 50.0, "acceleration"),
+        ("joint_accelerations", 5.0, "jerk"),
+        ("joints", 2e-6, "a jump"),
+    ],
+)
+def test_a_limit_that_is_passed_is_found(followed: np.ndarray, field: str, added: float, words: str) -> None:
+    spoilt = followed.copy()
+    spoilt[field][-1] += added
+    assert_limits_hold(followed)
+    with pytest.raises(AssertionError, match=words):
+        assert_limits_hold(spoilt)
+
+
+# --- legal hands ---
+
+
+@example_settings(max_examples=MANY or 20, deadline=None, derandomize=True)
+@given(
+    st.floats(0.1, 1.5),
+    st.floats(0.0, 0.003),
+    st.floats(30.0, 500.0),
+    st.sampled_from([500, 250, 1000]),
+    st.integers(0, 10**6),
+)
+def test_legal_hands_are_hardly_held_for(
+    max_speed: float, noise_m: float, rate_hz: float, loop_hz: int, seed: int
+) -> None:
+    """Reaches there and back at up to 1.5 m/s, with noise, late samples and dropouts of 30 to 90
+    ms.
+    """
+    random, lasts_s = np.random.default_rng(seed), 2.0
+    way = random.standard_normal((2, 3))
+    way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
+    far = np.linalg.norm(way, axis=1).max()
+    # a minimum-jerk reach, which no hand brakes harder at its end than the setpoint takes it to
+    reach_s = max(1.875 * far / max_speed, math.sqrt(5.774 * far / HAND_BRAKE_MPS2))
+    stamps = np.arange(0.0, lasts_s, 1.0 / rate_hz)
+    missing = np.zeros(len(stamps), bool)
+    for at in random.uniform(0.0, lasts_s, 2):
+        missing |= (stamps > at) & (stamps < at + random.uniform(0.03, 0.09) - 1.0 / rate_hz)
+    inboxes = {}
+    for stamp in stamps[~missing]:
+        turns, u = divmod(stamp / reach_s, 1.0)
+        there = smooth(u)
+        moved = way * (1.0 - there if turns % 2 else there) + noise_m * random.standard_normal((2, 3))
+        k = math.ceil(stamp * loop_hz - 1e-9)
+        inboxes[k] = seen(np.array((LEFT, RIGHT)) + moved, k)
+    ticks = (Tick(k, inboxes.get(k, ())) for k in range(round(lasts_s * loop_hz)))
+    found = played(replace(ASSUMED, rate_hz=loop_hz), stored("soldering"), ticks)
+    assert not found["rejected"][-1].any()
+    assert (found["mode"] == Mode.HOLD).mean() <= 0.02
+
+
+# --- quick reaches, and lowered speeds ---
+
+
+def reaches(skill: Skill, cell: Settings, random: np.random.Generator, count: int) -> Vector:
+    """Hands (T, 2, 3) [m] that reach for where the skill knows them, in 0.3 to 0.7 s, and rest for
+    a while.
+    """
+    known = skill.hands.reshape(-1, 2, 3)
+    at = known[random.integers(len(known))].copy()
+    path = [at] * cell.rate_hz
+    for _ in range(count):
+        to, seconds, goal = at.copy(), random.uniform(0.3, 0.7), known[random.integers(len(known))]
+        for side in (0, 1):
+            if random.random() < 0.7:
+                to[side] = goal[side] + random.normal(0.0, 0.02, 3)
+        ticks = int(seconds * cell.rate_hz)
+        path += list(at + smooth(np.arange(1, ticks + 1) / ticks)[:, None, None] * (to - at))
+        path += [to] * int(random.uniform(0.2, 1.0) * cell.rate_hz)
+        at = to
+    return np.array(path)
+
+
+# The seeds are of sessions with a fault in an earlier version, where one was found.
+QUICK = {
+    "wam": (cell_of("wam"), 2),
+    "wam, 1 kHz": (changed(cell_of("wam"), rate_hz=1000), 0),
+    "wam, slow": (changed(cell_of("wam"), rate_hz=250, max_speed=0.3), 19),
+    "ur5": (cell_of("ur5"), 3),
+    "panda, 250 Hz": (changed(cell_of("panda"), rate_hz=250), 0),
+    "panda, orientation": (changed(cell_of("panda"), orientation="full"), 0),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_quick_reach_is_no_fault_and_passes_no_speed(taught: Skill, name: str) -> None:
+    cell, first = QUICK[name]
+    for seed in range(first, first + (MANY or 1)):
+        hands = reaches(taught, cell, np.random.default_rng(seed), 8)
+        found = played(cell, taught, led(hands, first=1, every=every(cell)))
+        speed = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1).max() / cell.period_s
+        assert speed <= cell.tool.max_speed, f"seed {seed}: {speed:.4f} m/s"
+        assert np.ptp(found["tool"], axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize("seed", range(MANY or 8))
+def test_legal_hands_and_a_lowered_speed_never_fault(skill: Skill, taught: Skill, seed: int) -> None:
+    """As at the first start of a new arm, whose joints docs/hardware.md slows to a tenth."""
+    random = np.random.default_rng(seed)
+    name = ("wam", "panda", "ur5", "shipped franka", "shipped ur5")[seed % 5]
+    own = shipped(name.removeprefix("shipped ")) if name.startswith("shipped") else cell_of(name)
+    slower = float(random.choice([0.1, 1.0, 1.0]))
+    cell = changed(
+        replace(own, arm=replace(own.arm, source="assumed")),
+        rate_hz=int(random.choice([500, 500, 100, 250, 1000])),
+        speed=slower,
+        max_speed=float(random.choice([0.03, 0.05, 0.08, 0.1, 0.2, 0.5])),
+        orientation=str(random.choice(["full", "direction"])),
+    )
+    one = everywhere((skill, taught)[random.integers(2)])
+    hands = reaches(taught, cell, random, 3)
+    stops = set(random.integers(0, len(hands), 2).tolist())
+    orders = dict.fromkeys(stops, "hold") | {k + cell.rate_hz // 4: "resume" for k in stops}
+    found = played(cell, one, led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)))
+    speeds = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1) / cell.period_s
+    assert speeds.max() >= 0.3 * slower * cell.tool.max_speed  # the arm did move
+
+
+# --- hands that rest ---
+
+
+def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], seconds: float) -> None:
+    """Assert that an arm that starts somewhere rests in the last second; the hands (2, 3) move from
+    the first place to the second at 2 s, and rest there.
+    """
+    times = np.arange(1, round(seconds / cell.period_s)) * cell.period_s
+    path = hands[0] + smooth((times - 2.0) / 0.8)[:, None, None] * (hands[1] - hands[0])
+    found = played(cell, skill, led(path, every=every(cell)), start=start)
+    last = found["joint_accelerations"][times > seconds - 1.0]
+    assert np.sqrt(np.mean(last**2, axis=0)).max() < AT_REST_RADPS2
+
+
+@pytest.mark.parametrize(("number", "name"), [(2, "glass"), (11, "start")])
+def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill, number: int, name: str) -> None:
+    cell = changed(cell_of("panda"), rate_hz=250, jerk=0.2, orientation="full")
+    rest = taught.hands.reshape(-1, 2, 3)[taught.model.names.index(name)]
+    settled(cell, taught, free_postures(cell, 1, number)[0], [rest, rest], 16.0)
+
+
+def test_a_clearance_greater_than_the_arms_own_gaps_does_not_swing_it(taught: Skill) -> None:
+    """Of its elbow from its base, which are 12.2 cm apart as it stands."""
+    cell = replace(cell_of("wam"), rate_hz=250, obstacles=replace(Settings().obstacles, clearance=0.12))
+    places = taught.hands.reshape(-1, 2, 3)
+    rest = places[np.random.default_rng(12).integers(len(places))]
+    settled(cell, taught, np.array(cell.arm.posture), [rest, rest], 16.0)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "tool"), [(250, {"jerk_weight": 1e-11, "max_jerk": 43.0}), (500, {"max_jerk": 2.0})]
+)
+def test_a_tool_of_little_jerk_comes_to_rest(taught: Skill, rate_hz: int, tool: dict[str, float]) -> None:
+    cell, places = changed(cell_of("panda"), rate_hz=rate_hz, **tool), taught.hands.reshape(-1, 2, 3)
+    hands = list(places[np.random.default_rng(0).integers(len(places), size=2)])
+    settled(cell, taught, np.array(cell.arm.posture), hands, 16.0)
+
+
+@pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10: once swung for ever
+def test_whatever_the_cell_the_arm_comes_to_rest(taught: Skill, number: int) -> None:
+    random, cell = np.random.default_rng(number), cell_of(("wam", "panda", "ur5")[number % 3])
+    rate_hz, slower = int(random.choice([250, 500, 1000])), float(random.choice([0.3, 1.0]))
+    cell = changed(
+        cell,
+        rate_hz=rate_hz,
+        speed=slower,
+        acceleration=slower,
+        jerk=float(random.choice([0.2, 0.5, 1.0])),
+        jerk_weight=float(random.choice([1e-11, 2.8e-9, 1e-5])),
+        orientation=str(random.choice(["direction", "full"])),
+        plate_from_tool=(0.0, 0.0, float(random.choice([0.0, 0.2])), 0.0, 0.0, 0.0, 1.0),
+    )
+    places = taught.hands.reshape(-1, 2, 3)
+    first, second = places[random.integers(len(places))], places[random.integers(len(places))]
+    settled(cell, taught, np.array(cell.arm.posture), [first, second + random.normal(0, 0.03, (2, 3))], 20.0)
+
+
+@pytest.mark.parametrize("name", ["wam", "panda", "ur5"])
+@pytest.mark.parametrize("rate_hz", [250, 500, 1000])
+def test_the_arm_rests_at_a_target_on_a_side_of_the_workspace(name: str, rate_hz: int, skill: Skill) -> None:
+    """The box is drawn so that the target of resting hands lies beyond one, two or three sides."""
+    random = np.random.default_rng(rate_hz + len(name))
+    cell = replace(cell_of(name), rate_hz=rate_hz)
+    target = skill.predict(np.array((LEFT, RIGHT)), np.zeros((2, 3)), np.zeros((2, 3))).position
+    box = np.stack([target - random.uniform(0.05, 0.2, 3), target + random.uniform(0.05, 0.2, 3)])
+    for axis in random.choice(3, random.integers(1, 4), replace=False):
+        side = random.integers(2)
+        box[side, axis] = target[axis] + (1 - 2 * side) * random.choice([0.0, 0.01, 0.03])
+    confined = replaced(skill, workspace=box, threshold=math.inf)
+    got = played(cell, confined, resting(0, 6 * rate_hz, every=every(cell)))[-rate_hz // 2 :]
+    assert (got["mode"] == Mode.FOLLOW).all()
+    assert np.sqrt((got["joint_accelerations"] ** 2).mean()) <= AT_REST_RADPS2
+    assert np.ptp(got["tool"], axis=0).max() <= 1e-5
+
+
+# --- the scripted task on other arms ---
+
+
+@pytest.fixture(scope="module")
+def reach() -> Skill:
+    """A coarse skill of two demonstrations, with which the tool moves a metre."""
+    return learn([one.every(2) for one in demonstrations(Scene(), count=2, seed=1)], components=5, points=60)
+
+
+@pytest.mark.parametrize("arm", ["wam", *MODELS])
+def test_moving_targets_are_followed_to_half_a_millimetre(arm: str, reach: Skill, tmp_path: Path) -> None:
+    cell, ticks = cell_of(arm), list(ticks_of(HandScript(Scene(), seed=3)))
+    found = played(cell, reach, ticks)
+    assert_replays(tmp_path / "a.mcap", cell, reach, list(zip(ticks, found, strict=True))[:1500])
+    assert (found["mode"] == Mode.FOLLOW).all()
+    error_mm = 1000 * np.linalg.norm(found["tool"] - found["setpoint"], axis=1)
+    assert np.sqrt(np.mean(error_mm**2)) < 0.5, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
+    assert error_mm.max() < 5.0, f"{error_mm.max():.3f} mm"
+    assert np.ptp(found["tool"], axis=0).max() > 0.3
+
+
+# --- hands that tremble, and slow ones ---
+
+
+def tracked(skill: Skill, hands: Vector) -> np.ndarray:
+    """The frames (T,) while a noisy tracker reports hands (T, 6) [m]."""
+    noisy = hands + NOISE_M * np.random.default_rng(1).standard_normal(hands.shape)
+    return played(ASSUMED, skill, led(noisy.reshape(-1, 2, 3)))
+
+
+def above_4_hz(values: Vector) -> float:
+    """The root mean square of what is faster, once the tool has come."""
+    fast = sosfiltfilt(FAST, values, axis=0)[round(COMES_S / PERIOD_S) : -250]
+    return float(np.sqrt(np.mean(np.sum(fast**2, axis=1))))
+
+
+@pytest.mark.parametrize("size_m", [0.0003, 0.001, 0.002])
+@pytest.mark.parametrize("name", ["soldering", "experiments/as-paper"])
+def test_a_tremor_of_hands_at_rest_does_not_reach_the_tool(name: str, size_m: float) -> None:
+    one, random, t = stored(name), np.random.default_rng(0), np.arange(0.0, 5.0, PERIOD_S)
+    hands = np.tile(one.hands.mean(axis=0), (len(t), 1))
+    for side in (0, 3):
+        rates = np.interp(t, np.arange(0.0, 6.0, 0.5), random.uniform(8.0, 12.0, 12))
+        way = random.standard_normal(3)
+        tremor = np.sin(2.0 * np.pi * np.cumsum(rates) * PERIOD_S)
+        hands[:, side : side + 3] += size_m * tremor[:, None] * way / np.linalg.norm(way)
+    found = tracked(one, hands)
+    assert above_4_hz(found["tool"]) < 0.0002
+    axes = Rotation.from_quat(found["tool_orientation"]).apply((0.0, 0.0, 1.0))
+    assert math.degrees(above_4_hz(axes)) < 0.2
+
+
+def along(speed: float, parts: slice) -> Vector:
+    """Speeds (T,) [m/s] of the tool on its way while hands, those parts of (6,), move evenly. The
+    skill is a function of where the hands are alone.
+    """
+    one, t = stored("experiments/as-paper"), np.arange(0.0, 9.0, PERIOD_S)
+    hands = np.tile(one.hands.mean(axis=0), (len(t), 1))
+    way = np.array([0.3, 0.9, 0.3] * 2)[parts] / np.linalg.norm([0.3, 0.9, 0.3])
+    hands[:, parts] += speed * np.maximum(t - COMES_S, 0.0)[:, None] * way
+    tool = tracked(one, hands)["tool"][round((COMES_S + KNOWN_S) / PERIOD_S) :]
+    return np.asarray(np.diff(tool, axis=0) / PERIOD_S @ (tool[-1] - tool[0]) / np.linalg.norm(tool[-1] - tool[0]))
+
+
+@pytest.mark.parametrize("speed", [0.002, 0.005, 0.02])
+def test_a_tool_moves_evenly_with_a_slow_hand(speed: float) -> None:
+    assert along(speed, slice(0, 3)).std() < 0.001
+
+
+@pytest.mark.parametrize(("speed", "parts"), [(0.01, slice(0, 3)), (0.005, slice(0, 6))])
+def test_a_tool_never_turns_back_where_slow_hands_move_on(speed: float, parts: slice) -> None:
+    assert along(speed, parts).min() > 0.0

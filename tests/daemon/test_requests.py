@@ -1,0 +1,378 @@
+"""Requests: checked, refused whole with a reason, or carried out through the inbox and answered
+with the tick that took them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from service.cli.main import main
+from service.client import RefusedError, endpoints
+from service.contract import channels, requests
+from service.contract.records import Mode, Reason
+from service.core.frame import Event
+from service.core.skill.skill import Skill
+from service.daemon.daemon import load_skill
+from service.daemon.queryables import PendingEvent, SavedViaPoints
+from service.daemon.skill_worker import SkillWorker
+from service.learning.reach import beyond_m
+from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.learning.via_points import adapted
+from service.settings.config import Files, Reach, Settings
+from support.request_cell import PLACES, Cell
+
+HANDOVER = PLACES[0]
+ORDERS = ("hold", "resume", "reset")
+FAR_LEFT = Reach(centre=(0.0, 1.5, 0.346))
+
+
+def point(**change: Any) -> dict[str, Any]:
+    """A place as a client writes it; None leaves a field out."""
+    whole = {"name": "a", "left": HANDOVER.left, "right": HANDOVER.right, "tool": HANDOVER.tool} | change
+    return {name: value for name, value in whole.items() if value is not None}
+
+
+def add(*points: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"op": "add", "points": points, **more}
+
+
+def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> None:
+    assert cell.client.places() == ()
+    points = cell.client.add(PLACES).points
+    assert points is not None
+    assert [taught.name for taught in points] == ["handover", "glass", "soldering"]
+    assert all(taught.missed_by_m < 0.003 for taught in points)
+    assert cell.client.places() == points
+
+    moved = cell.client.ask(
+        "via_points", add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3]))
+    )
+    assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
+    assert len(moved["points"]) == 3
+
+    assert [taught.name for taught in cell.client.remove("glass").points or ()] == ["handover", "soldering"]
+    assert cell.client.clear().points == ()
+    assert cell.kinds() == ["skill"] * 4
+    assert cell.taken[0].value.via_points == PLACES
+
+
+def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
+    assert cell.client.add(PLACES).warnings == ()
+    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
+    missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
+    assert missed > 0.1
+    assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
+
+
+def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: StoredSkill) -> None:
+    cell.client.add(PLACES, tolerance=0.04)
+    (event,) = cell.taken
+    wanted = adapted(skill, PLACES, tolerance=0.04)
+    assert event.payload == cell.kept[0] == wanted.file
+    assert type(event.value) is Skill  # without its file, which a recording has beside it
+    assert event.value.digest == wanted.digest
+
+
+def test_what_is_taught_is_in_force_again_after_a_restart(cell: Cell, skill: Skill) -> None:
+    cell.client.add(PLACES[:2], tolerance=0.04)
+    assert SavedViaPoints(cell.settings).read(skill) == (PLACES[:2], 0.04)
+    cell.client.ask("via_points", {"op": "clear"})
+    restored = SavedViaPoints(cell.settings).read(skill)
+    assert restored is not None
+    assert restored[0] == ()
+
+
+def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
+    cell.client.add(PLACES)
+    saved = cell.folder / "state" / cell.settings.cell
+    assert stat.S_IMODE(next(saved.glob("places-*.json")).stat().st_mode) == 0o600
+    assert stat.S_IMODE(saved.stat().st_mode) == 0o700
+
+
+def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
+    (cell.folder / "state").write_text("a file where a folder is needed")
+    with pytest.raises(RefusedError, match="via-points"):
+        cell.client.add(PLACES)
+    assert cell.kinds() == []
+    assert cell.names() == []
+
+
+NOT_EMPTY: list[tuple[Any, str]] = [
+    ({"now": True}, "$: unknown field 'now'; known are none"),
+    (None, "$: null (or NaN) given; an object with its fields needed"),
+    (b"hold!", "not JSON: JSON is malformed"),
+]
+REFUSED: dict[str, list[tuple[Any, str]]] = {
+    "via_points": [
+        (add(point(left=[1.0, 2.0])), "$.points[0].left: 2 numbers, 3 needed"),
+        (add(point(), point(name="b", tool=[0.1] * 4)), "$.points[1].tool: 4 numbers, 3 needed"),
+        (add(point(left=[0.1, "x", 0.3])), "$.points[0].left[1]: 'x' given; -10 to 10 m accepted"),
+        (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
+        (add(point(left="here")), "$.points[0].left: 'here' given; 3 numbers needed"),
+        (add(point(right=None)), "$.points[0]: field `right` is missing"),
+        (
+            add(point(nam="b")),
+            "$.points[0]: unknown field 'nam'; known are name, left, right, tool, std, radius, follow",
+        ),
+        (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
+        (add(point(name="a/b")), "$.points[0].name: "),
+        (add(point(name="x" * 65)), "$.points[0].name: '"),
+        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
+        (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
+        (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
+        (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
+        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, ("),
+        (
+            add(point(tool=[0.2, 0.0, 0.3])),
+            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach by 0.145 m: 0.35 to 0.88 m from the",
+        ),
+        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m"),
+        (add(), "$.points: none given, 1 to 100 needed"),
+        (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
+        (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
+        ({"op": "add"}, "$: field `points` is missing"),
+        (
+            {"op": "remove", "names": ["nothing"]},
+            "$.names[0]: no via-point 'nothing'; in force: handover, glass, soldering",
+        ),
+        (
+            {"op": "remove", "names": ["glass", "nothing"]},
+            "$.names[1]: no via-point 'nothing'; in force: handover, glass, soldering",
+        ),
+        ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
+        ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),
+        ({"op": "lst"}, "$.op: 'lst' given; add, remove, clear, list accepted"),
+        ({}, "$: field `op` is missing"),
+        ([], "$: [] given; an object with its fields needed"),
+        (b'{"op":', "not JSON: Input data was truncated"),
+        (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
+        (b"\xff\xfe", "not JSON: JSON is malformed"),
+        (b"[" * 100_000, "not JSON: maximum recursion depth"),
+        (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
+    ],
+    "skill": [
+        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder; its skills: soldering"),
+        *(({"name": name}, "$.name: ") for name in (".npz", "a/b", "", "x" * 129)),
+        ({"name": 3}, "$.name: 3 given; 1 to 64 letters"),
+        ({}, "$: field `name` is missing"),
+    ],
+    "hold": NOT_EMPTY,
+    "resume": NOT_EMPTY,
+    "reset": NOT_EMPTY,
+}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "request_", "message"),
+    [(suffix, *row) for suffix, rows in REFUSED.items() for row in rows],
+    ids=lambda value: str(value)[:60] if isinstance(value, str) else "",
+)
+def test_a_request_is_refused_whole_and_with_a_reason(
+    taught_cell: Cell, suffix: str, request_: Any, message: str
+) -> None:
+    assert taught_cell.refusal(suffix, request_).startswith(message)
+
+
+# --- skills and stages ---
+
+
+@pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
+def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
+    cell: Cell, skill: StoredSkill, name: str
+) -> None:
+    cell.client.add(PLACES)
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    other = with_file(replace(skill, learned_from="other demonstrations"))
+    (cell.folder / "other.npz").write_bytes(other.file)
+    assert cell.client.ask("skill", {"name": "other"})["points"] == []
+    assert cell.taken[-1].value.digest == other.digest
+    assert cell.names() == []
+    cell.client.add(PLACES[:1])
+    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    assert len(cell.client.load_skill("other").points or ()) == 1
+
+
+def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
+    cell.running = False
+    with pytest.raises(RefusedError):
+        cell.client.add(PLACES)
+    monkeypatch.undo()
+    cell.running = True
+    cell.client.ask("hold")  # taken after whatever else waits
+    assert cell.kinds() == ["hold"]
+    assert cell.names() == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../secret", "..", "/etc/passwd", "sub/inside", "a\0b", "link", "loop", "pipe", ".hidden", "x" * 200),
+        *("{folder}/../secret", "{folder}/soldering", "soldering.npz/../../secret", "~/secret", "secret\n", ""),
+    ],
+)
+def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_path: Path, name: str) -> None:
+    """What lies elsewhere is not loaded, however it is named; nor is told where it is."""
+    outside = tmp_path / "elsewhere"
+    outside.mkdir()
+    for path in (outside / "secret.npz", cell.folder.parent / "secret.npz", cell.folder / ".hidden.npz"):
+        path.write_bytes(skill.file)
+    (cell.folder / "sub").mkdir()
+    (cell.folder / "sub" / "inside.npz").write_bytes(skill.file)
+    (cell.folder / "link.npz").symlink_to(outside / "secret.npz")
+    (cell.folder / "loop.npz").symlink_to(cell.folder / "loop.npz")
+    os.mkfifo(cell.folder / "pipe.npz")
+    with pytest.raises(RefusedError) as refused:
+        cell.client.ask("skill", {"name": name.format(folder=cell.folder)})
+    assert str(refused.value).startswith("$.name")
+    assert str(outside) not in str(refused.value)
+    assert cell.kinds() == []
+    assert cell.failures == []
+
+
+def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
+    (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
+    assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
+    (taught_cell.folder / "broken.npz").unlink()
+
+
+def test_the_stage_of_the_task_is_told_by_client_and_command(
+    cell: Cell, sessions: tuple[zenoh.Session, zenoh.Session], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "There are: start, handover, glass, soldering" in cell.refusal("stage", {"name": "elsewhere"})
+    reply = cell.client.set_stage("glass")
+    assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "stage")
+    command = ["stage", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
+    for mode, reason, told in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
+        cell.mode, cell.reason = mode, reason
+        assert main(command) == 0
+        assert re.search(rf"^at soldering since tick \d+: {re.escape(told)}$", capsys.readouterr().out, re.MULTILINE)
+    assert cell.kinds()[-3:] == ["stage"] * 3
+
+
+def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a_warning(
+    sessions: tuple[zenoh.Session, zenoh.Session], skill: StoredSkill, skill_worker: SkillWorker, tmp_path: Path
+) -> None:
+    positions = skill.tool_positions
+    half = Reach(min_x=float(np.quantile(positions[:, 0], 0.4)))  # 40 % are nearer to the base
+    for reach, is_refused in ((FAR_LEFT, True), (half, False)):
+        folder = tmp_path / str(is_refused)
+        folder.mkdir()
+        number = int(np.count_nonzero(beyond_m(Settings(reach=reach), positions)))
+        sentence = (
+            f"{number} of {len(positions)} places of the tool in skill 'soldering' are out of the arm's reach, the"
+        )
+        with contextlib.closing(Cell(*sessions, skill, skill_worker, folder, reach)) as cell:
+            if is_refused:
+                assert sentence in cell.refusal("skill", {"name": "soldering"})
+                assert cell.kept == []
+            else:
+                (warning,) = cell.client.load_skill("soldering").warnings
+                assert warning.startswith(sentence)
+                assert cell.kinds() == ["skill"]
+
+
+@pytest.mark.parametrize("reach", [FAR_LEFT, Reach(min_x=0.95)])
+def test_a_skill_out_of_reach_is_not_served(
+    reach: Reach, skill: StoredSkill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "soldering.npz").write_bytes(skill.file)
+    settings = Settings(files=Files(state=str(tmp_path)), reach=reach)
+    with pytest.raises(SkillError, match=r"places of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: "):
+        load_skill(tmp_path / "soldering.npz", settings)
+    served = load_skill(tmp_path / "soldering.npz", Settings(files=Files(state=str(tmp_path))))
+    assert served.digest == skill.digest
+    assert caplog.text == ""
+
+
+# --- hold, resume and reset ---
+
+
+class SlowWorkshop(SkillWorker):
+    """A skill worker in this process that adapts when it is let."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.let = threading.Event(), threading.Event()
+
+    def adapt(
+        self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float, timeout_s: float = 0.0
+    ) -> Skill:
+        self.begun.set()
+        assert self.let.wait(20)
+        return adapted(skill, places, tolerance=tolerance)
+
+
+@pytest.fixture
+def slow() -> Iterator[SlowWorkshop]:
+    running = SlowWorkshop()
+    yield running
+    running.close()
+
+
+@pytest.mark.parametrize("suffix", ORDERS)
+def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suffix: str) -> None:
+    first, second = cell.client.ask(suffix), cell.client.ask(suffix, {})
+    assert 0 < first["tick"] < second["tick"]
+    assert cell.kinds() == [suffix, suffix]
+
+
+def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
+    (reply,) = cell.session.get(channels.key(cell.settings.cell, "hold"), timeout=10.0)
+    assert reply.ok is not None
+    assert cell.kinds() == ["hold"]
+
+
+def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
+    cell.running = False
+    with pytest.raises(RefusedError, match="the loop did not take the request: it is starting, ending or stalled"):
+        cell.client.ask("hold")
+
+
+def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop) -> None:
+    cell = opened(slow)
+    with ThreadPoolExecutor(1) as pool:
+        teaching = pool.submit(cell.client.add, PLACES)
+        assert slow.begun.wait(10)
+        held = cell.client.ask("hold")
+        assert cell.kinds() == ["hold"]
+        assert cell.client.ask("status")["cell"] == cell.settings.cell
+        slow.let.set()
+        taught = teaching.result(20)
+    assert cell.kinds() == ["hold", "skill"]
+    assert held["tick"] < taught.tick
+
+
+def test_requests_that_wait_are_answered_before_the_end(
+    opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop
+) -> None:
+    cell = opened(slow)
+    with ThreadPoolExecutor(2) as pool:
+        teaching = pool.submit(cell.client.add, PLACES)
+        assert slow.begun.wait(10)
+        closing = pool.submit(cell.close)
+        slow.let.set()
+        assert teaching.result(20).points
+        closing.result(20)
+
+
+def test_a_pending_event_tells_the_tick_that_took_it() -> None:
+    event = Event("hold", b"", None)
+    pending = PendingEvent(event)
+    assert pending.claimed(42) is event
+    assert pending.wait() == 42
