@@ -109,7 +109,7 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
 
 @functools.cache
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
-    """For commands to these joints: bytes between stamp and first number, and layout of the rest."""
+    """For commands to these joints: bytes between stamp and first number, layout of the rest."""
     n = len(names)
     empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
     return empty[_STAMPED : len(empty) - layout.size], layout
