@@ -1,7 +1,7 @@
 """ROS 2 messages in CDR, little endian: the bytes of every stream on the wire and of every message
 in a recording.
 
-Written by hand because the loop encodes and decodes several a tick, in a microsecond each.
+Written by hand because the loop encodes and decodes several per tick, in a microsecond each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from service.contract.messages import (
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
-_STAMP = struct.Struct("<II")  # ROS 2 calls the seconds signed: as unsigned ones they last until 2106
+_STAMP = struct.Struct("<II")  # seconds are signed in ROS 2; unsigned ones last until 2106
 _LENGTH = struct.Struct("<I")
 _POSE = struct.Struct("<7d")
 _COVARIANCE = struct.Struct("<36d")
@@ -30,17 +30,19 @@ _TICK = struct.Struct("<qII")
 _ATTACHMENT = struct.Struct("<Qqq")
 _STAMPED = 12  # bytes of header and stamp
 _MOST_LAYOUTS = 16
-_LONGEST = 8192  # bytes of what the loop reads: the time it takes is bounded
+_LONGEST = 8192  # bytes; bounds the time in which the loop reads a message
 
 
 def _stamp(stamp_ns: int) -> tuple[int, int]:
-    """A time that does not fit loses its upper bits: no clock, however wrong, stops the loop."""
+    """Seconds and nanoseconds of a stamp. Upper bits that do not fit are dropped, so that no clock,
+    however wrong, stops the loop.
+    """
     seconds, nanoseconds = divmod(stamp_ns, _NS)
     return seconds & 0xFFFFFFFF, nanoseconds
 
 
 class Writer(bytearray):
-    """CDR bytes, put together piece by piece."""
+    """A writer that assembles CDR bytes piece by piece."""
 
     def __init__(self) -> None:
         super().__init__(CDR_HEADER)
@@ -94,8 +96,8 @@ def encode_joints(message: JointState) -> bytes:
 
 
 def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
-    """The layout of so many positions, velocities and efforts, each behind its count but for the
-    first, whose count stands before.
+    """The layout of positions, velocities and efforts with these counts. The count of velocities
+    and of efforts precedes them; that of positions precedes the layout.
     """
     layout, at = f"<{counts[0]}d", 0
     for count in counts[1:]:
@@ -107,7 +109,7 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
 
 @functools.cache
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
-    """What is between stamp and first number of commands to these joints; the layout after it."""
+    """For commands to these joints: bytes between stamp and first number, layout of the rest."""
     n = len(names)
     empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
     return empty[_STAMPED : len(empty) - layout.size], layout
@@ -116,8 +118,8 @@ def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
 def encode_command(
     stamp_ns: int, names: tuple[str, ...], position: Sequence[float], velocity: Sequence[float]
 ) -> bytes:
-    """CDR bytes of the JointState that commands the joints named [rad, rad/s]; as `encode_joints`,
-    in a tenth of its time.
+    """CDR bytes of the JointState that commands the joints [rad, rad/s]; the same as
+    `encode_joints`, in a tenth of the time.
     """
     prefix, layout = _command_layout(names)
     head = CDR_HEADER + _STAMP.pack(*_stamp(stamp_ns)) + prefix
@@ -135,8 +137,8 @@ def encode_numbers(values: Sequence[float]) -> bytes:
 def encode_trajectory(
     names: tuple[str, ...], position: Sequence[float], velocity: Sequence[float], within_ns: int
 ) -> bytes:
-    """CDR bytes of a `trajectory_msgs/msg/JointTrajectory` that begins when it comes: one point
-    [rad, rad/s], reached so soon [ns].
+    """CDR bytes of a `trajectory_msgs/msg/JointTrajectory` that starts on arrival: one point [rad,
+    rad/s], reached after a time [ns].
     """
     out = Writer()
     out.header(0, "")
@@ -156,7 +158,7 @@ def encode_diagnostics(stamp_ns: int, level: int, name: str, message: str, value
     out.header(stamp_ns, "")
     out.pack(_LENGTH, 1, align=4)
     out.append(level)
-    for text in (name, message, name):  # the last one of them is the hardware
+    for text in (name, message, name):  # the third is the hardware
         out.string(text)
     out.pack(_LENGTH, len(values), align=4)
     for text in (text for pair in values.items() for text in pair):
@@ -183,8 +185,8 @@ def encode_transforms(stamp_ns: int, transforms: Sequence[Transform]) -> bytes:
 
 
 def encode_tick(index: int, events: Sequence[int], lost: int) -> bytes:
-    """CDR bytes of a `thirdhand/msg/Tick`: its index, how many before it were lost, the numbers of
-    its events' kinds in inbox order.
+    """CDR bytes of a `thirdhand/msg/Tick`: its index, the number of lost ticks before it, and the
+    numbers of its events' kinds in inbox order.
     """
     return CDR_HEADER + _TICK.pack(index, lost, len(events)) + bytes(events)
 
@@ -195,7 +197,7 @@ def encode_skill(data: bytes) -> bytes:
 
 
 def encode_record(data: bytes) -> bytes:
-    """CDR bytes of a record of fixed layout (see `records`), which need no more than the header."""
+    """CDR bytes of a record of fixed layout (see `records`): the header and the record."""
     return CDR_HEADER + data
 
 
@@ -206,7 +208,7 @@ def _stamp_ns(sec: int, nanosec: int) -> int:
 
 
 class Reader:
-    """A cursor over CDR bytes; every read is checked against the end."""
+    """A cursor over CDR bytes; reads beyond the end raise WireError."""
 
     def __init__(self, data: bytes, most: int | None = None) -> None:
         if most is not None and len(data) > most:
@@ -244,7 +246,7 @@ class Reader:
         return self.unpack(struct.Struct(f"<{count}d"), 8) if count else ()
 
     def skip(self, layout: struct.Struct, align: int) -> None:
-        """Passes over a sequence of items of one layout."""
+        """Skip a sequence of items of one layout."""
         if count := self.length():
             self.unpack(struct.Struct(f"{count * layout.size}x"), align)
 
@@ -275,11 +277,11 @@ def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
 
 
 class _JointLayout(NamedTuple):
-    """What messages of one length from one source have in common."""
+    """The common part of messages of one length from one source."""
 
-    fixed: bytes  # what follows the stamp, up to the first position
-    numbers: struct.Struct  # from there on
-    counts: tuple[int, int, int]  # of positions, velocities, efforts
+    fixed: bytes  # bytes between the stamp and the first position
+    numbers: struct.Struct  # layout from the first position on
+    counts: tuple[int, int, int]  # numbers of positions, velocities, efforts
     names: tuple[str, ...]
     frame_id: str
 
@@ -290,7 +292,7 @@ _joint_layouts: dict[int, _JointLayout] = {}  # by the length of the message
 def decode_joints(data: bytes) -> JointState:
     """The JointState in CDR bytes. Raises WireError.
 
-    A source sends the same names again and again: where they are is found out once.
+    A source repeats the same names, so their place in the message is found only once.
     """
     known = _joint_layouts.get(len(data))
     if known is not None and data.startswith(known.fixed, _STAMPED) and data.startswith(CDR_HEADER):
@@ -318,7 +320,7 @@ def decode_joints(data: bytes) -> JointState:
 def _learn_layout(message: JointState, data: bytes) -> None:
     counts = len(message.position), len(message.velocity), len(message.effort)
     if not message.position or encode_joints(message) != data:
-        return  # another writer's padding: read field by field
+        return  # another writer's padding; such messages are read field by field
     numbers = _joint_numbers(counts)
     if len(_joint_layouts) >= _MOST_LAYOUTS:
         _joint_layouts.clear()

@@ -1,9 +1,9 @@
-"""The one table of channels: everything that passes between the service and others, enters its
-loop, or is recorded.
+"""The table of channels: everything that is exchanged with other programs, enters the loop, or is
+recorded.
 
-Subscribers, publishers, queryables, the kinds of events, the topics of a recording and of ROS 2,
-staleness and the table in docs/wire.md are all derived from it. A new channel is one more line here
-and, if it enters the loop, a case in `core.controller`; if the loop sends on it, a function of its
+Subscribers, publishers, queryables, kinds of events, topics of recordings and of ROS 2, staleness
+and the table in docs/wire.md are derived from it. A new channel is one more line here. If it enters
+the loop, it needs a case in `core.controller`; if the loop publishes on it, a function of
 `outgoing`; if its message is new, a codec in `cdr`, a definition in `ros2msg` and, unless it is
 only recorded, a hash in `ros2`.
 """
@@ -17,16 +17,16 @@ from typing import Any, Literal, NamedTuple
 
 from service.contract import cdr, markers, requests
 
-ENDPOINT = "tcp/127.0.0.1:7447"  # where a daemon listens and its clients look for it, unless told otherwise
+ENDPOINT = "tcp/127.0.0.1:7447"  # default endpoint of daemons and their clients
 LARGEST_REQUEST = 256 * 1024  # bytes
 _ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
 _ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
-PRESENCE = "daemon"  # below it each daemon's liveliness token, named by its Zenoh session
+PRESENCE = "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions
 PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
 
 class Codec(NamedTuple):
-    """A type of message, and how it becomes bytes and is read from them."""
+    """A message type with its encoder and decoder."""
 
     type: str  # of ROS 2, or JSON
     encoding: Literal["cdr", "json"]
@@ -57,29 +57,31 @@ FRAME, TIMING, STATE = (
 
 
 class EventKind(NamedTuple):
-    """What enters the loop: its number in recordings, for good, and how they keep it."""
+    """A kind of event that enters the loop: its permanent number in recordings, and its codec
+    there.
+    """
 
     number: int
     codec: Codec
 
 
 class Channel(NamedTuple):
-    """One line of the table."""
+    """A row of the table."""
 
-    key: str  # below the cell, unless it begins with a slash; behind one a recording's topic; the kind of an event
+    key: str  # below the cell, or a topic of recordings if it begins with a slash; also the kind of event
     codec: Codec
     direction: Literal["in", "out", "request", "recording"]
     about: str
     rate: str = "on demand"  # in words
-    every: int = 0  # ticks from one message to the next; 0: not sent by the loop
+    every: int = 0  # ticks between messages; 0: not published by the loop
     event: EventKind | None = None  # None: nothing enters the loop here
-    stale_after: tuple[str, str] | None = None  # section and name of the setting after which the source is silent
+    stale_after: tuple[str, str] | None = None  # setting (section, name) with the time after which the source is silent
     queryable: bool = False
     recorded: bool = True
 
     @property
     def kept_as(self) -> Codec:
-        """How a recording keeps what passes here."""
+        """The codec of this channel in recordings."""
         return self.event.codec if self.event else self.codec
 
 
@@ -141,7 +143,7 @@ LAST_PORT = 65535  # of IP
 
 
 def lacking(endpoint: str) -> str:
-    """What a Zenoh endpoint lacks to be one, in words; empty: nothing."""
+    """The problem with a Zenoh endpoint, in words; empty if it is valid."""
     protocol, slashes, address = _ENDPOINT.findall(endpoint)[0]
     host, _, port = re.sub("[?#].*", "", address).rpartition(":")
     if protocol in _ON_IP and port.isdecimal() and int(port) > LAST_PORT:
@@ -161,19 +163,19 @@ def key(cell: str, suffix: str) -> str:
 
 
 def presence(cell: str, session: str = "*") -> str:
-    """The key of the liveliness token by which the daemon of a Zenoh session serves a cell."""
+    """The key of the liveliness token with which the daemon of a Zenoh session serves a cell."""
     return key(cell, f"{PRESENCE}/{session}")
 
 
 def topic(cell: str, suffix: str) -> str:
-    """The topic of one channel in a recording: with a leading slash, as ROS 2 has them."""
+    """The topic of one channel in a recording, with a leading slash as in ROS 2."""
     return f"/{key(cell, suffix)}" if not suffix.startswith("/") else suffix
 
 
 def keys_by_topic(cell: str, suffixes: Iterable[str]) -> dict[str, str]:
-    """The channels' keys by their topics, also without the slash, which earlier recordings lack."""
+    """The channels' keys by topic, with and without the slash that earlier recordings lack."""
     return {name: suffix for suffix in suffixes for name in (topic(cell, suffix), key(cell, suffix))}
 
 
 STREAMS = tuple(channel for channel in CHANNELS if channel.direction == "out" and channel.every)
-"""On which a tick is published: each `every` so many."""
+"""Channels on which the loop publishes, every `every` ticks."""

@@ -64,7 +64,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Reason.NO_HANDS, Mode.HOLD, "no hands yet",
             "a hand has not been seen since the start",
             "start the tracker; `hand_age_ms` in the status names the hands that have been seen"),
-        Incident(Reason.OPERATOR, Mode.HOLD, "operator's request",
+        Incident(Reason.OPERATOR, Mode.HOLD, "operator request",
             "an operator requested a hold, or the daemon was stopped", "`thirdhand resume`"),
         Incident(Reason.ARM_NOT_READY, Mode.HOLD, "arm not ready",
             "the arm does not report its joints, does not rest within its limits, or is inside of something",

@@ -1,5 +1,5 @@
-"""Objects on the bench as `visualization_msgs/msg/MarkerArray`, in CDR: what ROS 2 tools and
-Foxglove draw as it is. Only what an object needs is kept: boxes, ellipsoids and cylinders.
+"""Objects on the bench as `visualization_msgs/msg/MarkerArray` in CDR, which ROS 2 tools and
+Foxglove draw directly. Only boxes, ellipsoids and cylinders are supported.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from service.contract import cdr
 from service.contract.messages import SceneObject, WireError
 
-SHAPES = {1: "box", 2: "ball", 3: "cylinder"}  # and the numbers of a Marker's type
+SHAPES = {1: "box", 2: "ball", 3: "cylinder"}  # by the number of a Marker's type
 NUMBERS = {shape: number for number, shape in SHAPES.items()}
 LARGEST = 16_384  # bytes
 MOST_OBJECTS = 32
 LARGEST_M, LONGEST_NAME = 10.0, 64
-_ADD = 0  # or change; other actions take away
+_ADD = 0  # the action that adds or changes a marker; others remove it
 _KIND, _COLOUR = struct.Struct("<iii"), struct.Struct("<4f")
 _PLACED, _POINT = struct.Struct("<10d"), struct.Struct("<3d")
 _UV, _COUNT, _BYTE = struct.Struct("<2f"), struct.Struct("<I"), struct.Struct("<B")
@@ -24,7 +24,7 @@ _LIFETIME = struct.Struct("<II")
 
 
 def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
-    """CDR bytes of a MarkerArray, one marker for each thing."""
+    """CDR bytes of a MarkerArray with one marker for each object."""
     out = cdr.Writer()
     out.pack(_COUNT, len(objects), align=4)
     for one in objects:
@@ -33,15 +33,15 @@ def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
         out.pack(_KIND, 0, NUMBERS[one.shape], _ADD, align=4)
         out.pack(_PLACED, *one.position, *one.orientation, *one.size, align=8)
         out.pack(_COLOUR, *one.colour, align=4)
-        out.pack(_LIFETIME, 0, 0, align=4)  # for good
-        out.pack(_BYTE, 0, align=1)  # placed anew only when said so
+        out.pack(_LIFETIME, 0, 0, align=4)  # unlimited
+        out.pack(_BYTE, 0, align=1)  # not locked to its frame
         out.pack(_COUNT, 0, align=4)  # points
-        out.pack(_COUNT, 0, align=4)  # their colours
+        out.pack(_COUNT, 0, align=4)  # colours of the points
         out.string("")  # texture
         out.header(0, "")
         out.string("")
         out.pack(_COUNT, 0, align=4)
-        out.pack(_COUNT, 0, align=4)  # and where it lies
+        out.pack(_COUNT, 0, align=4)  # texture coordinates
         out.string("")  # text
         out.string("")  # mesh
         out.string("")
@@ -51,7 +51,7 @@ def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
 
 
 def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
-    """The objects in the CDR bytes of a MarkerArray; markers of other kinds are passed over.
+    """The objects in the CDR bytes of a MarkerArray; markers of other kinds are ignored.
 
     Raises WireError.
     """

@@ -1,4 +1,4 @@
-"""The streams' messages as values: the ROS 2 ones in and out, and what rides with outputs."""
+"""The messages of the streams as values: ROS 2 messages, and the attachment of outputs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Quaternion: TypeAlias = tuple[float, float, float, float]  # x y z w
 
 
 class WireError(ValueError):
-    """Bytes that are not the message they should be."""
+    """Bytes that are not a valid message of their type."""
 
 
 class PoseStamped(NamedTuple):
@@ -47,7 +47,7 @@ class JointState(NamedTuple):
 
 
 class Transform(NamedTuple):
-    """`geometry_msgs/msg/TransformStamped` without its stamp: where a frame is in its parent,
+    """`geometry_msgs/msg/TransformStamped` without its stamp: pose of a frame in its parent,
     translation [m], rotation x y z w.
     """
 
@@ -58,8 +58,8 @@ class Transform(NamedTuple):
 
 
 class SceneObject(NamedTuple):
-    """Something on the bench, as viewers draw it: a `box`, `ball` or `cylinder` (along z) of a size
-    x y z [m], where it is in a frame, and its colour: red, green, blue and opacity, 0 to 1.
+    """An object on the bench, as viewers draw it: a `box`, `ball` or `cylinder` (along z), its pose
+    in a frame, size x y z [m] and colour (red, green, blue and opacity, 0 to 1).
     """
 
     name: str
@@ -72,8 +72,8 @@ class SceneObject(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """What rides with every output: tick index, publish time [ns], stamp of the newest hand sample
-    it answers [ns] (0: none).
+    """The attachment of every output: tick index, publish time [ns], stamp of the newest hand
+    sample that the output answers [ns] (0: none).
     """
 
     tick: int
@@ -82,8 +82,8 @@ class Attachment(NamedTuple):
 
 
 def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Position [rad] and velocity [rad/s] of the joints named, in that order, whatever order they
-    came in. Raises WireError.
+    """Position [rad] and velocity [rad/s] of the named joints, in the order of the names. Raises
+    WireError.
     """
     order = _order(message.names, names)
     if len(message.position) != len(message.names) or len(message.velocity) not in (0, len(message.names)):
@@ -96,7 +96,7 @@ def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, 
 
 @functools.lru_cache(maxsize=64)
 def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
-    """Where each of the names is among those given. Raises WireError."""
+    """The index of each name among those given. Raises WireError."""
     found = {name: i for i, name in enumerate(given)}
     missing = [name for name in names if name not in found]
     if missing:
@@ -108,5 +108,5 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def finite(values: tuple[float, ...]) -> bool:
-    """Whether no value is NaN or infinite."""
+    """True if no value is NaN or infinite."""
     return all(map(math.isfinite, values))

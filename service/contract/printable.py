@@ -1,4 +1,4 @@
-"""Text from files and from the network, made fit to be shown to people.
+"""Safe display of texts from files and from the network.
 
 A name may hold anything: line breaks, escape sequences that move a terminal's cursor, characters
 that reverse the direction of what follows. Each reader of a file or of the network passes texts
@@ -25,17 +25,17 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """The same of a message that may have several lines."""
+    """A message with several lines, each made printable."""
     return "\n".join(map(printable, text.splitlines()))
 
 
 def as_markdown(text: str) -> str:
-    """The same, so that Markdown shows it letter by letter: without emphasis, links or HTML."""
+    """A printable text escaped for Markdown, without emphasis, links or HTML."""
     return _MARKDOWN.sub(r"\\\g<0>", printable(text))
 
 
 def printable_values(value: Any) -> Any:
-    """The same of each text in what JSON held, keys included."""
+    """A value from JSON with each text made printable, keys included."""
     match value:
         case str():
             return printable(value)

@@ -1,5 +1,5 @@
-"""Who may do what on a network: each certificate's common name tells a role, and a daemon with a
-certificate of its own lets each role do what stands here and nothing else.
+"""Access control on a network: the common name of a certificate is a role. A daemon that has a
+certificate allows each role what is listed here, and nothing else.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state", "gripper/state")
 TOOL, OBJECTS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
-MOST_OF_A_ROLE = 99  # certificates: access control compares whole names, so all that may be are listed
+MOST_OF_A_ROLE = 99  # certificates of a role; access control compares whole names, so all are listed
 
 
 class Role(NamedTuple):
-    """What the holder of a certificate may do in a cell."""
+    """Rights of the holder of a certificate in a cell."""
 
     about: str
     publishes: tuple[str, ...] = ()
-    hears: bool = False  # all that the daemon publishes
-    asks: bool = False  # any request; all roles may ask for the status, and which daemons are alive
-    hears_inputs: bool = False  # what trackers and the arm publish
+    hears: bool = False  # receives everything that the daemon publishes
+    asks: bool = False  # sends any request; all roles may request the status, and list daemons
+    hears_inputs: bool = False  # receives what trackers and the arm publish
 
 
 ROLES = {
@@ -46,7 +46,7 @@ ROLES = {
 
 
 def names(role: str) -> tuple[str, ...]:
-    """The names that certificates of a role may have: `tracker`, `tracker-2` to `tracker-99`."""
+    """The accepted names of a role's certificates: `tracker`, `tracker-2` to `tracker-99`."""
     return (role, *(f"{role}-{number}" for number in range(2, MOST_OF_A_ROLE + 1)))
 
 
@@ -56,9 +56,9 @@ def access_control(
     ros2_domain: int | None = None,
     more_topics: Collection[ros2.Topic] = (),
 ) -> dict[str, Any]:
-    """Zenoh's settings by which a daemon of this cell keeps the roles apart, and lets certificates
-    of the `revoked` names do nothing. What a role may do it may do in a ROS 2 domain too, with
-    `more_topics` besides the cell's own.
+    """Zenoh's settings with which a daemon of this cell enforces the roles, and rejects
+    certificates with `revoked` names. The rights of a role hold in a ROS 2 domain too, for the
+    cell's own topics and `more_topics`.
     """
 
     def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
@@ -99,7 +99,7 @@ def access_control(
     alive, answers = [*tokens, *queries], ["query", "reply", "declare_queryable"]
     if ros2_domain is not None:
         see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
-    # two daemons see that they are two
+    # two daemons of one cell notice each other
     neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
 
     allowed = {}
@@ -111,7 +111,7 @@ def access_control(
             allowed[name] += both(f"{name} publish", ["put"], ["declare_subscriber"], published)
     allowed[DAEMON] = neighbours
     valid = {role: [name for name in names(role) if name not in revoked] for role in allowed}
-    granted = [role for role in allowed if valid[role]]  # no name at all would mean everybody
+    granted = [role for role in allowed if valid[role]]  # an empty list would mean everybody
     return {
         "access_control": {
             "enabled": True,

@@ -1,5 +1,5 @@
-"""A cell as ROS 2 sees it through rmw_zenoh: names of its topics on Zenoh, what rides with each
-message, and the liveliness tokens by which tools list them. For Iron and later.
+"""A cell as seen from ROS 2 through rmw_zenoh: its topics' keys on Zenoh, the attachment of each
+message, and the liveliness tokens from which tools list topics. For Iron and later.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from service.contract import channels
 
 LAST_DOMAIN = 232
 NODE = "thirdhand"
-TYPE_HASHES = {  # of the definitions, as REP 2011 has them; Humble has none
+TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
     "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
@@ -27,15 +27,16 @@ TYPE_HASHES = {  # of the definitions, as REP 2011 has them; Humble has none
 HEARD = tuple(channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event)
 SAID = tuple(channel for channel in channels.CHANNELS if channel.direction == "out")
 _DEPTH = 10
-_RELIABLE, _BEST_EFFORT = f"::,{_DEPTH}:,:,:,,", f"2::,{_DEPTH}:,:,:,,"  # the rest as ROS 2 has it by default
-_LATCHED = ":1:,1:,:,:,,"  # reliable, transient local: who comes later is told the last one
+_RELIABLE, _BEST_EFFORT = f"::,{_DEPTH}:,:,:,,", f"2::,{_DEPTH}:,:,:,,"  # the rest are the defaults of ROS 2
+_LATCHED = ":1:,1:,:,:,,"  # reliable, transient local: later subscribers get the last message
 _ATTACHMENT = struct.Struct("<qqB16s")
 _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
 
 
 class Topic(NamedTuple):
-    """A topic: its full name, its message type, the channel whose messages pass there, and whether
-    the cell hears it or else publishes on it; `latched`: who comes later is told the last message.
+    """A topic: its full name, its message type and the channel of its messages. The cell subscribes
+    if `heard`, and publishes otherwise. Later subscribers of a `latched` topic get the last
+    message.
     """
 
     name: str
@@ -43,10 +44,10 @@ class Topic(NamedTuple):
     channel: str
     heard: bool = False
     latched: bool = False
-    every: int = 1  # of so many messages of the channel one
+    every: int = 1  # one of this number of the channel's messages is published
 
 
-SET = (  # the setting that begins a topic's name, and the topic, of that name's end
+SET = (  # the setting with the beginning of a topic's name, and the topic with its end
     ("position_commands", Topic("", "std_msgs/msg/Float64MultiArray", "joints/command")),
     ("trajectory", Topic("", "trajectory_msgs/msg/JointTrajectory", "joints/command")),
     ("joint_states", Topic("", "sensor_msgs/msg/JointState", "joints/state", heard=True)),
@@ -58,7 +59,7 @@ SET = (  # the setting that begins a topic's name, and the topic, of that name's
 
 
 def of_settings(settings: Any) -> Iterator[Topic]:
-    """The topics that a cell's settings name: those of ros2_control, and what RViz and rqt show."""
+    """The topics named in a cell's settings: those of ros2_control, RViz and rqt."""
     for setting, topic in SET:
         if name := getattr(settings, setting):
             yield topic._replace(name=name + topic.name)
@@ -70,7 +71,7 @@ def of_channel(cell: str, channel: channels.Channel) -> Topic:
 
 
 def is_name(cell: str) -> bool:
-    """Whether a cell's name may stand before the names of ROS 2 topics."""
+    """True if a cell's name is a valid beginning of ROS 2 topics."""
     return re.fullmatch(f"{_PART}(?:/{_PART})*", cell) is not None
 
 
@@ -85,7 +86,7 @@ def key(domain: int, topic: Topic) -> str:
 
 
 def kept(key: str) -> str:
-    """The key expression under which what a publisher of this key latched is kept and found."""
+    """The key expression of the latched messages of a publisher of this key."""
     return f"{key}/@adv/**"
 
 
@@ -108,13 +109,13 @@ def tokens(domain: int, cell: str, session: str, topics: Sequence[Topic]) -> dic
 
 
 def gid(token: str) -> bytes:
-    """The 16 bytes by which the publisher of a token is known."""
+    """The 16 bytes that identify the publisher of a token."""
     return hashlib.blake2b(token.encode(), digest_size=16).digest()
 
 
 def encode_attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
-    """33 bytes, little endian, without which rmw_zenoh takes in no message: its number, when it was
-    published [ns], its publisher.
+    """The 33 bytes, little endian, that rmw_zenoh requires with each message: its number, publish
+    time [ns] and publisher.
     """
     return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
 

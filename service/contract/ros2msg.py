@@ -1,5 +1,4 @@
-"""ROS 2 message definitions as `ros2msg` schemas, with which any MCAP reader decodes what we
-record.
+"""ROS 2 message definitions as `ros2msg` schemas, with which any MCAP reader decodes recordings.
 
 The public ones are reduced to their fields; those of Frame, Timing and State follow their layouts.
 """
@@ -46,8 +45,8 @@ _DEFINITIONS = {
 
 
 def schema(message_type: str, own: Mapping[str, str] | None = None) -> str:
-    """The `ros2msg` schema of a message type like `geometry_msgs/msg/PoseStamped`, with all that it
-    depends on.
+    """The `ros2msg` schema of a message type like `geometry_msgs/msg/PoseStamped`, with its
+    dependencies.
 
     `own` are the definitions of further types, as `core.frame.definitions` has them.
     """

@@ -109,7 +109,7 @@ def _tables(report: Report) -> Iterator[Table]:
     yield Table(
         "joints",
         "Use of the joints' limits",
-        ("joint", "least distance from a limit [rad]", "of its speed limit [%]", "of its acceleration limit [%]"),
+        ("joint", "from a limit [rad]", "speed [% of limit]", "acceleration [% of limit]"),
         tuple(
             (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
         ),

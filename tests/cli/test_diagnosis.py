@@ -227,6 +227,14 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert rows(named)["rejected"] == f"right hand 3 ahead (newest as ahead: {why['refused']})"
 
 
+def test_a_status_explains_its_flags_and_a_stuck_tool_once() -> None:
+    found = rows(msgspec.structs.replace(HEALTHY, flags=("separation", "stuck")))
+    assert found["mode"] == "follow  separation, stuck"
+    assert "slows down toward it" in found["separation"]
+    assert "What to do: give it room" in found["separation"]
+    assert "stuck" not in found  # `because` has that one, with its figures
+
+
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
     silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
     found = diagnosed(mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False)

@@ -273,7 +273,7 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         assert tab.until("document.getElementById('mode').className == 'follow'")
         assert grey() == ["resume", "reset"]
         tab.picture(tmp_path / "follow.png")
-        click("hold", until="hold: operator")
+        click("hold", until="hold: operator request")
         tab.until("document.getElementById('answer').textContent != 'hold ...'")
         assert tab.ask("document.getElementById('answer').textContent").startswith("hold carried out at tick ")
         assert grey() == ["reset"]
@@ -316,7 +316,7 @@ def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_s
             with served(page.daemon, address):
                 tab.until(f"token != '{tab.ask('token')}' && document.getElementById('mode').className == 'follow'")
                 tab.ask("document.getElementById('hold').click()")
-                assert tab.until("document.getElementById('mode').textContent == 'hold: operator'")
+                assert tab.until("document.getElementById('mode').textContent == 'hold: operator request'")
                 tab.ask("document.getElementById('resume').click()")
                 assert tab.until("document.getElementById('mode').textContent == 'follow'")
     with Image.open(tmp_path / "phone.png") as image:

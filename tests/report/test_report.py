@@ -371,7 +371,7 @@ def test_without_a_stop_the_reason_is_where_hands_and_tool_came_to(session: Repo
     best_m = session.best_m("glass")
     assert best_m is not None
     assert told.startswith("with the hands where 'glass' was taught, the tool came no nearer than")
-    assert told.endswith(f" {1000 * best_m:.0f} mm of it")
+    assert told.endswith(f" {1000 * best_m:.0f} mm")
     assert why_missed(session, "attic", begun_s=0.2, start_s=0.0, end_s=1.0) == "no place 'attic' was taught"
 
 

@@ -311,7 +311,7 @@ def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_th
     assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/joints/position"], "tick")) == 30
-    assert any(text.startswith("a skill of which nothing can be drawn") for (text,) in values(rows["/log"], TEXT))
+    assert any(text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT))
 
 
 def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
