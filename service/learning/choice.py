@@ -1,5 +1,5 @@
 """Selection of hyper-parameters for takes, in metres: the reference points, and the scales of
-`kmp.direct`.
+`kmp.criteria.direct`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.direct import DirectSelection, Scales
+from kmp.criteria.direct import DirectSelection, Scales
 from service.core.frame import Vector
 from service.settings.config import ToolSettings
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.cross_validation import rms
+from kmp.criteria.cross_validation import rms
 from service.core.frame import Vector
 from service.core.skill.model import LEVELS, Regions
 from service.core.skill.skill import is_reachable

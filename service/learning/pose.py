@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import KMP, GaussianKernel, Gaussians
-from kmp.cross_validation import rms
-from kmp.direct import DirectSelection, Parameters
+from kmp.criteria.cross_validation import rms
+from kmp.criteria.direct import DirectSelection, Parameters
 from kmp.kernel import Kernel
 from kmp.orientation import continuous, log
 from service.core.frame import Vector

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.cross_validation import mahalanobis
+from kmp.criteria.cross_validation import mahalanobis
 from service.core.frame import Vector
 from service.core.skill.model import Model, Regions, standard_deviations
 from service.core.skill.pose import LearnedGripper, LearnedOrientation

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kmp.cross_validation import rms
+from kmp.criteria.cross_validation import rms
 from service.contract.records import SIDES
 from service.contract.requests import Hands
 from service.core.frame import Vector

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from kmp.cross_validation import held_out_covariances, held_out_residuals, mahalanobis, preferred, squared_distances
+from kmp.criteria.cross_validation import (
+    held_out_covariances,
+    held_out_residuals,
+    mahalanobis,
+    preferred,
+    squared_distances,
+)
 
 RANDOM = np.random.default_rng(0)
 POINTS, TARGETS = RANDOM.normal(size=(20, 2)), RANDOM.normal(size=(20, 3))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from kmp.cross_validation import mahalanobis, rms
-from kmp.direct import DirectSelection
+from kmp.criteria.cross_validation import mahalanobis, rms
+from kmp.criteria.direct import DirectSelection
 from service.core.skill.model import CHI_SQUARE, LEVELS
 from service.learning.choice import POSITION_SCALES, selection_of, thinned
 from service.learning.demonstration import Demonstration

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kmp import KMP, AffineMean, GaussianKernel, Gaussians
-from kmp.cross_validation import rms
-from kmp.direct import DirectSelection, ridge_mean
+from kmp.criteria.cross_validation import rms
+from kmp.criteria.direct import DirectSelection, ridge_mean
 from service.core.frame import Vector
 from service.core.skill.model import standard_deviations
 from service.learning.baselines import held_out_errors, linear

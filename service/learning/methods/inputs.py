@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from kmp.cross_validation import preferred
+from kmp.criteria.cross_validation import preferred
 from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER

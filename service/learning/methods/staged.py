@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
-from kmp.cross_validation import held_out_residuals, rms
+from kmp.criteria.cross_validation import held_out_residuals, rms
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array
-from kmp.cross_validation import (
+from kmp.criteria.cross_validation import (
     held_out_covariances,
     held_out_residuals,
     mahalanobis,
