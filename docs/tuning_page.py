@@ -36,7 +36,7 @@ matter there may still matter in a rare situation: look for tests of it before y
 """
 
 
-class Told(NamedTuple):
+class NumberText(NamedTuple):
     """The comments of a number: what it is, its range, and what more and less of it do."""
 
     meaning: str
@@ -46,18 +46,18 @@ class Told(NamedTuple):
     less: str
 
 
-def told(stage: str) -> dict[str, Told]:
+def told(stage: str) -> dict[str, NumberText]:
     """The comments of a stage's numbers. Raises ValueError for a number without them."""
     path = ROOT / "service" / "core" / stage / "tuning.py"
     lines = path.read_text(encoding="utf-8").splitlines()
-    out: dict[str, Told] = {}
+    out: dict[str, NumberText] = {}
     for node in ast.parse("\n".join(lines)).body:
         if isinstance(node, ast.Assign):
             record = RECORD.fullmatch(lines[node.lineno - 2])
             _, _, meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")
             if record is not None:
                 low, high, more, less = record.groups()
-                out[ast.unparse(node.targets[0])] = Told(meaning, float(low), float(high), more, less)
+                out[ast.unparse(node.targets[0])] = NumberText(meaning, float(low), float(high), more, less)
     return out
 
 

@@ -174,7 +174,7 @@ class KMP(Predictor, Plotted):
         means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
         variance = squared("deviation", deviation)
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
-        points = Functionals.checked(np.repeat(via, self._dimensions, axis=0), axes)
+        points = Functionals.checked(frozen(np.repeat(via, self._dimensions, axis=0)), axes)
         adapted = self._through(points, desired, 0.0)
         warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted

@@ -54,7 +54,7 @@ def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, caps
     assert ended.keys() == modules.keys()
     assert received.keys() == {"hands/left", "hands/right", "joints/state"}
     assert "thirdhand: follow" in said
-    assert "commands come, at tick " in said
+    assert "commands arrive, at tick " in said
     assert "were none of this arm's" not in said
     assert "example: missed by " in said
     assert "refused: $.names[0]: no via-point 'no such place'" in said

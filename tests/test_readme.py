@@ -1,4 +1,4 @@
-"""The README's program runs as it stands, and its first commands come in an order that works."""
+"""The README's program runs as it stands, and its first commands arrive in an order that works."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.ARM_INSIDE, None, "arm inside of something",
             "a part of the arm is inside of the table, of a box or of another part",
             "move the arm out by hand, or by `thirdhand reset`, which moves it out slowly; if nothing is there, "
-            "correct [table], [obstacles] or the URDF"),
+            "correct the URDF, `[table]` and `[obstacles]`"),
         Incident(Condition.HAND_SILENT, None, "no hand arrives",
             "no messages of a hand arrive", "start the tracker, connected to the daemon"),
         Incident(Condition.JOINTS_SILENT, None, "no joint states arrive",

@@ -115,7 +115,7 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
         at, joints = ("--connect", *endpoints(session)), Joints(session)
         with following(arm, *at, "--config", str(config), *more) as running:  # it waits for the daemon
             with serving(folder, *at, network=network) as daemon:
-                running.until("commands come")
+                running.until("commands arrive")
                 for attempt in range(20):
                     tracker.left = LEFT if attempt % 2 else NEAR_LEFT
                     with contextlib.suppress(TimeoutError):
@@ -128,7 +128,7 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
             time.sleep(0.3)
             assert np.abs(joints.position - stands).max() < 1e-3
             with serving(folder, *at, network=network) as daemon:
-                running.until("commands come", times=2)
+                running.until("commands arrive", times=2)
                 tracker.left = LEFT if tracker.left == NEAR_LEFT else NEAR_LEFT
                 running.waits(joints.moving)
                 daemon.end()
@@ -170,7 +170,7 @@ def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_
             Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
             done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
             assert done.returncode == 0, done.stderr
-            running.until("commands come")
+            running.until("commands arrive")
             assert running.ended() == 0
     report = json.loads(done.stdout)
     for name in ("handover", "grasp", "carry"):
@@ -191,7 +191,7 @@ def refused(*arguments: str) -> str:
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
-    assert "no arm 'frankia'; franka and simulated are shipped" in refused("frankia")
+    assert "no arm 'frankia'; franka or simulated accepted" in refused("frankia")
     assert "is a daemon or a router running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
     six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
@@ -230,7 +230,7 @@ def test_an_arm_follows_a_daemon_at_1000_hz_without_being_told_its_rate(tmp_path
     with serving(tmp_path, "--rate", "1000", network=PATIENT) as daemon, Tracker(daemon.session) as tracker:
         joints = Joints(daemon.session)
         with following("simulated", "--connect", daemon.endpoint) as running:
-            running.until("commands come")
+            running.until("commands arrive")
             for attempt in range(20):
                 tracker.left = LEFT if attempt % 2 else NEAR_LEFT
                 with contextlib.suppress(TimeoutError):
@@ -242,7 +242,10 @@ def test_an_arm_follows_a_daemon_at_1000_hz_without_being_told_its_rate(tmp_path
 
 
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
-    arm, told_so = SimulatedArm(Settings()), r"no command came on thirdhand/joints/command within 0\.3 s: is the daemon"
+    arm, told_so = (
+        SimulatedArm(Settings()),
+        r"no command arrived on thirdhand/joints/command within 0\.3 s: is the daemon",
+    )
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
         follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)

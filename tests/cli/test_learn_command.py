@@ -60,7 +60,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     out = tmp_path / "skill.npz"
     done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out), "--points", "80")
     assert done.returncode == 1
-    assert "is not written: " in done.stderr
+    assert "was not written: " in done.stderr
     assert "contradict others" in done.stderr
     assert "unsafe: " not in done.stdout
     assert not out.exists()

@@ -163,7 +163,7 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         ),
         ("via_points", {"op": "remove", "names": ["nothing"]}, "no via-point 'nothing'"),
         ("via_points", {"op": "turn"}, "$.op"),
-        ("skill", {"name": "sodlering"}, "There are: soldering"),
+        ("skill", {"name": "sodlering"}, "its skills: soldering"),
         ("skill", {"name": "../secret"}, "$.name"),
         ("hold", {"why": "so"}, "why"),
         ("via_points", {"op": "list", "a - at `$.x`": 1}, "unknown field"),
@@ -243,7 +243,7 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert "1 via-point in force" in told("via-points", "list", *at).stdout
     refused = told("via-points", "remove", "other", *at)
     assert refused.returncode == 1
-    assert "There are: my place" in refused.stderr
+    assert "in force: my place" in refused.stderr
     assert told("via-points", "clear", *at).returncode == 0
     carried = json.loads(told("status", "--json", *at).stdout)
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
@@ -258,7 +258,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
     said = capsys.readouterr().err
-    assert re.search(r"nothing taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
+    assert re.search(r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
     shared_daemon.client.ask("hold")
     with Tracker(shared_daemon.session):
         status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
@@ -266,7 +266,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
             assert main(add) == 1
-    assert "nothing taught: hands or tool did not hold still" in capsys.readouterr().err
+    assert "nothing was taught: hands or tool did not hold still" in capsys.readouterr().err
     (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
     assert point["name"] == "glass"
     np.testing.assert_allclose(point["left"], LEFT, atol=1e-3)

@@ -58,7 +58,7 @@ def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
         assert main(["status", "--watch", *reach]) == 1
         assert "starting: importing" in capsys.readouterr().err
         start.over()
-        with pytest.raises(UnreachableError, match="begins or ends") as ended:
+        with pytest.raises(UnreachableError, match="is starting or ending") as ended:
             client.status()
         assert not isinstance(ended.value, StartingError)
 
@@ -157,7 +157,7 @@ def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
 
 
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "STUCK_S", 8.0)
+    monkeypatch.setattr(launch, "START_STALL_S", 8.0)
     before = "import time\nfrom service.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
     said: list[str] = []
     stuck = r"no progress for 8 s.*last report: loading compiled functions, \d+ of \d+ functions"
@@ -168,7 +168,7 @@ def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkey
 
 def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that takes as many seconds as it says, and says so in time."""
-    monkeypatch.setattr(launch, "STUCK_S", 3.0)
+    monkeypatch.setattr(launch, "START_STALL_S", 3.0)
     slow = (
         "import sys, time\nfor i in range(8):\n    print('now starting:', i, file=sys.stderr, flush=True)\n"
         "    time.sleep(0.5)\nprint('listening on tcp/127.0.0.1:1 as cell slow', flush=True)\ntime.sleep(600)"

@@ -195,12 +195,12 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         at = ("serve", "--arm", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
         refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
         assert refused.returncode == 1
-        assert "cell thirdhand is served already" in refused.stderr
+        assert "cell thirdhand is already served" in refused.stderr
         assert f"listening on {daemon.endpoint}" in refused.stderr
         assert "Traceback" not in refused.stderr
         unseen = thirdhand("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
         assert unseen.returncode == 1
-        assert "cell thirdhand is served already on this machine" in unseen.stderr
+        assert "cell thirdhand is already served on this machine" in unseen.stderr
         assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in unseen.stderr
         assert "Traceback" not in unseen.stderr
         lock = tmp_path / "state" / "thirdhand" / "daemon.lock"

@@ -198,4 +198,4 @@ def test_what_a_skill_does_not_use_never_refuses_a_take(clean: list[Demonstratio
     np.testing.assert_array_equal(got.hands, take.hands)
     assert (got.gripper, got.places) == (None, ())
     assert any("states of the gripper have no position" in line for line in said)
-    assert any("places are not understood, and not used" in line for line in said)
+    assert any("are not readable and not used" in line for line in said)

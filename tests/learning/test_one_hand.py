@@ -61,7 +61,7 @@ def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: 
         assert (got.conducts, got.person) == (who, "Ada")
         np.testing.assert_array_equal(got.hands, led(0).hands)
         np.testing.assert_array_equal(got.tool, led(0).tool)
-        assert f"the {who} hand conducts alone" in said[0]
+        assert f"the {who} hand leads alone" in said[0]
         assert [one.name for one in summary(tmp_path / f"{who}.mcap").streams] == [who, "tool"]
 
 
@@ -137,7 +137,7 @@ def test_a_hand_that_a_take_does_not_have_is_not_needed(side: str, tmp_path: Pat
         got = read_demonstration(write_streams(path, streams), say=said.append)
         assert got.conducts == side
         np.testing.assert_array_equal(got.hands, np.tile(getattr(take, side)[:, :3], 2))
-        assert any(f"the {side} hand conducts alone" in line for line in said)
+        assert any(f"the {side} hand leads alone" in line for line in said)
     write_streams(path, streams_of_one(side, take))
     for topics in (
         {other: PoseTopic(f"cell/hands/{side}")},
@@ -154,7 +154,7 @@ def test_one_stream_for_both_hands_whose_name_says_neither_is_refused(tmp_path: 
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
     both = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
-    with pytest.raises(RecordingError, match=r"cell/tool/pose is given as left and as right: another topic needed"):
+    with pytest.raises(RecordingError, match=r"cell/tool/pose is given as left and as right; another topic needed"):
         read_demonstration(path, topics=both)
 
 

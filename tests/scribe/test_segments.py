@@ -161,7 +161,7 @@ def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
 
 
 def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segments, "LEAST_GROWTH_S", 0.5)
+    monkeypatch.setattr(segments, "MIN_GROWTH_S", 0.5)
     settings = msgspec.structs.replace(CELL, files=Files(rerun=False, segment_mb=0.3))
     paths = RecordingPaths(settings, str(tmp_path), None, None)
     one = Segments(settings, paths, say=print, draw=print)

@@ -227,7 +227,7 @@ def test_places_out_of_reach_are_moved_into_it_and_said() -> None:
             Reach(centre=(0.0, -0.05, 0.12), inner=0.23, outer=0.26),  # an SO-100
             "moved by 0.15 m: handover needs the tool 0.64 m from the shoulder; glass needs the tool 0.66 m from the "
             "shoulder; soldering needs the tool 0.64 m from the shoulder. Its tool reaches from 0.23 to 0.26 m around "
-            "its shoulder at [0.0, -0.05, 0.12], where x is at least 0.15 and z at least 0.02 m. What to do: take a",
+            "its shoulder at [0.0, -0.05, 0.12], where x is at least 0.15 and z at least 0.02 m. What to do: use a",
         ),
         (Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.45), "handover needs the tool 0.61 m from the shoulder; "),
         (Reach(min_x=0.6), "handover needs the tool at x = 0.54, z = 0.38 m; glass needs the tool at x = 0.50, z = "),

@@ -294,7 +294,7 @@ def test_an_arm_elsewhere_is_scored_by_its_joint_states(network: tuple[zenoh.Ses
     reports: list[RunReport] = []
     script, arm = HandScript(SCENE, seed=1, speed=20.0), threading.Thread(target=tell)
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
-        with pytest.raises(BenchError, match="no arm tells its joints on lab/joints/state"):
+        with pytest.raises(BenchError, match="no joint states arrive on lab/joints/state"):
             run(bench, session, Live(cell="lab", wait_s=1.0), stop=threading.Event(), report=reports.append)
         assert set(told) == {"lab/hands/left", "lab/objects"}
         arm.start()
@@ -334,7 +334,7 @@ def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
     ) as process:
         assert process.stderr is not None
         for line in process.stderr:
-            if "the hands go back" in line:
+            if "the hands move back" in line:
                 process.send_signal(signal.SIGTERM)
                 break
         rest = process.stderr.read()

@@ -38,7 +38,7 @@ BRAKE_RAMP_S = 0.08  # time until a deceleration has built up, and until a hand'
 LOOKAHEAD_S = 0.5 * BRAKE_RAMP_S * np.arange(5.0)  # times ahead at which the rule is evaluated
 # 0.05 to 0.5. More: new hands are trusted sooner. Less: the arm waits longer.
 UNKNOWN_VELOCITY_STD_MPS = 0.2  # a hand with a larger standard deviation is assumed to approach at `unknown_speed`
-# 1 to 20. More: the arm retreats sooner. Less: unseen hands may surprise it.
+# 1 to 20. More: the arm retreats sooner. Less: hands may appear closer than planned.
 UNSEEN_ACCELERATION_MPS2 = 5.0  # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
 # 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
 CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a via-point's radius, on each axis
