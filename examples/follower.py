@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> list[float]:
             if braking != (command is None):
                 braking = not braking
                 print(
-                    "no command for 20 ms: it brakes" if command is None else f"commands come, at tick {command.tick}"
+                    "no command for 20 ms: it brakes" if command is None else f"commands arrive, at tick {command.tick}"
                 )
             follower.tell(joints, velocity)
             time.sleep(PERIOD_S)

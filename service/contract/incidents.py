@@ -214,7 +214,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "find what holds samples up: the network, or a publisher or daemon that is too busy"),
         Incident(Condition.WRONG_UNIT, None, "wrong unit",
             "positions look to be in another unit than `[hands] unit`",
-            "write the tracker's unit under [hands] in the cell's settings, and restart the daemon"),
+            "write the tracker's unit under `[hands]` in the cell's settings, and restart the daemon"),
         Incident(Condition.DEGREES, None, "joints in degrees",
             "joint positions look to be in degrees", "publish joints in radians"),
     ),

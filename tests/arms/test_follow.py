@@ -134,7 +134,7 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
                 daemon.end()
                 running.until("the arm brakes", times=2)
             assert running.ended() == 0
-    assert re.search(r"ended at rest, -?\d+\.\d ticks behind; 0 commands were refused", running.said[-1])
+    assert re.search(r"ended at rest; delay -?\d+\.\d ticks; 0 commands were refused", running.said[-1])
 
 
 PATIENT = """[network]
