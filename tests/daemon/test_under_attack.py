@@ -287,7 +287,7 @@ def test_requests_beyond_the_bound_are_refused_at_once(daemon: Daemon) -> None:
     refused = [reply.err.payload.to_string() for reply in answers if reply.err is not None]
     assert len(answers) == 40
     assert refused
-    assert set(refused) == {"busy: 16 teaching requests wait already; try again later"}
+    assert set(refused) == {"busy: 16 teaching requests are waiting; try again later"}
     assert daemon.client.ask("via_points", {"op": "clear"})["points"] == []
 
 
