@@ -29,7 +29,16 @@ NAMES = ("left", "right", "tool")
 OFF_M = 0.005  # what is farther than this from the truth is bad
 SEEDS = 2
 CHECK = ("MAX_HAND_MPS2",)
-OFFSETS = ("HALF_WINDOW", "STEP_M", "UNUSUAL_RATIO", "USUAL_PERCENTILE", "USUAL_S", "MAX_REMAINDER", "MAX_BESIDE", "MAX_JUMP_S")
+OFFSETS = (
+    "HALF_WINDOW",
+    "STEP_M",
+    "UNUSUAL_RATIO",
+    "USUAL_PERCENTILE",
+    "USUAL_S",
+    "MAX_REMAINDER",
+    "MAX_BESIDE",
+    "MAX_JUMP_S",
+)
 AROUND = {"USUAL_PERCENTILE": (60, 90), "HALF_WINDOW": (2, 8)}
 INTAKE = "_intake_verdicts"  # what takes longest, and is the same whatever these constants are
 SETTINGS = Settings()
