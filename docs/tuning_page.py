@@ -46,7 +46,7 @@ class NumberText(NamedTuple):
     less: str
 
 
-def told(stage: str) -> dict[str, NumberText]:
+def texts_of(stage: str) -> dict[str, NumberText]:
     """The comments of a stage's numbers. Raises ValueError for a number without them."""
     path = ROOT / "service" / "core" / stage / "tuning.py"
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -83,7 +83,7 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any], tun
     """The heading and the table of a stage."""
     yield f"\n## {stage.capitalize()}\n\n| number | value | range | meaning | more | less | measured |\n"
     yield "|---|---|---|---|---|---|---|\n"
-    comments = told(stage)
+    comments = texts_of(stage)
     for one in numbers:
         words = comments[one.name]
         found = _measured(measured[one.key], tuned) if one.key in measured else "not yet"

@@ -57,7 +57,7 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 
 def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
     page = program("tuning_page")
-    comments = {stage: page.told(stage) for stage in page.STAGES}
+    comments = {stage: page.texts_of(stage) for stage in page.STAGES}
     for one in page.tuning().numbers.values():
         words = comments[one.stage][one.name]
         assert words.meaning, one.key
