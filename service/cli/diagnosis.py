@@ -207,7 +207,7 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
 
 
 def _unit_advice(source: Source) -> str:
-    """What to do if the rejected samples seem to be in another unit; empty otherwise."""
+    """The remedy if the rejected samples seem to be in another unit; empty otherwise."""
     looks = re.search(r"looks like (\w+)", source.refused)
     if looks is None or source.cause != "out_of_range":
         return ""

@@ -119,7 +119,7 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
 
 
 def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
-    """What was found, and what to do if the figures show a closer cause; empty otherwise."""
+    """The finding and its remedy if the figures show a closer cause; empty otherwise."""
     found, closer = "", ""
     match reason:
         case Reason.NO_HANDS | Reason.STALE_HAND:
@@ -234,7 +234,7 @@ def _joint_error(seen: Evidence) -> str:
 
 
 def _contradiction(seen: Evidence) -> str:
-    """How the arm's states of the last second contradict each other; empty if they do not."""
+    """The contradiction among the arm's states of the last second; empty if there is none."""
     if (arm := seen.sources.get("arm")) is None:
         return ""
     if arm.contested > seen.contested:
@@ -257,7 +257,7 @@ def _rate_too_low(seen: Evidence, name: str) -> str:
 
 
 def _silence(seen: Evidence) -> str:
-    """How long the arm has not reported its joints, or that it does so too rarely; else empty."""
+    """The time without joint states, or their rate if it is too low; empty otherwise."""
     source = seen.sources.get("arm")
     if rate := _rate_too_low(seen, "arm"):
         return f"joint states arrive {rate}"
@@ -267,7 +267,7 @@ def _silence(seen: Evidence) -> str:
 
 
 def _not_ready(seen: Evidence) -> tuple[str, str]:
-    """What keeps the arm from being ready, and what to do about that."""
+    """The condition that keeps the arm from being ready, and its remedy."""
     source, out = seen.sources.get("arm"), seen.outside
     if source is None:
         return "", ""
@@ -302,7 +302,7 @@ def _is_rejected(source: Source) -> bool:
 
 
 def _rejected_remedy(seen: Evidence, *needed: str) -> str:
-    """What to do about the first needed source whose samples are all rejected; empty otherwise."""
+    """The remedy for the first needed source whose samples are all rejected; empty otherwise."""
     rejected = (source for name in needed if (source := seen.sources.get(name)) is not None and _is_rejected(source))
     return next((source.advice or what_to_do(source.cause) for source in rejected), "")
 

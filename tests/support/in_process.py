@@ -95,7 +95,7 @@ def assert_limits_hold(seen: np.ndarray, cell: Settings = ASSUMED) -> None:
 
 class Loop:
     """A controller and an arm that is where it was commanded, which reports its joints and their
-    velocities as `reports` says. The hands are where `hands` has them in a tick.
+    velocities as `reports` says. The hands are where `hands` has them in a tick; None: unseen.
     """
 
     def __init__(self, cell: Settings, skill: Skill, start: Vector | tuple[float, ...] | None = None) -> None:
@@ -103,7 +103,7 @@ class Loop:
         self.joints = np.array(cell.arm.posture if start is None else start)
         self.speed = np.zeros(len(self.joints))
         self.reports: Callable[[Vector, Vector], tuple[Vector, Vector]] = lambda q, dq: (q, dq)
-        self.hands: Callable[[int], Vector] = lambda k: np.array((LEFT, RIGHT))
+        self.hands: Callable[[int], Vector] | None = lambda k: np.array((LEFT, RIGHT))
         self.index = 0
         self.steps: list[tuple[Tick, Frame]] = []
         self._names = cell.joints.names
@@ -116,7 +116,7 @@ class Loop:
     def step(self, *events: Event, is_heard: bool = True) -> Frame:
         """One tick; in every fifth the hands are seen."""
         k = self.index
-        inbox = list(seen(self.hands(k), k)) if k % 5 == 0 else []
+        inbox = list(seen(self.hands(k), k)) if self.hands is not None and k % 5 == 0 else []
         if is_heard:
             joints, speed = (tuple(part.tolist()) for part in self.reports(self.joints, self.speed))
             inbox.append(joints_event(self._names, joints, speed, stamp_ns(k)))
