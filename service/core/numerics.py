@@ -13,6 +13,14 @@ PROBABILITY_ROUND_TO = 1e12  # probabilities are rounded, so that a replay on an
 GAIN_DECIMALS = 6  # gains are rounded, so that a replay on another kind of CPU agrees
 SLOWEST_PER_S = 0.2  # [1/s] the tracker's Riccati equation is not solved reliably for a lower rate
 
+LEAST_PULL_VARIANCE_SHARE = 1e-6  # added variance, so that exact via-points remain solvable
+# Steps that are fine enough: half and twice of them change nothing that is measured.
+MOTION_STEP_S = 0.02  # step of the differences along the hands' motion
+MEMORY_STEP_S = 0.004  # step of the memory's filters along a demonstration
+
+LEAST_SPEED_MPS = 1e-3  # below this speed a motion has no direction
+STOP_SECANT_TOLERANCE_M = 1e-3  # the search for a jerk ends when the stop leaves less than this distance unused
+
 # Inputs are clipped to these before anything is calculated; larger ones are errors elsewhere.
 LARGEST_USABLE = 1e6  # a state of the joints with a larger number is rejected
 MAX_JOINT_RAD = 1e4
@@ -24,4 +32,6 @@ MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow
 BOUND_ROUNDS = 12  # largest number of rounds in which a joint is held at its bound or released
 CONSTRAINT_ROUNDS = 40  # largest number of rounds in which an inequality is added or removed
 BELIEF_PERIODS = 20  # number of updates after which the belief of hands at rest has converged
+STOP_SECANTS = 8  # largest number of secant steps; in long periods the stopping distance is not linear in jerk
+STOP_SAMPLES = 16  # the tool's speed is checked at 15 times, which divide the stop into 16 parts
 CAPSULE_FITS = 101  # number of lengths that are tried for a capsule

@@ -29,16 +29,16 @@ from service.contract.records import Cause, Reason
 from service.core.frame import Vector, as_array, blank, state_layout
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
-from service.core.intake.tuning import AGREE_MPS, CONTESTED_MEMORY_S, CONTESTED_OFF_SHARE, SCATTER_OFF_M
+from service.core.intake.tuning import CONTESTED_OFF_SHARE, SCATTER_OFF_M, TRACKER_MEMORY_S
 from service.files.track import Track
 from service.files.track_offsets import STEP_M, displaced
 from service.settings.config import HandSettings, Settings
 
 # `track_offsets` explains ranges and measured sensitivities.
 # [m/s²] A step with more acceleration is a leap. Range 70 to 200: larger values miss jumps that
-# last
-# to the end of a take, smaller ones remove fast motion.
+# last to the end of a take, smaller ones remove fast motion.
 MAX_HAND_MPS2 = 100.0  # missed 0.5, 0.3, 1.2 %; removed 0.03, 0.31, 0.03 %
+UNSAMPLED_MPS = 2.0  # a hand moves at most this fast between two pieces of its track
 # [s] A shorter piece between two bad stretches is left out with them. Range 0.1 to 0.5.
 LEAST_PIECE_S = 0.3  # good time left out beside bad stretches 1.4, 1.4, 1.9 %
 
@@ -173,7 +173,7 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
             if state["contested"][one] > CONTESTED_OFF_SHARE or state["noise_variance"][one] > SCATTER_OFF_M**2:
                 disputed_ns[one].append(stamp_ns + start_ns)
     for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
-        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * CONTESTED_MEMORY_S))
+        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TRACKER_MEMORY_S))
         for i in np.flatnonzero(mask).tolist():
             verdict.why[i] = Distrust.CONTESTED
     return out
@@ -239,7 +239,7 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     before = [-1] * len(begins)
     for run in range(1, len(begins)):
         off = np.linalg.norm(at[begins[run]] - at[ends[:run]], axis=1)
-        possible = off <= hands.jump + AGREE_MPS * (seconds[begins[run]] - seconds[ends[:run]])
+        possible = off <= hands.jump + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
         possible[-1] &= not is_leap[ends[run - 1]]
         if possible.any():
             before[run] = int(np.argmax(np.where(possible, total[:run], -1.0)))

@@ -128,6 +128,7 @@ _SENSITIVITY = Seeds(  # four seeds of each session
         "hands": Stream("hands", 0, range(300, 304)),
         "scenes": Stream("random scene", 2026, range(300, 304)),
         "made": Stream("made task three", 2, range(30, 42)),
+        "untold": Stream("made task one_hand", 2, range(30, 42)),
     },
     learned=_SHIPPED,
 )

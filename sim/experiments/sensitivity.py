@@ -41,7 +41,9 @@ from numba.extending import intrinsic
 from sim.experiments.results import ExperimentError
 
 if TYPE_CHECKING:  # the rest of the service is imported after `begin`
+    from service.settings.config import Settings
     from sim.experiments.people.moving_hands import Moving
+    from sim.experiments.rehearsal import Rehearsed
     from sim.experiments.results import Array, Options, Results
 
 Figures: TypeAlias = dict[str, dict[str, float]]
@@ -53,10 +55,15 @@ ROOT = Path(__file__).parents[2]
 STAGES = ("intake", "skill", "setpoint", "arm", "separation", "limiter", "decision")  # in the order of measurement
 FACTORS = (0.5, 2.0)
 EVENTS = ("handover", "grasp", "carry")
-MADE = "three"  # kind of made task for `partners`
+MADE, UNTOLD_KIND = "three", "one_hand"  # kinds of made tasks: for `partners`, and for `untold`
+SOFT_JERK = 5.0  # [m/s³] of a tool that is moved softly
+AT_REST_S = 0.3  # at the end of a stop
+BOX = ((0.52, -0.2, 0.36), (0.08, 0.04, 0.3))  # centre and half size [m] of a box on the way to the handover
 MOTION_S, CALM_S = 4.0, 2.5  # length of the sequences
 SLOW_MPS, APART_M = 0.005, 0.04  # speed of a slow hand; distance between the positions of two sources
 UNSEEN_S, TWO_S = (2.0, 0.3), (3.0, 1.0)  # middle and length of the time without one hand, and with two sources
+BURSTS, BURST, BURST_M = 4, (1, 5), (0.05, 0.4)  # bursts of outliers: how many, of how many samples, how far away
+EXCHANGED_S = (3.0, 0.3)  # middle and length of the time in which the tracker takes each hand for the other one
 LIMIT_S = 300  # a value that takes longer has no figures
 ROOM = 1024  # float64 values for which there is memory
 
@@ -154,7 +161,7 @@ def tuning() -> Tuning:
             replace.visit(node) if isinstance(node, ast.ImportFrom) else None
         for name, formula in _assigned(tree):
             if _named(formula):
-                found.reads[f"{stage}.{name}"] = replace.visit(formula)
+                found.reads[f"{stage}.{name}"] = replace.named[name] = replace.visit(formula)
     return found
 
 
@@ -180,13 +187,13 @@ class _Reads(ast.NodeTransformer):
     def __init__(self, path: str, reads: Mapping[str, ast.expr], stage: str = "", *, inside: bool = False) -> None:
         """`stage` is that of a `tuning.py`, whose own names are replaced too."""
         self._path, self._reads, self._inside = path, reads, inside
-        self._named = {key.split(".")[1]: read for key, read in reads.items() if key.split(".")[0] == stage}
+        self.named = {key.split(".")[1]: read for key, read in reads.items() if key.split(".")[0] == stage}
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
         module = (node.module or "").split(".")
         if module[:2] == ["service", "core"] and module[-1] == "tuning":
             for one in node.names:
-                self._named[one.asname or one.name] = self._reads[f"{module[2]}.{one.name}"]
+                self.named[one.asname or one.name] = self._reads[f"{module[2]}.{one.name}"]
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
@@ -197,11 +204,11 @@ class _Reads(ast.NodeTransformer):
         return node
 
     def visit_Name(self, node: ast.Name) -> ast.AST:
-        if node.id not in self._named or not isinstance(node.ctx, ast.Load):
+        if node.id not in self.named or not isinstance(node.ctx, ast.Load):
             return node
         if not self._inside:
             raise ImportError(f"{self._path}:{node.lineno}: {node.id} is read outside of a function")
-        return ast.copy_location(copy.deepcopy(self._named[node.id]), node)
+        return ast.copy_location(copy.deepcopy(self.named[node.id]), node)
 
 
 class _Loader(SourceFileLoader):
@@ -263,7 +270,9 @@ def forget() -> None:
 
 def sessions() -> dict[str, Session]:
     """Short sessions by name: from the number of a seed, below EACH, to figures by name."""
+    import msgspec
     from scipy.signal import butter, sosfiltfilt
+    from scipy.spatial.transform import Rotation
 
     from service.contract.records import Flag, Mode
     from service.contract.requests import TOLERANCE_M
@@ -274,7 +283,7 @@ def sessions() -> dict[str, Session]:
     from service.learning.learn import learn
     from service.learning.skill_file import decoded
     from service.learning.via_points import adapted
-    from service.settings.config import Settings
+    from service.settings.config import Box, Obstacles, Settings
     from sim.experiments import motion, phase, reached, separation
     from sim.experiments.catalogue import EXPERIMENTS
     from sim.experiments.open_loop import targets
@@ -290,14 +299,18 @@ def sessions() -> dict[str, Session]:
     streams = EXPERIMENTS["sensitivity"].seeds.tuning
     period_s, names = moving_hands.PERIOD_S, ("error_rms_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
 
-    def follow(hands: list[Moving], keep: tuple[str, ...]) -> dict[str, float]:
+    def follow(hands: list[Moving], keep: tuple[str, ...], settings: Settings) -> dict[str, float]:
         """Figures of sequences with the core alone, by a skill that depends on the hands alone."""
         skill = decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
         out: dict[str, list[float]] = {}
         for one in hands:
-            found = motion.figures("ours", one, targets(skill, one.truth), ours(skill, Settings())(one))
+            seen = ours(skill, settings)(one)
+            found = motion.figures("ours", one, targets(skill, one.truth), seen)
             for name in keep:
                 out.setdefault(f"{one.group}: {name}", []).append(getattr(found, name))
+            if "overshoot_mm" in keep:
+                last = np.diff(seen.tool[-round(AT_REST_S / period_s) :], axis=0) / period_s
+                out.setdefault(f"{one.group}: at_rest_mm_s", []).append(1000 * float(np.sqrt(np.mean(last**2))))
         return {name: float(np.mean(values)) for name, values in out.items()}
 
     def middle() -> Array:
@@ -309,14 +322,27 @@ def sessions() -> dict[str, Session]:
         return [one for one in hands if one.group in motion.FLOOR_GROUPS]
 
     def disturbed(seed: int) -> dict[str, float]:
-        """Late samples, a hand out of sight, and a second source for a while."""
+        """Late samples and a hand out of sight; a second source for a while; outliers, then hands
+        that are exchanged.
+        """
         hands, random = person(seed)[0], np.random.default_rng([streams["disturbed"].seed, seed])
         late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
         late[np.abs(hands.stamps - UNSEEN_S[0]) < UNSEEN_S[1] / 2, seed % 2] = np.inf
         samples, twice = hands.samples.copy(), np.flatnonzero(np.abs(hands.stamps - TWO_S[0]) < TWO_S[1] / 2)
         samples[twice[::2], :3] += APART_M
-        groups = {"late and unseen": replaced(hands, late=late), "two sources": replaced(hands, samples=samples)}
-        return follow([replaced(one, group=name) for name, one in groups.items()], names)
+        wrong = hands.samples.copy()
+        for at in random.integers(0, len(wrong) - BURST[1], BURSTS):
+            away, hand = random.standard_normal(3), 3 * int(random.integers(2))
+            away *= random.uniform(*BURST_M) / np.linalg.norm(away)
+            wrong[at : at + random.integers(*BURST), hand : hand + 3] += away
+        exchanged = np.abs(hands.stamps - EXCHANGED_S[0]) < EXCHANGED_S[1] / 2
+        wrong[exchanged] = np.roll(wrong[exchanged], 3, axis=1)
+        groups = {
+            "late and unseen": replaced(hands, late=late),
+            "two sources": replaced(hands, samples=samples),
+            "mistakes": replaced(hands, samples=wrong),
+        }
+        return follow([replaced(one, group=name) for name, one in groups.items()], names, Settings())
 
     def replaced(hands: Moving, **changed: Any) -> Moving:
         return type(hands)(**{**vars(hands), **changed})
@@ -325,7 +351,13 @@ def sessions() -> dict[str, Session]:
         numbers = streams["stops"].numbers[seed : seed + 1]
         seen = moving_hands.stops(middle(), numbers=numbers)
         seen += moving_hands.stops(middle(), numbers=numbers, rate_hz=30, noise=0.002, group="stops, 30 Hz, 2 mm")
-        return follow(seen, ("overshoot_mm", "settled_ms"))
+        return follow(seen, ("overshoot_mm", "settled_ms"), Settings())
+
+    def soft(seed: int) -> dict[str, float]:
+        """Stops of a tool that is moved softly."""
+        seen = moving_hands.stops(middle(), numbers=streams["stops"].numbers[seed : seed + 1])
+        tool = msgspec.structs.replace(Settings().tool, max_jerk=SOFT_JERK)
+        return follow(seen, ("overshoot_mm", "error_rms_mm"), msgspec.structs.replace(Settings(), tool=tool))
 
     def calm(seed: int) -> dict[str, float]:
         """Hands that tremble at rest, then a hand that moves slowly."""
@@ -359,6 +391,26 @@ def sessions() -> dict[str, Session]:
             "goes_on_mm": float(1000 * np.linalg.norm(stopped[-1] - stopped[0])),
             "tremor_in_pause_mm": float(1000 * np.sqrt(np.mean(np.sum(resting**2, axis=1)))),
             "held_s": one.held_s,
+            "turn_off_deg": turned_off(one),
+        }
+
+    def turned_off(one: Rehearsed) -> float:
+        """Angle between the tool's axis and the one that is asked for, root mean square."""
+        asked = Rotation.from_quat(one.frames["orientation"]).apply((0.0, 0.0, 1.0))
+        return float(np.degrees(np.sqrt(np.mean(np.arccos(np.clip(np.sum(asked * one.axis, axis=1), -1, 1)) ** 2))))
+
+    def beside_a_box(seed: int) -> dict[str, float]:
+        """The nominal scene with a box on the way to the handover."""
+        script = HandScript(Scene(), seed=streams["hands"].numbers[seed], tremor_rms=TREMOR_M, noise_std=NOISE_M)
+        things = Obstacles(boxes=(Box(*BOX),))
+        settings = msgspec.structs.replace(Settings(), obstacles=things)
+        one = rehearse(script, reached.ours(Scene()), rate_hz=separation.RATE_HZ, settings=settings, keep=True)
+        behind = np.linalg.norm(one.frames["setpoint"] - one.tool, axis=1)
+        return {
+            **{f"{name}_error_mm": value for name, value in zip(EVENTS, one.errors_mm, strict=True)},
+            "held_s": one.held_s,
+            "behind_mm": float(1000 * behind.max()),
+            "turn_off_deg": turned_off(one),
         }
 
     def scene(kind: str) -> Session:
@@ -379,12 +431,28 @@ def sessions() -> dict[str, Session]:
     def partners(seed: int) -> dict[str, float]:
         stream = streams["made"]
         who = stream.numbers[3 * seed : 3 * seed + 3]
-        learned, asked = takes(MADE, people=who[:2], each=2, seed=stream.seed), takes(MADE, people=who[2:], each=1)
+        learned, asked = (
+            takes(MADE, people=who[:2], each=2, seed=stream.seed),
+            takes(MADE, people=who[2:], each=1, seed=stream.seed),
+        )
         skill = learn([take.demonstration for take in learned])
         seen = [left_out("", "", take.demonstration) for take in asked]
         there = [adapted(skill, one.demonstration.places, tolerance=TOLERANCE_M) for one in seen]
         found = summary([judged(one, predicted(at, one)) for one, at in zip(seen, there, strict=True)])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "held", "unsure")}
+
+    def untold(seed: int) -> dict[str, float]:
+        """A skill of both hands and their memory, for a task whose places are not told."""
+        stream = streams["untold"]
+        who = stream.numbers[3 * seed : 3 * seed + 3]
+        shown, asked = (
+            takes(UNTOLD_KIND, people=who[:2], each=2, seed=stream.seed),
+            takes(UNTOLD_KIND, people=who[2:], each=1, seed=stream.seed),
+        )
+        skill = learn([take.demonstration._replace(places=()) for take in shown])
+        seen = [left_out("", "", take.demonstration) for take in asked]
+        found = summary([judged(one, predicted(skill, one)) for one in seen])
+        return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
 
     first: dict[str, Any] = {}
 
@@ -404,14 +472,17 @@ def sessions() -> dict[str, Session]:
         }
 
     return {
-        "motion": lambda seed: follow(person(seed), names),
+        "motion": lambda seed: follow(person(seed), names, Settings()),
         "stops": stops,
+        "soft": soft,
         "disturbed": disturbed,
         "calm": calm,
         "phase": pauses,
         "scene": scene("random"),
         "thrust": scene("thrust"),
+        "box": beside_a_box,
         "partners": partners,
+        "untold": untold,
         "golden": golden,
     }
 
@@ -429,6 +500,7 @@ def at_tuned_values(known: Mapping[str, Number], all_sessions: Mapping[str, Sess
     """Measure all sessions with all seeds."""
     out = Known({}, {}, {}, {})
     for name, session in all_sessions.items():
+        forget()  # or a number that is read once, for a cache, would be marked in the first session alone
         marks[:] = 0
         found, began = [session(0)], time.monotonic()
         out.reads[name] = [key for key, one in known.items() if marks[one.at]]

@@ -19,7 +19,7 @@ from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.stage import Limiter
 from service.core.setpoint.orientation import OrientationSetpoint
-from service.core.setpoint.tuning import ORIENTATION_SPEED_SHARE
+from service.core.setpoint.tuning import PLANNED_SPEED_SHARE
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
 from service.core.skill.skill import Skill
 from service.core.skill.tuning import GRIPPER_MOVES_S
@@ -97,7 +97,7 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
         lead.step(state, target.as_quat(), np.zeros(3))
         seen.append(state["turning"].copy())
     speeds = np.array(seen)
-    assert np.linalg.norm(speeds, axis=1).max() <= ORIENTATION_SPEED_SHARE * FASTEST + 1e-6
+    assert np.linalg.norm(speeds, axis=1).max() <= PLANNED_SPEED_SHARE * FASTEST + 1e-6
     assert np.linalg.norm(np.diff(speeds, axis=0), axis=1).max() <= HARDEST * PERIOD_S + 1e-6
     off = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])

@@ -173,7 +173,9 @@ def test_legal_hands_are_hardly_held_for(
     ticks = (Tick(k, inboxes.get(k, ())) for k in range(round(lasts_s * loop_hz)))
     found = played(replace(ASSUMED, rate_hz=loop_hz), stored("soldering"), ticks)
     assert not found["rejected"][-1].any()
-    assert (found["mode"] == Mode.HOLD).mean() <= 0.02
+    # The skill was not shown such reaches, and may say so.
+    unknown = np.isin(found["reason"], (Reason.FAR_FROM_DEMONSTRATIONS, Reason.AMBIGUOUS))
+    assert ((found["mode"] == Mode.HOLD) & ~unknown).mean() <= 0.02
 
 
 # --- quick reaches, and lowered speeds ---

@@ -22,8 +22,7 @@ from service.core.arm.tuning import (
     SINGULAR_VOLUME_M3,
     SPARING_POWER,
     TOOL_SPEED_SHARE,
-    TURN_GAIN_PER_S,
-    TURN_GAIN_RATE_SHARE,
+    TURN_GAIN_SHARE,
     TURN_HORIZON_S,
     TURN_LEVER_M,
 )
@@ -89,7 +88,7 @@ class Arm:
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
         spared /= spared.mean(axis=1, keepdims=True)
-        rate = acceleration_rate(limits)
+        gain = min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * acceleration_rate(limits))
         self.parameters = parameters(
             period_s=settings.period_s,
             closing_braking=closing.braking,
@@ -98,8 +97,8 @@ class Arm:
             constrained_speed=CONSTRAINED_SPEED_MPS,
             max_tool_speed=TOOL_SPEED_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
-            position_gain=min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * rate),
-            turn_gain=min(TURN_GAIN_PER_S, TURN_GAIN_RATE_SHARE * rate),
+            position_gain=gain,
+            turn_gain=TURN_GAIN_SHARE * gain,
             turn_lever=TURN_LEVER_M * size,
             damping=DAMPING_M2 * size**2,
             singular_damping=SINGULAR_DAMPING_M2 * size**2,

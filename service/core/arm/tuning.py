@@ -20,8 +20,6 @@ SINGULAR_DAMPING_M2 = 2e-3  # [m²] additional damping at a singular posture
 SINGULAR_VOLUME_M3 = 0.04  # [m³] manipulability below which damping is added; 0.06 to 0.13 over the WAM's table
 # 0 to 20. More: unreachable targets are calm. Less: far targets close faster.
 FAR_DAMPING_S2 = 4.0  # [s²] damping at unreachable targets = 4 s² * (closing speed - FAR_SPEED_MPS)²
-# 0.05 to 0.5. More: damping begins later. Less: damping begins earlier.
-FAR_SPEED_MPS = 0.15  # closing speed above which the damping for unreachable targets begins
 # Speed of the tool that constraints take away, at which half of SINGULAR_DAMPING_M2 is added. Where
 # several constraints leave few directions free, the least motion would change the solution much.
 # 5e-3 to 0.1. More: constrained joints move more. Less: constrained joints are calm.
@@ -32,22 +30,20 @@ SPARING_POWER = 0.8  # weight of a joint's speed = acceleration limit^-0.8, so t
 # Closing in on the setpoint.
 # 10 to 200. More: the tool lags less. Less: the joints are calm.
 POSITION_GAIN_PER_S = 50.0  # [1/s] decay of a small position error
-# 2 to 50. More: turns lag less. Less: the joints are calm.
-TURN_GAIN_PER_S = 10.0  # [1/s] decay of a small orientation error
 # 0.5 to 5. More: slow joints lag less. Less: slow joints are calm.
 POSITION_GAIN_RATE_SHARE = 2.0  # upper limit of the position gain / (jerk / acceleration) of the slowest joint
-# 0.1 to 1. More: slow joints turn faster. Less: slow joints are calm.
-TURN_GAIN_RATE_SHARE = 0.4  # upper limit of the turn gain / that rate; with larger gains the joints oscillate
+# 0.04 to 1. More: turns lag less. Less: the joints are calm.
+TURN_GAIN_SHARE = 0.2  # decay of a small orientation error / position gain; with more, the joints oscillate
 # 0.1 to 1. More: large errors close faster. Less: large errors close calmly.
 CLOSING_SPEED_MPS = 0.3  # largest speed at which an error is closed
+FAR_SPEED_MPS = 0.5 * CLOSING_SPEED_MPS  # closing speed above which the damping for unreachable targets begins
 # 0.03 to 0.5. More: large errors close faster. Less: the joints are calm.
 CLOSING_BRAKE_SHARE = 0.1  # share of the tool's deceleration for closing in; with more, the joints oscillate
 # 2e-3 to 0.05. More: turns go on. Less: position is kept in turns.
 TURN_HORIZON_S = 0.008  # a turn is scaled down unless its joint velocities can be reached within this time
-# 0.9 to 1. More: the tool is faster. Less: the limit is never reached.
-TOOL_SPEED_SHARE = 0.985  # share of max_speed for closing in and forward speed together
 # 0.5 to 1. More: the setpoint is faster. Less: joints can correct more.
 PLANNED_LIMIT_SHARES = np.array([0.97, 0.95, 0.85])  # shares of joint speed, acceleration, jerk for the setpoint
+TOOL_SPEED_SHARE = 0.5 * (1.0 + float(PLANNED_LIMIT_SHARES[0]))  # of max_speed for setpoint and closing in together
 
 # The posture, in what is left free.
 # 0.1 to 10. More: the posture is kept closely. Less: the posture may drift.

@@ -13,7 +13,6 @@ from service.core.decision.tuning import (
     WAY_MPS,
     WAY_NEAR_RAD,
     WAY_RADPS,
-    WAY_SPEED_SHARE,
     WAY_START_RAD,
 )
 from service.core.frame import Event, Record, Vector
@@ -24,8 +23,8 @@ class WayOut:
     """Way out in the state: postures that the arm approaches one after the other."""
 
     def __init__(self, settings: Settings) -> None:
-        self._mps = min(WAY_MPS, WAY_SPEED_SHARE * settings.tool.max_speed)
-        self._radps = min(WAY_RADPS, WAY_SPEED_SHARE * min(settings.joints.velocity))
+        self._mps = min(WAY_MPS, settings.tool.max_speed)
+        self._radps = min(WAY_RADPS, *settings.joints.velocity)
 
     def take(self, state: Record, event: Event) -> None:
         """Start on a planned way out, if the tool is still stuck and the way begins within

@@ -39,8 +39,6 @@ from service.core.codes import (
 from service.core.decision.tuning import (
     ANOTHER_TARGET_M,
     FREED_SHARE,
-    FREED_TIMEOUT_S,
-    GATE_RETURN_SHARE,
     PROGRESS_SHARE,
     PROGRESS_SPEED_SHARE,
     STUCK_GAP_M,
@@ -49,6 +47,7 @@ from service.core.decision.tuning import (
     WAY_TIMEOUT_S,
 )
 from service.core.frame import Records, Vector
+from service.core.intake.tuning import END_SHARE
 from service.core.vectors import distance
 
 
@@ -74,7 +73,7 @@ def step(
       been seen or is not seen now.
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
       follow yet.
-    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > GATE_RETURN_SHARE
+    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > END_SHARE
       threshold.
     * AMBIGUOUS: the stage of the task is not known.
     * BLOCKED: the tool is stuck, and the arm waits or moves along a way out (`_stuck`).
@@ -101,7 +100,7 @@ def step(
     elif known & sum(UNSEEN) and (known & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
         reason = STALE_HAND
     else:
-        ease = GATE_RETURN_SHARE if state.reason == FAR else 1.0
+        ease = END_SHARE if state.reason == FAR else 1.0
         reason = FAR if gate_m > ease * threshold else AMBIGUOUS if known & STAGE_AMBIGUOUS else NONE
     if reason == NONE:
         state.stuck = _stuck(states, frames, heres, parameters)
@@ -120,7 +119,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
       it is outside its limits it is RETURNING, else READY. One that is inside of a thing starts
       only after the operator's confirmation (`leaves`), and is RETURNING.
     * A RETURNING arm is READY within its limits and inside of nothing, or within its limits without
-      motion for FREED_TIMEOUT_S.
+      motion for STUCK_S.
     * A silent arm is a fault (ARM_SILENT) if it follows or moves; at rest, it is no longer ready.
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
@@ -151,7 +150,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
         if moving:
             state.stuck_tick = state.tick
-        if not inside or (state.tick - state.stuck_tick) * config.period_s > FREED_TIMEOUT_S:
+        if not inside or (state.tick - state.stuck_tick) * config.period_s > STUCK_S:
             state.arm_ready, state.leaves = READY, 0
     error, speed = measured_error(states, heres, parameters)
     if error > config.max_error_rad:

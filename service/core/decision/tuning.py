@@ -7,25 +7,24 @@ line follows from others.
 
 from __future__ import annotations
 
+from service.core.intake.tuning import ARM_STILL_RAD
+
 # The arm.
 # 0.03 to 0.5. More: a return is fast. Less: a return takes long.
 RETURN_RADPS = 0.1  # speed at which a joint outside its limits moves back
 # 0.01 to 0.1. More: faults come later. Less: late commands are faults.
 TOO_FAST_S = 0.03  # a tool above fault_speed for this time is a fault; one late command is shorter
-# 0.3 to 5. More: the arm tries longer. Less: the arm gives up sooner.
-FREED_TIMEOUT_S = 1.0  # an arm that does not get out of a thing within this time stays where it is
 
 # A tool that is stuck: it comes no nearer to its target.
 # 5e-3 to 0.05. More: fewer tools are stuck. Less: a lag looks stuck.
 STUCK_GAP_M = 0.02  # a tool nearer than this has reached its target; a target that moves farther is a new one
 # 0.3 to 3. More: a stuck tool is noticed later. Less: slow progress looks stuck.
-STUCK_S = 0.8  # time within which progress is expected
+STUCK_S = 0.8  # time within which progress is expected, toward a target or out of a thing
 # 0.02 to 0.3. More: slow progress looks stuck. Less: a stuck tool is missed.
 PROGRESS_SHARE = 0.08  # expected progress, as share of the distance
-# 0.1 to 1. More: slow progress looks stuck. Less: a stuck tool is missed.
-PROGRESS_SPEED_SHARE = 0.3  # upper limit of it, as share of max_speed times STUCK_S
 # 0.1 to 0.8. More: it stays stuck longer. Less: it is freed by chance.
-FREED_SHARE = 0.25  # progress that ends being stuck
+FREED_SHARE = 0.25  # progress that ends being stuck, as share of the distance
+PROGRESS_SPEED_SHARE = FREED_SHARE  # upper limit of expected progress, as share of max_speed times STUCK_S
 ANOTHER_TARGET_M = 2.0 * STUCK_GAP_M  # a target this far from the one that could not be reached is tried
 
 # A way out.
@@ -34,15 +33,9 @@ WAY_TIMEOUT_S = 20.0  # a way out that takes longer is given up
 # 0.3 to 3. More: paths are fast. Less: paths take long.
 WAY_RADPS = 1.2  # largest speed of the busiest joint
 # 0.1 to 1. More: paths are fast. Less: paths take long.
-WAY_SPEED_SHARE = 0.5  # largest share of a joint's own speed limit
-# 0.1 to 1. More: paths are fast. Less: paths take long.
 WAY_MPS = 0.4  # largest speed of the tool, low because the person does not command this motion
 # 1 to 20. More: postures are approached fast. Less: postures are approached softly.
 WAY_GAIN_PER_S = 4.0  # [1/s] approach to each posture
 # 0.1 to 1. More: paths begin with a detour. Less: late paths are dropped.
 WAY_START_RAD = 0.3  # a way that begins farther from the arm than this is not taken
-# 5e-3 to 0.1. More: corners are cut. Less: postures are reached exactly.
-WAY_NEAR_RAD = 0.02  # a posture this near is reached
-
-# 0.5 to 1. More: a hold ends sooner. Less: a hold lasts longer.
-GATE_RETURN_SHARE = 0.9  # hands that were too far must come below this share of the threshold
+WAY_NEAR_RAD = ARM_STILL_RAD  # a posture is reached where an arm that rests may be

@@ -26,17 +26,15 @@ from service.core.intake.mode_filter import advance, start, update
 from service.core.intake.motion_model import CHANGE, model
 from service.core.intake.tuning import (
     DELAY_TOLERANCE_S,
-    DELAY_WINDOW_S,
     LEAST_NOISE_M,
-    LONE_SAMPLE_S,
     MAX_LATE_S,
-    MAX_NOISE_M,
     MODE_INTENSITIES_M2PS5,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     REAPPEARED_VARIANCE_SHARE,
     STILLNESS_FALL_S,
     STILLNESS_LOWPASS_S,
+    TRACKER_MEMORY_S,
 )
 from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from service.core.vectors import squared_distance
@@ -121,9 +119,9 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
         d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, NOISE_SAMPLES)
         r = r + (min(|d|² / 60, NOISE_OUTLIER_SHARE r) - r) / (n + 1)
 
-    60 = 3 axes * (1 + 9 + 9 + 1). r is limited to LEAST_NOISE_M² ... MAX_NOISE_M². Only evenly
-    spaced samples are used: when an interval differs by more than half from the one before, this
-    sample and the next do not change r.
+    60 = 3 axes * (1 + 9 + 9 + 1). r is at least LEAST_NOISE_M². Only evenly spaced samples are
+    used: when an interval differs by more than half from the one before, this sample and the next
+    do not change r.
     """
     state, past = states[0], states[0].past_samples[side]
     count, variance = state.even_samples[side], state.noise_variance[side]
@@ -140,7 +138,7 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
         samples = min(state.noise_samples[side] + 1, NOISE_SAMPLES)
         state.noise_samples[side] = samples
         variance += (seen - variance) / (samples + 1.0)
-        state.noise_variance[side] = min(max(variance, LEAST_NOISE_M**2), MAX_NOISE_M**2)
+        state.noise_variance[side] = max(variance, LEAST_NOISE_M**2)
     for axis in range(3):
         past[2, axis] = past[1, axis]
         past[1, axis] = past[0, axis]
@@ -283,7 +281,7 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
     """Update the minimum delays of one tracker by a sample that arrives now, and the trust in its
     clock.
 
-    Every DELAY_WINDOW_S, the clock is trusted if the minimum delays of two consecutive windows
+    Every TRACKER_MEMORY_S, the clock is trusted if the minimum delays of two consecutive windows
     agree within DELAY_TOLERANCE_S. Learning restarts with the first sample, and with one that
     arrives after a silence (not `fresh`) more than MAX_LATE_S above the minimum delay: the clock
     was set back.
@@ -294,7 +292,7 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
     if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > MAX_LATE_S):
         stamps[:], ticks[:] = stamp_ns, state.tick
         state.clock[side], state.clock_tick[side] = LEARNING, state.tick
-    elif (state.tick - state.clock_tick[side]) * period_s >= DELAY_WINDOW_S:
+    elif (state.tick - state.clock_tick[side]) * period_s >= TRACKER_MEMORY_S:
         apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
         steady = abs(apart_s) <= DELAY_TOLERANCE_S and state.clock[side] != LEARNING
         state.clock[side] = TRUSTED if steady else DOUBTED
@@ -348,7 +346,7 @@ def take(
     state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, state.tick
     state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
     state.kept_positions[side, at] = position
-    filter_in(states, side, at, LONE_SAMPLE_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
+    filter_in(states, side, at, TRACKER_MEMORY_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
     look_ahead(states, models, side)
 
 

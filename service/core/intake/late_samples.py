@@ -22,7 +22,7 @@ from service.core.frame import Record, Records, Vector
 from service.core.intake import KEPT
 from service.core.intake.hand_estimator import filter_in, look_ahead, order_of, seconds_after, slot
 from service.core.intake.mode_filter import advance
-from service.core.intake.tuning import LONE_SAMPLE_S
+from service.core.intake.tuning import TRACKER_MEMORY_S
 from service.core.numerics import TICK_ROUNDING
 
 
@@ -126,7 +126,7 @@ def take_late(
         anew = first or state.kept_restarts[side, at] > 0
         if not anew:
             _move_on(means, covariances, models, ticks)
-        filter_in(states, side, at, LONE_SAMPLE_S if first else ticks * config.period_s, anew)
+        filter_in(states, side, at, TRACKER_MEMORY_S if first else ticks * config.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _move_on(means, covariances, models, ticks)
     look_ahead(states, models, side)

@@ -27,17 +27,17 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.frame import Vector
 from service.core.intake import MODES, STATES
-from service.core.intake.motion_model import REST
+from service.core.intake.motion_model import CHANGE, REST
 from service.core.intake.tuning import (
     LEAST_MODE_PROBABILITY,
-    MAX_INNOVATION,
     MAX_TREMOR_M,
+    MODE_ACCELERATION_REVERSIONS_PER_S,
+    MODE_INTENSITIES_M2PS5,
     MODE_PRIOR,
     MODE_SWITCH_RATES_PER_S,
     REST_ACCELERATION_STD_MPS2,
     REST_MAX_SPEED_MPS,
     REST_SPEED_STD_MPS,
-    START_ACCELERATION_STD_MPS2,
     START_SPEED_STD_MPS,
     TREMOR_RATE_PER_S,
     TREMOR_STDS_M,
@@ -50,11 +50,12 @@ from service.core.vectors import square
 def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
     """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
 
-        mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², σ_a², σ², (ω σ)²)
+        mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
 
-    with σ_v = START_SPEED_STD_MPS, σ_a = START_ACCELERATION_STD_MPS2 and the mode's tremor σ. The
-    probabilities are MODE_PRIOR.
+    with σ_v = START_SPEED_STD_MPS and the mode's tremor σ. The variance of the acceleration is the
+    stationary one of the mode CHANGE at a given velocity. The probabilities are MODE_PRIOR.
     """
+    of_acceleration = MODE_INTENSITIES_M2PS5[CHANGE] / (2.0 * MODE_ACCELERATION_REVERSIONS_PER_S[CHANGE])
     means[:] = 0.0
     covariances[:] = 0.0
     for mode in range(MODES):
@@ -62,7 +63,7 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
             means[mode, 0, axis] = position[axis]
         covariances[mode, 0, 0] = noise
         covariances[mode, 1, 1] = START_SPEED_STD_MPS**2
-        covariances[mode, 2, 2] = START_ACCELERATION_STD_MPS2**2
+        covariances[mode, 2, 2] = of_acceleration
         _tremble(means[mode], covariances[mode], mode)
         modes[mode] = MODE_PRIOR[mode]
 
@@ -142,6 +143,14 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 
 @compiled
+def _bounded(square: float) -> float:
+    """Squared, normalised innovation on three axes, at most 6 log(1 / LEAST_MODE_PROBABILITY). What
+    is as improbable on each axis as a mode can be is then equally unlikely in all modes.
+    """
+    return min(square, -6.0 * math.log(LEAST_MODE_PROBABILITY))
+
+
+@compiled
 def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector) -> None:
     """Joint probabilities s (MODES, MODES), written to `shares`, of mode i before an interval Δ and
     mode j after it:
@@ -151,7 +160,7 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
     μ are the probabilities `modes`, λ is MODE_SWITCH_RATES_PER_S, ρ is MODE_PRIOR. The transition
     from a moving mode i to REST is weighted by how slow that mode is; s_ii keeps the rest:
 
-        slow_i = exp(-½ min(|v_i|² / (P_i[v, v] + REST_SPEED_STD_MPS²), MAX_INNOVATION))
+        slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + REST_SPEED_STD_MPS²)))
     """
     for i in range(MODES):
         stay = math.exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
@@ -159,9 +168,7 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
             shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
         if i != REST:
             speed = square(means[i, 1])
-            slow = math.exp(
-                -0.5 * min(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS), MAX_INNOVATION)
-            )
+            slow = math.exp(-0.5 * _bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
 
@@ -234,7 +241,7 @@ def update(
     The modes are mixed (`_switched`, `_mix`), then each is updated with H = [1, 0, 0, 1, 0]:
 
         S = H P Hᵀ + r,   K = P Hᵀ / S,   m = m + K (z - H m),   P = P - K S Kᵀ
-        log L = -3/2 log S - ½ min(|z - H m|² / S, MAX_INNOVATION),   μ_j ∝ c_j L_j
+        log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
     The innovation in log L is that before the update. For REST, log L is reduced by half of
     `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY and are rounded.
@@ -259,7 +266,7 @@ def update(
             for column in range(row, STATES):
                 p[row, column] -= seen[row] * seen[column] / variance
                 p[column, row] = p[row, column]
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * min(error / variance, MAX_INNOVATION)
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * _bounded(error / variance)
         if i == REST:
             likelihood[i] -= 0.5 * _beyond_rest(mean)
         best = max(best, likelihood[i])

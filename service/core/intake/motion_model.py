@@ -13,8 +13,8 @@ tremor's stationary standard deviation σ (TREMOR_STDS_M) differ between the mod
 TREMOR_RATE_PER_S and ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
 
 The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
-sample, a hand that reaches or changes keeps its velocity while its acceleration fades. The
-reversion to zero would report the end of a motion too early.
+sample, the velocity of a hand that reaches or changes does not revert to zero. That would report
+the end of a motion while its next sample may only be late.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from scipy.linalg import expm
 from service.core.frame import Records, Vector, structured
 from service.core.intake import MODES, STATES
 from service.core.intake.tuning import (
-    ACCELERATION_FADE_PER_S,
     MODE_ACCELERATION_REVERSIONS_PER_S,
     MODE_INTENSITIES_M2PS5,
     MODE_VELOCITY_REVERSIONS_PER_S2,
@@ -46,9 +45,9 @@ def models(period_s: float, count: int) -> Records:
 
     Record n holds, for the interval t = n `period_s`, `transition` F(t) and `noise` Q(t) as `model`
     computes them, and `onward` (MODES, 3, 3), which extrapolates (p, v, a) from the newest sample.
-    With h = min(t, VELOCITY_KEPT_S) and e = ACCELERATION_FADE_PER_S:
+    With h = min(t, VELOCITY_KEPT_S):
 
-        onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -e]]
+        onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -k_a]]
 
     For REST, onward = F(t)[:3, :3].
     """
@@ -57,10 +56,9 @@ def models(period_s: float, count: int) -> Records:
     for ticks, one in enumerate(out):
         one["transition"], one["noise"] = model(ticks * period_s)
         kept_on_s = min(ticks * period_s, VELOCITY_KEPT_S)
-        one["onward"] = (
-            model(ticks * period_s - kept_on_s)[0][:, :3, :3]
-            @ _over(_motion(0.0, ACCELERATION_FADE_PER_S), kept_on_s)[0]
-        )
+        reverted = model(ticks * period_s - kept_on_s)[0][:, :3, :3]
+        for mode, fades in enumerate(MODE_ACCELERATION_REVERSIONS_PER_S):
+            one["onward"][mode] = reverted[mode] @ _over(_motion(0.0, fades), kept_on_s)[0]
         one["onward"][REST] = one["transition"][REST, :3, :3]
     return out
 

@@ -12,7 +12,7 @@ source that contradicts the first. The rules are the same for both hands and for
   the other one: the tracker has swapped them. The new position is accepted after `hands.swapped_s`,
   within which the tracker may correct itself.
 * A source is contested when at least CONTESTED_ON_SHARE of its samples within about
-  CONTESTED_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
+  TRACKER_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
   arm, these are samples that jumped. For a hand, they alternate between two positions, or they
   jumped by the same offset as the last one that jumped, with accepted samples between them; the
   jumps of a single tracker do not repeat an offset. A hand is also contested while its samples
@@ -29,17 +29,10 @@ from service.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import slot
 from service.core.intake.tuning import (
-    AGREE_M,
-    AGREE_MPS,
     CONFIRMED_S,
     CONFIRMED_SAMPLES,
-    OFFSET_CHANGE_MPS,
-    OFFSET_TOLERANCE_M,
-    RETURN_SAMPLES,
     SOURCE_SPREAD_SHARE,
     SOURCES_APART_M,
-    SWAPPED_M,
-    SWAPPED_MPS,
 )
 from service.core.vectors import distance, squared_distance
 
@@ -49,13 +42,12 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
     """True if a hand's sample (3,) [m] that jumped comes from a second source; records the jump.
 
     Its offset from the `expected` position (3,) must equal that of the last sample that jumped,
-    within OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * elapsed time, and that sample must be less than
-    `stale_ticks` old. Between the two, a sample was accepted; in a row of successive jumps, the
-    decision about the first one holds for all.
+    within `jump`, and that sample must be less than `stale_ticks` old. Between the two, a sample
+    was accepted; in a row of successive jumps, the decision about the first one holds for all.
     """
     state, config, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
-    far = distance(offset, state.other_offset[side]) > OFFSET_TOLERANCE_M + OFFSET_CHANGE_MPS * passed * config.period_s
+    far = distance(offset, state.other_offset[side]) > config.jump
     in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
     returns = passed < config.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
     state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
@@ -109,24 +101,24 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     """True if a hand's sample (3,) [m] is near the other hand's estimate, and nearer to it than
     half the distance between the hands.
 
-    Near is within SWAPPED_M + SWAPPED_MPS * the time since the other hand was seen, at most
-    `swapped_s`.
+    Near is where the other hand may have moved since it was seen: within jump + jump_speed *
+    elapsed time, at most `swapped_s`.
     """
     state, config = states[0], parameters[0]
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = SWAPPED_M + SWAPPED_MPS * min((state.tick - seen) * config.period_s, config.swapped_s)
+    near = config.jump + config.jump_speed * min((state.tick - seen) * config.period_s, config.swapped_s)
     return bool(seen >= 0 and distance(position, there) < min(near, 0.5 * distance(here, there)))
 
 
 @compiled
 def _goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """True if a sample (3,) [m] agrees with the newest sample that jumped: it is less than
-    `stale_ticks` later and within AGREE_M + AGREE_MPS * elapsed time.
+    `stale_ticks` later and within jump + jump_speed * elapsed time.
     """
     state, config = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = distance(position, state.jumped_to[side]) <= AGREE_M + AGREE_MPS * passed * config.period_s
+    near = distance(position, state.jumped_to[side]) <= config.jump + config.jump_speed * passed * config.period_s
     return bool(passed < config.stale_ticks and near)
 
 
@@ -134,12 +126,12 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
 def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
     """True if an earlier sample deviated by about the same `offset` (3,) [m] from its neighbours.
 
-    The last RETURN_SAMPLES retained samples before number `order` are checked. The deviation of a
-    sample is x_k - (x_(k-1) + x_(k+1)) / 2; it may differ from the offset by SOURCE_SPREAD_SHARE
-    |offset|. A second source repeats its offset, the outliers of one tracker do not.
+    All retained samples before number `order` are checked. The deviation of a sample is x_k -
+    (x_(k-1) + x_(k+1)) / 2; it may differ from the offset by SOURCE_SPREAD_SHARE |offset|. A second
+    source repeats its offset, the outliers of one tracker do not.
     """
     state, around = states[0], np.empty((3, 3))
-    for before in range(order + 2, min(order + RETURN_SAMPLES, state.kept[side] - 1)):
+    for before in range(order + 2, state.kept[side] - 1):
         for k in range(3):
             around[k] = state.kept_positions[side, slot(states, side, before - 1 + k)]
         off = around[1] - 0.5 * (around[0] + around[2])

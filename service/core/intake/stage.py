@@ -21,7 +21,7 @@ from service.core.intake.arm_samples import still_ticks
 from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
-from service.core.intake.tuning import JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS, MAX_LATE_S, MAX_OUTSIDE_RAD
+from service.core.intake.tuning import JOINT_JUMP_RADPS, MAX_LATE_S, MAX_OUTSIDE_RAD
 from service.settings.config import Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
@@ -76,9 +76,7 @@ class Intake:
             jump=float(hands.jump),
             jump_speed=float(hands.jump_speed),
             swapped_s=float(hands.swapped_s),
-            joint_jump_speed=max(
-                JOINT_JUMP_RADPS, JOINT_JUMP_SPEEDS * float((np.array(joints.velocity) / per_rad).max())
-            ),
+            joint_jump_speed=max(JOINT_JUMP_RADPS, float((np.array(joints.velocity) / per_rad).max())),
             plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),

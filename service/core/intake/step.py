@@ -18,21 +18,18 @@ from service.core.intake.late_samples import expected, take_late, tick_made
 from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
 from service.core.intake.tuning import (
     ARM_STILL_RAD,
-    CONTESTED_MEMORY_S,
     CONTESTED_OFF_SHARE,
     CONTESTED_ON_SHARE,
     JOINT_JUMP_RAD,
     JUMP_NOISE_STDS,
-    LEAST_INTERVAL_S,
     MAX_HAND_DISTANCE_M,
     MAX_LATE_S,
-    SAMPLE_MAX_S,
     SCATTER_LEAST_SAMPLES,
     SCATTER_OFF_M,
     SCATTER_ON_M,
     TO_AND_FRO_MAX_SHARE,
     TO_AND_FRO_MPS2,
-    TO_AND_FRO_S,
+    TRACKER_MEMORY_S,
 )
 from service.core.vectors import squared_distance
 
@@ -77,15 +74,15 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 
 @compiled
-def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
+def note(states: Records, source: int, jumped: bool, most_s: float, period_s: float) -> None:
     """Update the share c of a source's recent samples that contradict the others:
 
-        c = c + (1 - exp(-Δ / CONTESTED_MEMORY_S)) (jumped - c)
+        c = c + (1 - exp(-Δ / TRACKER_MEMORY_S)) (jumped - c)
 
     Δ is half the time since the tick with a sample before the last one; for a further sample in the
-    same tick, it is the time since the last tick with one. Δ is at most SAMPLE_MAX_S. So the
-    samples of two trackers that take turns have the same weight, however soon one follows the
-    other.
+    same tick, it is the time since the last tick with one. Δ is at most `most_s`, after which the
+    source is silent. So the samples of two trackers that take turns have the same weight, however
+    soon one follows the other.
     """
     state = states[0]
     ticks, share = state.sample_ticks[source], state.contested[source]
@@ -93,8 +90,8 @@ def note(states: Records, source: int, jumped: bool, period_s: float) -> None:
     if ticks[1] < state.tick:
         passed *= 0.5  # half the time since the sample before the last one
         ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min(passed * period_s, SAMPLE_MAX_S)
-    share += (1.0 - math.exp(-passed_s / CONTESTED_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
+    passed_s = min(passed * period_s, most_s)
+    share += (1.0 - math.exp(-passed_s / TRACKER_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
     state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
 
@@ -115,18 +112,16 @@ def has_jumped(
 
 
 @compiled
-def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
+def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float, period_s: float) -> bool:
     """True if a hand at x_0 (3,) [m], h_0 after the retained sample x_1 at ring index `at`, which
     followed x_2 after h_1, would have accelerated by at least TO_AND_FRO_MPS2:
 
         |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= TO_AND_FRO_MPS2
 
-    Intervals h are at least LEAST_INTERVAL_S. False if h_0 + h_1 exceeds TO_AND_FRO_S.
+    Intervals h are at least a period, also those within a tick.
     """
-    before_s, past, wanted = states[0].kept_noise[side, at, 3], states[0].kept_past[side, at], 0.0
-    if after_s + before_s > TO_AND_FRO_S:
-        return False
-    after_s, before_s = max(after_s, LEAST_INTERVAL_S), max(before_s, LEAST_INTERVAL_S)
+    past, wanted = states[0].kept_past[side, at], 0.0
+    after_s, before_s = max(after_s, period_s), max(states[0].kept_noise[side, at, 3], period_s)
     for axis in range(3):
         turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
         wanted += (2.0 * turned / (after_s + before_s)) ** 2
@@ -155,7 +150,7 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
         jumped = fresh and off > JOINT_JUMP_RAD + config.joint_jump_speed * passed_s
-        note(states, ARM, jumped, config.period_s)
+        note(states, ARM, jumped, silent_s, config.period_s)
         if jumped and cause < 0:
             cause = JUMPED
     if near and (moved > ARM_STILL_RAD or not fresh):
@@ -229,11 +224,13 @@ def take_hand(
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
             if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
-                another = _turns_hard(states, side, at, in_base, passed_s)  # a higher share would only decay later
+                another = _turns_hard(
+                    states, side, at, in_base, passed_s, period_s
+                )  # a higher share would only decay later
                 another = another and is_to_and_fro(states, side, order, in_base)
-            note(states, side, another, period_s)
+            note(states, side, another, stale_ticks * period_s, period_s)
         elif cause != REPEATED:
-            note(states, side, False, period_s)
+            note(states, side, False, stale_ticks * period_s, period_s)
         if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
             jumped = is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):

@@ -11,8 +11,7 @@ from service.core.codes import FAULT
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of
 from service.core.kinematics import tool_speed_after
-from service.core.limiter.tuning import STOP_SAMPLES
-from service.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING
+from service.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING, STOP_SAMPLES
 from service.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited

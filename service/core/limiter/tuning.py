@@ -7,10 +7,10 @@ line follows from others.
 
 from __future__ import annotations
 
-# 8 to 64. More: a fast stop is found surely. Less: ticks are cheaper.
-STOP_SAMPLES = 16  # the tool's speed is checked at 15 times, which divide the stop into 16 parts
-# 0.9 to 1. More: the tool may move faster. Less: joints stop earlier.
-STOP_SPEED_SHARE = 0.99  # the joints stop when the tool's speed in a stop would exceed this share of max_speed
+from service.core.arm.tuning import TOOL_SPEED_SHARE
+
+# The joints stop when the tool's speed in a stop would exceed this share of max_speed.
+STOP_SPEED_SHARE = 0.5 * (1.0 + TOOL_SPEED_SHARE)  # half of what motion to the setpoint leaves free
 # Joints end their accelerations at different times in a stop, so their motions cancel less of each
 # other: the tool gains at most this share of the sum of what they contribute (0.16 seen).
 # 0.16 to 1. More: more stops are checked. Less: ticks are cheaper.

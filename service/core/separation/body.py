@@ -16,7 +16,7 @@ import numpy as np
 from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.core.numerics import CAPSULE_FITS, TOLERANCE
-from service.core.separation.tuning import CAPSULE_EXCESS_M, LEAST_TOOL_M, OWN_CLEARANCE_M
+from service.core.separation.tuning import CAPSULE_EXCESS_M, OWN_CLEARANCE_M
 from service.settings.config import Settings
 from service.settings.urdf import Shape, Urdf, UrdfJoint
 
@@ -72,7 +72,7 @@ def body_of(settings: Settings, description: str) -> Body:
                 )
                 found.append((number, end + travel, settings.arm.link_radius))
     tool = np.array(settings.tool.plate_from_tool[:3])
-    if math.hypot(*tool) > LEAST_TOOL_M:
+    if math.hypot(*tool) > TOLERANCE:
         found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
     found.sort(key=lambda one: one[0])
     capsules = structured(len(found), CAPSULE)

@@ -31,10 +31,9 @@ RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # largest speed of the return to the c
 SLIP_DEPTH_M = 0.0005  # inside a clearance the tolerated excess falls, to a tenth near this depth
 
 # Hands: what may happen until the arm reacts.
-# 0.02 to 0.3. More: braking hands are trusted. Less: hands are expected to go on.
-HAND_ACCELERATION_FADE_S = 0.07  # time constant with which a hand's acceleration fades
 # 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
 BRAKE_RAMP_S = 0.08  # time until a deceleration has built up, and until a hand's new velocity is measured
+HAND_ACCELERATION_FADE_S = BRAKE_RAMP_S  # time constant with which a hand's acceleration fades
 LOOKAHEAD_S = 0.5 * BRAKE_RAMP_S * np.arange(5.0)  # times ahead at which the rule is evaluated
 # 0.05 to 0.5. More: new hands are trusted sooner. Less: the arm waits longer.
 UNKNOWN_VELOCITY_STD_MPS = 0.2  # a hand with a larger standard deviation is assumed to approach at `unknown_speed`
@@ -46,7 +45,4 @@ CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a vi
 # The body.
 # 0 to 0.03. More: the arm folds less. Less: parts come nearer.
 OWN_CLEARANCE_M = 0.01  # largest clearance between own parts; more would keep the arm from folding
-# 0 to 0.03. More: overlaps are forgiven. Less: mesh capsules collide falsely.
-CAPSULE_EXCESS_M = 0.01  # capsules around meshes exceed them by about this
-# 1e-3 to 0.05. More: short tools are not protected. Less: the plate is covered twice.
-LEAST_TOOL_M = 0.01  # a tool point nearer to the plate than this needs no capsule
+CAPSULE_EXCESS_M = OWN_CLEARANCE_M  # capsules around meshes exceed them by about as much

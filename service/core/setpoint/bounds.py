@@ -34,14 +34,9 @@ from service.core.codes import (
     SPEED_BOUND,
 )
 from service.core.frame import Records, Vector
-from service.core.numerics import ROUNDING, TOLERANCE
+from service.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.tuning import (
-    HULL_MARGIN_M,
-    RETURN_SHARE,
-    STOP_SECANT_TOLERANCE_M,
-    STOP_SECANTS,
-)
+from service.core.setpoint.tuning import HULL_MARGIN_M, RETURN_SHARE
 from service.core.stops import fastest_stop
 from service.core.vectors import distance, norm, square, squared_distance
 

@@ -10,7 +10,7 @@ from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, parameters
 from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.numerics import ROUNDING
-from service.core.setpoint.tuning import ORIENTATION_BRAKE_SHARE, ORIENTATION_GAIN_PER_S, ORIENTATION_SPEED_SHARE
+from service.core.setpoint.tuning import ORIENTATION_GAIN_PER_S, PLANNED_BRAKE_SHARE, PLANNED_SPEED_SHARE
 from service.core.vectors import dot, norm
 from service.settings.config import Settings
 
@@ -21,7 +21,7 @@ class OrientationSetpoint:
     def __init__(self, settings: Settings) -> None:
         tool = settings.tool
         self.parameters = parameters(
-            max_speed=ORIENTATION_SPEED_SHARE * tool.max_turn_speed,
+            max_speed=PLANNED_SPEED_SHARE * tool.max_turn_speed,
             max_acceleration=float(tool.max_turn_acceleration),
             about=int(tool.orientation == "full"),
             period_s=settings.period_s,
@@ -69,7 +69,7 @@ def turn_orientation(
         along = dot(target_turning, axis)
     angle = norm(error)
     # rate is constant for small errors; for large ones the turn ends at constant deceleration
-    brake, rate = ORIENTATION_BRAKE_SHARE * config.max_acceleration, ORIENTATION_GAIN_PER_S
+    brake, rate = PLANNED_BRAKE_SHARE * config.max_acceleration, ORIENTATION_GAIN_PER_S
     near = brake / ORIENTATION_GAIN_PER_S**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle

@@ -10,6 +10,7 @@ from kmp.compiled import compiled
 from service.core.codes import BROKEN, PLANNED, STOPPED
 from service.core.frame import Records, Vector
 from service.core.kinematics import joint_costs
+from service.core.numerics import LEAST_SPEED_MPS
 from service.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
 from service.core.setpoint.orientation import turn_orientation
 from service.core.setpoint.tuning import (
@@ -21,16 +22,12 @@ from service.core.setpoint.tuning import (
     HAND_BRAKE_MPS2,
     LATE_STOP_MAX_M,
     LATE_STOP_SHARE,
-    LEAST_SPEED_MPS,
     MEETING_BRAKE_LEAST_SHARE,
-    MEETING_BRAKE_SHARE,
-    MEETING_OVERSHOOT_M,
     PLANNED_BRAKE_SHARE,
     PLANNED_SPEED_SHARE,
     PROMPT_RESPONSE_S,
     STOP_JERK_ERROR_M,
     STOP_OVERSHOOT_M,
-    STOP_REACTION_S,
 )
 from service.core.vectors import norm
 
@@ -127,10 +124,10 @@ def _track(
 
         stop      h = w + o - stop_distance(v, a, B, C)
                   o    = STOP_OVERSHOOT_M - min(late_s v, LATE_STOP_MAX_M)
-                         + stop_room (STOP_REACTION_S v_p + v_p² / (2 HAND_BRAKE_MPS2))
+                         + stop_room v_p² / (2 HAND_BRAKE_MPS2)
                   v_p  = max(0, v_t + DECELERATION_LOOKAHEAD_S min(a_t, 0))    predicted speed
-        meeting   h = w + MEETING_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
-                  M = max(MEETING_BRAKE_SHARE B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
+        meeting   h = w + STOP_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
+                  M = max(B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
         speed     h = top - (v + a |a| / 2C)
 
         retained = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
@@ -171,9 +168,7 @@ def _track(
     top = slow * PLANNED_SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     predicted_speed = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
     overshoot = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
-    overshoot += config.stop_room * (
-        STOP_REACTION_S * predicted_speed + predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
-    )
+    overshoot += config.stop_room * predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
     # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
@@ -184,9 +179,9 @@ def _track(
     )
     faster, a_faster = speed - v_target, a - a_target
     if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
-        meeting = max(MEETING_BRAKE_SHARE * brake + min(a_target, 0.0), MEETING_BRAKE_LEAST_SHARE * brake)
+        meeting = max(brake + min(a_target, 0.0), MEETING_BRAKE_LEAST_SHARE * brake)
         chosen = stopping(
-            distance + MEETING_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
+            distance + STOP_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
         )
     limit = top - retained * (top - now)
     coasting = _coasting(speed, a, chosen, change, dt)

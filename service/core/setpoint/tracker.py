@@ -8,17 +8,11 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from service.core.frame import Vector
+from service.core.intake.motion_model import REACH
+from service.core.intake.tuning import MODE_ACCELERATION_REVERSIONS_PER_S, MODE_VELOCITY_REVERSIONS_PER_S2
 from service.core.joint_limits import acceleration_rate
 from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
-from service.core.setpoint.tuning import (
-    ACCELERATION_REVERSION_PER_S,
-    GAP_STOPPED_M,
-    GAP_WAITING_M,
-    STIFFEST_PER_M,
-    TRACKER_LOOP_SHARE,
-    TRACKER_RATE_SHARE,
-    VELOCITY_REVERSION_PER_S2,
-)
+from service.core.setpoint.tuning import GAP_STOPPED_M, GAP_WAITING_M, STIFFEST_PER_M, TRACKER_RATE_SHARE
 from service.core.skill.model import Target
 from service.settings.config import Settings
 
@@ -32,12 +26,14 @@ def gains_for(settings: Settings) -> Vector:
         rate = min(TRACKER_RATE_SHARE * min over joints of (jerk / acceleration),
                    max(TRACKER_RATE_SHARE * tool jerk / tool acceleration,
                        cbrt(STIFFEST_PER_M * tool jerk)),
-                   TRACKER_LOOP_SHARE * rate_hz)
+                   rate_hz / 2)
         jerk_weight = max(configured weight, max(rate, SLOWEST_PER_S)^-6)
+
+    The tracker acts once a tick: it would oscillate at the rate of the loop.
     """
     tool = settings.tool
     own = max(TRACKER_RATE_SHARE * tool.jerk / tool.acceleration, math.cbrt(STIFFEST_PER_M * tool.jerk))
-    quickest = min(TRACKER_RATE_SHARE * acceleration_rate(settings.joints), own, TRACKER_LOOP_SHARE * settings.rate_hz)
+    quickest = min(TRACKER_RATE_SHARE * acceleration_rate(settings.joints), own, 0.5 * settings.rate_hz)
     return tracker_gains(max(tool.jerk_weight, max(quickest, SLOWEST_PER_S) ** -6))
 
 
@@ -48,16 +44,17 @@ def tracker_gains(jerk_weight: float) -> Vector:
 
         jerk = k · z    minimises    integral of (r - x)² + jerk_weight jerk² dt
 
-    jerk_weight is in s⁶. The target is assumed to follow r''' = -VELOCITY_REVERSION_PER_S2 r' -
-    ACCELERATION_REVERSION_PER_S r''. The gains solve the continuous algebraic Riccati equation.
+    jerk_weight is in s⁶. The target is assumed to move as a hand that reaches, r''' = -k_v r' - k_a
+    r'' with the reversions of `motion_model`. The gains solve the continuous algebraic Riccati
+    equation.
     """
     a = np.zeros((5, 5))  # dz/dt = a z + b jerk
     a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = (
         1.0,
         -1.0,
         1.0,
-        -VELOCITY_REVERSION_PER_S2,
-        -ACCELERATION_REVERSION_PER_S,
+        -MODE_VELOCITY_REVERSIONS_PER_S2[REACH],
+        -MODE_ACCELERATION_REVERSIONS_PER_S[REACH],
         1.0,
     )
     b = np.zeros((5, 1))

@@ -7,27 +7,19 @@ line follows from others.
 
 from __future__ import annotations
 
-from service.core.arm.tuning import PLANNED_LIMIT_SHARES
+from service.core.arm.tuning import PLANNED_LIMIT_SHARES, POSITION_GAIN_PER_S, TURN_GAIN_SHARE
 
 # The tracker: a linear-quadratic one, whose input is jerk.
 # 0.5 to 2. More: the setpoint follows faster. Less: the joints follow calmly.
 TRACKER_RATE_SHARE = 1.1  # largest tracker rate / (jerk / acceleration); joints oscillate with a larger one
-# 0.2 to 1. More: slow loops follow faster. Less: slow loops follow calmly.
-TRACKER_LOOP_SHARE = 0.6  # largest tracker rate / loop rate; the tracker acts once a tick, and oscillates from 1 on
 # 20 to 500. More: errors close faster. Less: large errors saturate less.
 STIFFEST_PER_M = 100.0  # [1/m] jerk gain / max_jerk; an error below 1 / 100 m does not saturate the jerk
-# 1 to 20. More: accelerations are trusted less. Less: accelerations last longer.
-ACCELERATION_REVERSION_PER_S = 5.0  # [1/s] expected decay of a target's acceleration
-# 30 to 500. More: targets are expected to stop. Less: targets are expected to go on.
-VELOCITY_REVERSION_PER_S2 = 150.0  # [1/s²] expected pull of a target's velocity to 0
 
 # Stopping where the hands would stop at the soonest.
 # 0 to 5e-3. More: less lag, more overshoot. Less: more lag, less overshoot.
 STOP_OVERSHOOT_M = 0.0012  # the setpoint may stop this far beyond the hand's earliest stop
-# 0 to 0.05. More: less lag, more overshoot. Less: more lag, less overshoot.
-STOP_REACTION_S = 0.0115  # a hand needs at least this time before it brakes
-# 5 to 50. More: more lag, less overshoot. Less: less lag, more overshoot.
-HAND_BRAKE_MPS2 = 16.0  # [m/s²] largest deceleration of a hand
+# 3 to 50. More: more lag, less overshoot. Less: less lag, more overshoot.
+HAND_BRAKE_MPS2 = 7.0  # [m/s²] largest mean deceleration of a hand, from when it begins to brake
 # 0.03 to 0.3. More: ends of reaches are braked early. Less: stops are passed.
 DECELERATION_LOOKAHEAD_S = 0.11  # predicted speed = v + 0.11 s * min(a, 0)
 # A slow tracker shows a stop late: delay = 4 * (response time - 28.5 ms), at most 8 mm of travel.
@@ -37,16 +29,9 @@ PROMPT_RESPONSE_S = 0.0285  # response time of the hand filter with a good track
 LATE_STOP_SHARE = 4.0  # delay of a stop / excess of the response time
 # 0 to 0.02. More: slow trackers overshoot less. Less: slow trackers lag less.
 LATE_STOP_MAX_M = 0.008  # largest travel that is allowed for such a delay
-# 0.01 to 0.1. More: stops are sharper. Less: stops are softer.
-STOP_JERK_ERROR_M = 0.03  # a planned stop uses at most the tracker's jerk for this error; with more it oscillates
 
-# Meeting a target that moves.
-# 0 to 0.02. More: moving targets are passed. Less: moving targets are met late.
-MEETING_OVERSHOOT_M = 0.004  # the setpoint may pass its target by this while it slows to the target's speed
-# 0.2 to 1. More: targets are met faster. Less: targets are met softly.
-MEETING_BRAKE_SHARE = 0.5  # planned braking = 0.5 * largest braking + min(acceleration of the target, 0)
 # 0.05 to 0.5. More: braking targets are met faster. Less: they are met softly.
-MEETING_BRAKE_LEAST_SHARE = 0.15  # smallest planned braking / largest braking
+MEETING_BRAKE_LEAST_SHARE = 0.15  # smallest planned braking / largest braking, to meet a target that brakes too
 
 # The barriers: the distance left shrinks in a period dt by at most this share of itself:
 # min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt).
@@ -56,20 +41,13 @@ BARRIER_RATE_PER_S = 100.0  # [1/s] largest rate at which the distance left shri
 BARRIER_TIME_S = 0.0035  # limits the share in long periods, where the prediction over one period is less accurate
 PLANNED_BRAKE_SHARE = float(PLANNED_LIMIT_SHARES[1])  # of acceleration and jerk; the rest corrects errors
 PLANNED_SPEED_SHARE = float(PLANNED_LIMIT_SHARES[0])  # share of max_speed that is planned with
-# 1e-5 to 0.01. More: slow motion is not limited. Less: rounding decides a direction.
-LEAST_SPEED_MPS = 1e-3  # below this speed a motion has no direction
-# 1e-5 to 5e-3. More: ticks are cheaper. Less: the stop is used up exactly.
-STOP_SECANT_TOLERANCE_M = 1e-3  # the search for a jerk ends when the stop leaves less than this distance unused
-# 2 to 20. More: the stop is used up exactly. Less: ticks are cheaper.
-STOP_SECANTS = 8  # largest number of secant steps; in long periods the stopping distance is not linear in jerk
 
 # A tool that falls behind.
 # 0 to 0.02. More: a late tool is waited for less. Less: small lags slow the setpoint.
 GAP_FREE_M = 0.003  # a tool this far behind its setpoint does not slow it
 # 3e-3 to 0.05. More: a late tool is waited for less. Less: lags slow the setpoint.
 GAP_SLOW_M = 0.012  # share of the speed = 1 / (1 + (gap - free) / 12 mm)
-# 0.03 to 0.5. More: the setpoint runs ahead. Less: the setpoint waits sooner.
-GAP_WAITING_M = 0.12  # the setpoint begins to wait for its tool at this distance
+GAP_WAITING_M = GAP_FREE_M + 9.0 * GAP_SLOW_M  # where a tenth of the speed is left, the setpoint begins to wait
 # 0.05 to 1. More: the setpoint runs ahead. Less: the setpoint waits sooner.
 GAP_STOPPED_M = 0.2  # the setpoint stops at this distance from its tool
 
@@ -78,13 +56,9 @@ GAP_STOPPED_M = 0.2  # the setpoint stops at this distance from its tool
 HULL_TIME_S = 0.35  # the setpoint stays near the targets of this last time
 # 5e-3 to 0.1. More: more overshoot is possible. Less: the bounds brake the setpoint.
 HULL_MARGIN_M = 0.03  # the setpoint may be this far outside of the box around those targets
+STOP_JERK_ERROR_M = HULL_MARGIN_M  # a planned stop uses at most the tracker's jerk for this error, or it oscillates
 # 0.01 to 0.3. More: returns are fast. Less: returns take long.
 RETURN_SHARE = 1 / 16  # share of max_speed at which a setpoint beyond its bounds returns, on each axis
 
 # Orientation.
-# 3 to 40. More: turns lag less. Less: turns are calm.
-ORIENTATION_GAIN_PER_S = 12.0  # [1/s] decay of a small error
-# 0.3 to 1. More: large turns end hard. Less: large turns end softly.
-ORIENTATION_BRAKE_SHARE = 0.7  # share of the angular acceleration with which a large turn is planned to end
-# 0.5 to 1. More: the arm cannot catch up. Less: turns are slower.
-ORIENTATION_SPEED_SHARE = 0.9  # share of max_turn_speed for the setpoint; the arm needs the rest to catch up
+ORIENTATION_GAIN_PER_S = TURN_GAIN_SHARE * POSITION_GAIN_PER_S  # [1/s] decay of a small error, as in the arm

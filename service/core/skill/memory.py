@@ -17,8 +17,9 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
+from service.core.numerics import MEMORY_STEP_S
 from service.core.skill import TURNS
-from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, MEMORY_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
+from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
 
 
 @compiled

@@ -8,6 +8,7 @@ import numpy as np
 
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Record, Vector, as_array
+from service.core.intake.tuning import END_SHARE
 from service.core.skill import ORDER
 from service.core.skill.memory import remember
 from service.core.skill.model import Wanted
@@ -15,12 +16,10 @@ from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp
 from service.core.skill.step import calibrate, recent, write
 from service.core.skill.tuning import (
-    AMBIGUOUS_OFF_SHARE,
     AMBIGUOUS_PROBABILITY,
     AMBIGUOUS_S,
     MEMORY_LAG_S,
     UNSURE_M,
-    UNSURE_OFF_SHARE,
 )
 from service.core.skill.unseen import off_m
 from service.settings.config import Settings
@@ -85,10 +84,10 @@ class SkillStage:
         recent_mps = recent(found.position, passed_s, state["trail"])
         reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
         off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
-        state["unsure"] = math.hypot(reach_m, off) > (UNSURE_OFF_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
+        state["unsure"] = math.hypot(reach_m, off) > (END_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
         frame["closure"] = state["closure"]
         _tell_stage(belief, frame)
-        most = AMBIGUOUS_PROBABILITY * (AMBIGUOUS_OFF_SHARE if state["reason"] == AMBIGUOUS else 1.0)
+        most = AMBIGUOUS_PROBABILITY * (END_SHARE if state["reason"] == AMBIGUOUS else 1.0)
         if found.ambiguity <= most:
             state["sure_tick"] = tick
         is_ambiguous = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S

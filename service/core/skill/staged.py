@@ -19,7 +19,7 @@ from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
-from service.core.numerics import BELIEF_PERIODS
+from service.core.numerics import BELIEF_PERIODS, MOTION_STEP_S
 from service.core.skill.model import COVARIANCE_ROUND_TO, Arrays, Motion, Seen
 from service.core.skill.stages import (
     MOST_STAGES,
@@ -35,7 +35,7 @@ from service.core.skill.stages import (
     tools_at,
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
-from service.core.skill.tuning import MOTION_STEP_S, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.core.skill.via_points import pulls_through
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names

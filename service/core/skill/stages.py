@@ -18,34 +18,29 @@ from kmp.compiled import compiled
 from kmp.loops.kernel_row import add_weighted
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
+from service.core.numerics import MOTION_STEP_S
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
 from service.core.skill.tuning import (
     AMBIGUOUS_M,
     CALM_MPS,
     DIRECTION_SPEED_MPS,
-    DIRECTION_WEIGHT,
     ERROR_WIDTH,
-    FIRST_SAMPLE_WEIGHT,
     FIRST_STAGE_ODDS,
     FULL_SEGMENT_M,
-    LEAST_SEGMENT_SHARE,
     LEAST_STAGE_PROBABILITY,
     LEAST_STD_M,
     MAX_SQUARED_DEVIATION,
     MAX_TARGET_MPS2,
-    MOTION_STEP_S,
     OTHER_STAGE_ERROR_WEIGHT,
     PULL_SHARPNESS_PER_M2,
     REST_SHARPNESS,
-    RESTLESS_WEIGHT,
     SAMPLE_CORRELATION_S,
     SEGMENT_END_M,
     SEGMENT_MIDDLE_M,
     STAGE_ASTRAY_PER_S,
-    STAGE_BACK_PER_S,
+    STAGE_CHANGE_PER_S,
     STAGE_CYCLE_PER_S,
     STAGE_END_M,
-    STAGE_FORWARD_PER_S,
     WITH_HAND_POWER,
 )
 from service.core.vectors import dot, norm, squared_distance
@@ -111,8 +106,8 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
     """Share of its segment that a hand (3,) with the stillness s has covered, attracted to the ends
     while the hand rests.
 
-    With λ of `on_way`, the size c = clip(|w| / FULL_SEGMENT_M, LEAST_SEGMENT_SHARE, 1) and the
-    scaled distance r = min(λ, 1 - λ) |w| / c from the nearer end:
+    With λ of `on_way` and the distance r = min(λ, 1 - λ) max(|w|, FULL_SEGMENT_M) from the nearer
+    end, on a segment that is stretched to FULL_SEGMENT_M if it is shorter:
 
         near = clip((SEGMENT_MIDDLE_M - r) / (SEGMENT_MIDDLE_M - SEGMENT_END_M), 0, 1)
         n = 1 + (REST_SHARPNESS - 1) near s,   share = λⁿ / (λⁿ + (1 - λ)ⁿ)
@@ -121,11 +116,8 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
     square = stage["square"][side]
     if square <= STAYS:
         return along
-    long = math.sqrt(square)
-    size = min(max(long / FULL_SEGMENT_M, LEAST_SEGMENT_SHARE), 1.0)
-    near = min(
-        max((SEGMENT_MIDDLE_M - min(along, 1.0 - along) * long / size) / (SEGMENT_MIDDLE_M - SEGMENT_END_M), 0.0), 1.0
-    )
+    from_end = min(along, 1.0 - along) * max(math.sqrt(square), FULL_SEGMENT_M)
+    near = min(max((SEGMENT_MIDDLE_M - from_end) / (SEGMENT_MIDDLE_M - SEGMENT_END_M), 0.0), 1.0)
     power = 1.0 + (REST_SHARPNESS - 1.0) * near * still
     one, other = along**power, (1.0 - along) ** power
     return float(one / (one + other))
@@ -153,10 +145,10 @@ def _near(hands: Vector, stage: Record) -> float:
 def _likely(moving: Vector, stage: Record) -> float:
     """Log likelihood of the hands' motion (3, 6) in a stage, summed over both hands:
 
-        -½ min(d² / σ², MAX_SQUARED_DEVIATION) + DIRECTION_WEIGHT tanh(u / DIRECTION_SPEED_MPS)
+        -½ min(d² / σ², MAX_SQUARED_DEVIATION) + tanh(u / DIRECTION_SPEED_MPS)
 
     d is the distance of `on_way`. u is the speed along the segment, v·w / |w|; for a hand that
-    rests in this stage, u = -RESTLESS_WEIGHT |v|.
+    rests in this stage, u = -|v|.
     """
     out = 0.0
     for side in range(2):
@@ -164,11 +156,8 @@ def _likely(moving: Vector, stage: Record) -> float:
         _, off = on_way(moving[0, here], stage, side)
         out -= 0.5 * min((off / stage["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
         length, velocity = stage["square"][side], moving[1, here]
-        if length > STAYS:
-            goes = dot(velocity, stage["way"][side]) / math.sqrt(length)
-        else:
-            goes = -RESTLESS_WEIGHT * norm(velocity)
-        out += DIRECTION_WEIGHT * math.tanh(goes / DIRECTION_SPEED_MPS)
+        goes = dot(velocity, stage["way"][side]) / math.sqrt(length) if length > STAYS else -norm(velocity)
+        out += math.tanh(goes / DIRECTION_SPEED_MPS)
     return out
 
 
@@ -180,8 +169,8 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     This is the forward filter of a hidden Markov model (Rabiner 1989). Transitions, with n_k =
     `_near` of stage k, each moving at most half of a probability:
 
-        k to k + 1:      STAGE_FORWARD_PER_S Δ n_(k+1) p_k
-        k + 1 to k:      STAGE_BACK_PER_S Δ n_(k+1) p_(k+1)
+        k to k + 1:      STAGE_CHANGE_PER_S Δ n_(k+1) p_k
+        k + 1 to k:      STAGE_CHANGE_PER_S Δ n_(k+1) p_(k+1)
         last to first:   STAGE_CYCLE_PER_S Δ n_0 p_(K-1)
         to all stages:   p_k = p_k + STAGE_ASTRAY_PER_S Δ (1 / K - p_k)
 
@@ -189,22 +178,21 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     SAMPLE_CORRELATION_S, 1), as successive samples are correlated.
 
     A belief of zeros starts anew: the first stage is FIRST_STAGE_ODDS times as probable as any
-    other, and c = FIRST_SAMPLE_WEIGHT.
+    other, and c = 1.
     """
     count, hands = len(stages), moving[0]
     total, share = 0.0, min(period_s / SAMPLE_CORRELATION_S, 1.0)
     for k in range(count):
         total += belief[k]
     if total <= 0.0:
-        share = FIRST_SAMPLE_WEIGHT
+        share = 1.0
         for k in range(count):
             belief[k] = (FIRST_STAGE_ODDS if k == 0 else 1.0) / (count - 1 + FIRST_STAGE_ODDS)
     elif count > 1:
         before = belief[0]
         for k in range(count - 1):
-            near = _near(hands, stages[k + 1])
-            forward = min(STAGE_FORWARD_PER_S * period_s * near, 0.5) * before
-            backward = min(STAGE_BACK_PER_S * period_s * near, 0.5) * belief[k + 1]
+            change = min(STAGE_CHANGE_PER_S * period_s * _near(hands, stages[k + 1]), 0.5)
+            forward, backward = change * before, change * belief[k + 1]
             before = belief[k + 1]
             belief[k] += backward - forward
             belief[k + 1] += forward - backward

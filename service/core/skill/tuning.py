@@ -7,6 +7,8 @@ line follows from others.
 
 from __future__ import annotations
 
+from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS
+
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
 # 0.03 to 0.5. More: stages learn apart. Less: stages share more.
 STAGE_DISTANCE = 0.12  # distance between stages as an input of the primitive: most of what one shows holds in all
@@ -17,20 +19,15 @@ REST_SHARPNESS = 4.0  # exponent of the share of a segment of a resting hand
 # 0.02 to 0.1. More: resting hands are drawn to ends. Less: rests on the way count.
 SEGMENT_END_M = 0.05  # on a full segment, a hand that rests this near to an end is at that end
 SEGMENT_MIDDLE_M = 2.0 * SEGMENT_END_M  # one that rests this far from both ends waits on its way
-# 0.1 to 1. More: short segments keep less of it. Less: short segments keep more of it.
-FULL_SEGMENT_M = 0.3  # on a shorter segment, SEGMENT_END_M and SEGMENT_MIDDLE_M shrink in proportion
-# 0.03 to 0.5. More: short segments keep more of it. Less: short segments keep less of it.
-LEAST_SEGMENT_SHARE = 0.1  # smallest factor by which distances shrink on a short segment
+FULL_SEGMENT_M = 3.0 * SEGMENT_MIDDLE_M  # a shorter segment has thirds instead: begin, middle, end
 # 3e-3 to 0.03. More: small motions count as rest. Less: drift counts as a segment.
 LEAST_SEGMENT_M = 0.01  # a hand whose via-points are nearer to each other than this rests
 # 1 to 8. More: the tool joins a hand later. Less: the tool joins a hand sooner.
 WITH_HAND_POWER = 4  # exponent of the share with which the tool moves with a hand to or from a via-point
 # 0.03 to 0.2. More: stages change sooner. Less: stages change later.
 STAGE_END_M = 0.08  # a stage ends, and the next begins, within this distance of a via-point
-# 0.3 to 5. More: stages change sooner. Less: stages change later.
-STAGE_FORWARD_PER_S = 1.5  # [1/s] rate of transitions to the next stage while the hands are there
-# 0.1 to 5. More: stages are repeated sooner. Less: stages are repeated later.
-STAGE_BACK_PER_S = 1.0  # [1/s] rate of transitions to the stage before
+# 0.3 to 5. More: stages change and are repeated sooner. Less: they change later.
+STAGE_CHANGE_PER_S = 1.5  # [1/s] rate of transitions to the next stage and back while the hands are there
 # 1e-6 to 1e-2. More: wrong beliefs recover sooner. Less: the belief is steadier.
 STAGE_ASTRAY_PER_S = 1e-4  # [1/s] rate of transitions to any other stage, so that a wrong belief recovers
 # 0.03 to 2. More: tasks begin again sooner. Less: tasks begin again later.
@@ -39,24 +36,13 @@ STAGE_CYCLE_PER_S = 0.2  # [1/s] rate of transitions from the last stage to the 
 FIRST_STAGE_ODDS = 10.0  # probability of the first stage / probability of any other, at the start
 # 0.05 to 1. More: the belief is slower. Less: the belief is faster.
 SAMPLE_CORRELATION_S = 0.2  # samples within this time carry the same evidence
-# 1 to 10. More: the start is certain sooner. Less: the start is uncertain longer.
-FIRST_SAMPLE_WEIGHT = 3.0  # weight of the first sample, before which nothing is known
-# 4 to 30. More: distances weigh more. Less: odd paths are forgiven.
-MAX_SQUARED_DEVIATION = 9.0  # larger deviations from a segment carry no more evidence
-# 0.3 to 3. More: directions weigh more. Less: distances weigh more.
-DIRECTION_WEIGHT = 1.0  # weight of a hand's direction along the segment
+MAX_SQUARED_DEVIATION = OUTLIER_STDS**2  # larger deviations from a segment carry no more evidence
 # 0.05 to 0.5. More: slow motions weigh less. Less: slow motions weigh more.
-DIRECTION_SPEED_MPS = 0.15  # speed at which it has half of that weight
-# 0.2 to 2. More: moving hands leave such a stage. Less: moving hands may stay in it.
-RESTLESS_WEIGHT = 0.7  # weight of the speed of a hand that rests in a stage, against that stage
+DIRECTION_SPEED_MPS = 0.15  # speed at which a hand's direction along the segment has half of its weight
 # 1e-3 to 0.05. More: fewer stages are mixed. Less: more stages are mixed.
 LEAST_STAGE_PROBABILITY = 0.01  # a less probable stage is left out of the prediction
-# 0.02 to 0.2. More: fewer stages are ambiguous. Less: more stages are ambiguous.
-AMBIGUOUS_M = 0.05  # tools of two stages farther apart than this are different via-points
 # 0.1 to 0.5. More: the arm holds less. Less: the arm holds more.
 AMBIGUOUS_PROBABILITY = 0.3  # the skill is ambiguous if the tool belongs elsewhere with this probability
-# 0.2 to 0.9. More: a hold ends sooner. Less: a hold lasts longer.
-AMBIGUOUS_OFF_SHARE = 0.5  # it is no longer ambiguous below this share of it
 # 0.1 to 1. More: the arm holds later. Less: transitions hold the arm.
 AMBIGUOUS_S = 0.3  # shorter ambiguity is a transition between stages
 
@@ -69,34 +55,24 @@ OTHER_STAGE_ERROR_WEIGHT = 0.05  # weight of an error in another stage
 LEAST_STD_M = 0.003  # lower limit of the standard deviation on each axis
 # 0.05 to 0.3. More: fewer targets are unsure. Less: more targets are unsure.
 UNSURE_M = 0.10  # the skill is unsure if the 95 % region reaches farther: the tool may belong to another thing
-# 0.5 to 0.95. More: the flag ends sooner. Less: the flag lasts longer.
-UNSURE_OFF_SHARE = 0.8  # it is no longer unsure below this share of it
-# 0.05 to 0.5. More: late tools widen it for longer. Less: late tools widen it for less time.
-TRAIL_S = 0.2  # the tool's motion over this time counts as error: a late tool is still off when hands rest
+AMBIGUOUS_M = 0.5 * UNSURE_M  # tools of two stages farther apart than this belong to different things
+TRAIL_S = SAMPLE_CORRELATION_S  # the tool's motion over this time counts as error: a late tool stays off for it
 
 # Motion of the target.
-# 5e-3 to 0.05. More: velocities are smoother. Less: velocities are local.
-MOTION_STEP_S = 0.02  # step of the differences along the hands' motion
-# 0.05 to 0.5. More: slow hands lead without velocity. Less: tremor reaches the target.
-CALM_MPS = 0.2  # a slower hand trembles: its velocity does not predict its motion
+CALM_MPS = DIRECTION_SPEED_MPS  # a slower hand trembles: its velocity does not predict its motion
 # 1 to 10. More: targets turn sharply. Less: targets turn softly.
 MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration
 # 10 to 200. More: via-points act locally. Less: via-points act widely.
 PULL_SHARPNESS_PER_M2 = 50.0  # [1/m²] k: a via-point moves the tool with the weight exp(-k |hands - its hands|²)
-# 1e-9 to 1e-3. More: exact via-points are missed more. Less: close via-points are unsolvable.
-LEAST_PULL_VARIANCE_SHARE = 1e-6  # added variance, so that exact via-points remain solvable
 
 # Memory of the hands.
 # 0.2 to 1. More: older motion counts. Less: recent motion counts.
 MEMORY_LAG_S = 0.5  # time constant of each filter; half or twice as much predicts recorded partners no better
+MEMORY_LONGEST_STEP_S = MAX_LATE_S  # upper limit of a step: a hand that is not seen does not fade from memory
 # 0.01 to 0.1. More: orientations are smoother. Less: orientations follow faster.
 TURN_LAG_S = 0.03  # time constant of the filters of a hand's turn; trackers have noise of some 0.01 rad
 # 0.03 to 0.3. More: orientations weigh more. Less: positions weigh more.
 TURN_WEIGHT_M = 0.1  # entries of a rotation matrix count as distances of a tool fixed to the hand this far away
-# 1e-3 to 0.02. More: learning is faster. Less: learning agrees with the service.
-MEMORY_STEP_S = 0.004  # step of the filters along a demonstration, as fine as the service's own period
-# 0.03 to 1. More: unseen hands fade. Less: memory lags after a gap.
-MEMORY_LONGEST_STEP_S = 0.1  # upper limit of a step: a hand that is not seen does not fade from memory
 
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
@@ -104,5 +80,4 @@ GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure
 GRIPPER_CLOSE_ABOVE = 1.0 - GRIPPER_OPEN_BELOW  # the gripper closes above this closure; between both, it does not move
 # 0.1 to 2. More: it acts rarely. Less: it acts often.
 GRIPPER_MOVES_S = 0.5  # it is left alone for this time after a command
-# 3e-3 to 0.05. More: it acts farther from the target. Less: it may never act.
-GRIPPER_THERE_M = 0.01  # it moves only if the tool is this near to its target
+GRIPPER_THERE_M = LEAST_SEGMENT_M  # it moves only if the tool is as near to its target as via-points that are one

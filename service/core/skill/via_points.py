@@ -8,7 +8,8 @@ import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
-from service.core.skill.tuning import LEAST_PULL_VARIANCE_SHARE, PULL_SHARPNESS_PER_M2
+from service.core.numerics import LEAST_PULL_VARIANCE_SHARE
+from service.core.skill.tuning import PULL_SHARPNESS_PER_M2
 
 NEIGHBOURS = 12  # of a via-point with a radius: two along each coordinate of both hands
 

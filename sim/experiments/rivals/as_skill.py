@@ -13,9 +13,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from service.core.intake.hand_estimator import STILL
+from service.core.numerics import MOTION_STEP_S
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Earlier, Prediction, Skill
-from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2, MOTION_STEP_S
+from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
 from sim.bench import Bench
 from sim.experiments.results import Array
 from sim.experiments.rivals.method import DependsOn, Observed, Placed
