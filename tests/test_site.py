@@ -93,7 +93,7 @@ def test_the_index_and_the_navigation_have_every_page() -> None:
     assert there <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
-@pytest.mark.parametrize("name", ["frames", "loop"])
+@pytest.mark.parametrize("name", ["frames", "loop", "segment"])
 def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawing = program(f"{name}_picture")
     monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")
