@@ -54,5 +54,3 @@ POSTURE_SPEED_RADPS = 0.3  # largest speed of this pull, for each joint
 IDLE_BRAKE_SHARE = 0.25  # share of the joints' acceleration for braking motion that does not move the tool
 # 0.02 to 0.3. More: the flag comes earlier. Less: the flag comes later.
 NEAR_LIMIT_RAD = 0.1  # a joint nearer to its limit than this is reported
-
-# The solver.

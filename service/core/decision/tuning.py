@@ -38,4 +38,4 @@ WAY_MPS = 0.4  # largest speed of the tool, low because the person does not comm
 WAY_GAIN_PER_S = 4.0  # [1/s] approach to each posture
 # 0.1 to 1. More: paths begin with a detour. Less: late paths are dropped.
 WAY_START_RAD = 0.3  # a way that begins farther from the arm than this is not taken
-WAY_NEAR_RAD = ARM_STILL_RAD  # a posture is reached where an arm that rests may be
+WAY_NEAR_RAD = ARM_STILL_RAD  # a posture this near is reached; an arm at rest may be as far off

@@ -29,16 +29,14 @@ MODE_ACCELERATION_REVERSIONS_PER_S = np.array([10.0, 14.0, 14.0])  # [1/s] decay
 # 0.1 to 300. More: motions are expected to end sooner. Less: motions are expected to go on.
 MODE_VELOCITY_REVERSIONS_PER_S2 = np.array([0.3, 95.0, 95.0])  # [1/s²] slow hands keep their velocity, reaches end
 # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
-TREMOR_STDS_M = np.array(
-    [5e-4, 3e-4, 0.0]
-)  # standard deviation on each axis; a larger tremor is recognised by its rhythm
+TREMOR_STDS_M = np.array([5e-4, 3e-4, 0.0])  # standard deviation on each axis; larger tremor shows by its rhythm
 # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
 TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] angular frequency; physiological tremor has 8 to 12 Hz
 # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
 TREMOR_DAMPING = 0.18  # damping ratio of the tremor's oscillator
 # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
 MAX_TREMOR_M = 6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
-# 0.1 to 1. More: new hands move sooner. Less: they rest longer; separation trusts them.
+# 0.1 to 1. More: new hands move sooner. Less: they rest longer; their speed counts as known.
 START_SPEED_STD_MPS = 0.3  # standard deviation of the speed after a hand's first sample
 # 3e-3 to 0.03. More: faster drift counts as rest. Less: rest is left sooner.
 REST_SPEED_STD_MPS = 0.01  # standard deviation of a resting hand, each axis: hands that hold something drift
@@ -73,7 +71,7 @@ DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this; clo
 # Jumps, and two sources that contradict each other.
 # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
 MAX_HAND_DISTANCE_M = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
-JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation, which includes that of the prediction, is no jump
+JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation, which the prediction adds to, is no jump
 # 2 to 10. More: jumps are followed later. Less: outliers are followed.
 CONFIRMED_SAMPLES = 3  # a jump is accepted after this number of successive samples that agree
 # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
@@ -90,9 +88,7 @@ TO_AND_FRO_MAX_SHARE = 2.0 * CONTESTED_ON_SHARE  # alternating samples raise the
 CONTESTED_OFF_SHARE = END_SHARE * CONTESTED_ON_SHARE  # a contested source remains so until its share is below this
 SCATTER_ON_M = SOURCES_APART_M  # a hand is contested above this standard deviation of its samples on each axis
 SCATTER_OFF_M = END_SHARE * SCATTER_ON_M  # a contested hand remains so until the standard deviation is below this
-SCATTER_LEAST_SAMPLES = (
-    NOISE_SAMPLES // 2
-)  # fewer samples do not show scatter, because one outlier affects four of them
+SCATTER_LEAST_SAMPLES = NOISE_SAMPLES // 2  # fewer do not show scatter, because one outlier affects four of them
 
 # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
 # 20 to 1000. More: wrong samples pass. Less: fast arms are rejected.
