@@ -31,10 +31,11 @@ BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTAL
 BLOCKS = {  # templates of a paragraph in a page
     "README.md": """{{ stale("people") }}
 With modelled people who did not demonstrate it, the soldering task succeeds in
-{{ people.methods.ours.success.mean | percent }} % of the scenes, in
-{{ people.methods.ours.success_on_the_way.mean | percent }} on the path that a teacher would have
-taken. A table of taught places alone succeeds in {{ people.methods.look_up.success.mean | percent }},
-but {{ share(people.methods.look_up.success_on_the_way.mean) }} on that path.
+{{ people.methods.ours.success.mean | percent }} % of the scenes; in
+{{ people.methods.ours.success_on_the_way.mean | percent }} % the tool also takes the path that a
+teacher would take. A mere look-up of the taught places succeeds in
+{{ people.methods.look_up.success.mean | percent }} %, but its tool takes that path in
+{{ people.methods.look_up.success_on_the_way.mean | percent }} %.
 [docs/experiments.md](docs/experiments.md) has all results, and how they were measured.""",
     "docs/faults.md": """{{ stale("faults") }}
 In that run, {{ faults.unaccounted_ticks }} ticks were lost without a mark, and

@@ -103,7 +103,7 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
 
 def test_without_figures_the_sentence_is_the_general_one_and_with_them_theirs() -> None:
     off = Evidence(gate_m=(0.123, 0.1), measure="the target's standard deviation")
-    assert explained(Reason.FAR_FROM_DEMONSTRATIONS).why.startswith("the skill is uncertain")
+    assert explained(Reason.FAR_FROM_DEMONSTRATIONS).why.startswith("the hands are farther")
     found = "the target's standard deviation is 12.3 cm, 10.0 accepted"
     assert explained(Reason.FAR_FROM_DEMONSTRATIONS, off).why == found
     assert explained(Reason.TWO_SOURCES, off).why == explained(Reason.TWO_SOURCES).why
