@@ -27,7 +27,8 @@ The range and the effects of more and less are what we expect. The last column i
 `python -m sim.experiments sensitivity` halves and doubles each number, a count as well, and
 compares short sessions with those at the tuned value. The column names the figure that changes most
 in relation to its noise, which is the standard deviation of the figure over other seeds. A change
-below the noise says little.
+below the noise says little. The change of a figure that is the same for all seeds counts as one
+noise.
 
 {state}
 

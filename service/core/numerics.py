@@ -1,5 +1,6 @@
-"""Tolerances, roundings, caps and iteration counts of the core's arithmetic. They follow from
-64-bit floating point and from the algorithms, not from how the arm should move: none is tuned.
+"""Tolerances, roundings, caps, steps and iteration counts of the core's arithmetic. They follow
+from 64-bit floating point and from the algorithms, or are so fine that half and twice of them
+change nothing that is measured: none is tuned.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ MEMORY_STEP_S = 0.004  # step of the memory's filters along a demonstration
 LEAST_SPEED_MPS = 1e-3  # below this speed a motion has no direction
 STOP_SECANT_TOLERANCE_M = 1e-3  # the search for a jerk ends when the stop leaves less than this distance unused
 
-# Inputs are clipped to these before anything is calculated; larger ones are errors elsewhere.
+# Larger inputs are errors elsewhere: joints, targets and errors are clipped, a state is rejected.
 LARGEST_USABLE = 1e6  # a state of the joints with a larger number is rejected
-MAX_JOINT_RAD = 1e4
-MAX_TARGET_M = 1e3
+MAX_JOINT_RAD = 1e4  # [rad, m] positions of joints
+MAX_TARGET_M = 1e3  # coordinates of a target
 MAX_ERROR_M = 10.0  # [m, m/s] errors and velocities of the tool
 MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow as integers
 

@@ -1,5 +1,5 @@
-"""Sensitivity of what the other experiments measure to each tuned number of the core: every number
-times a half and times two, beside the noise of each figure, which is its spread over other seeds.
+"""Change of what the other experiments measure when a tuned number of the core is halved or
+doubled, compared with the noise of each figure: its standard deviation over other seeds.
 
 The numbers are module constants that Numba compiles into the code, and compiling takes a minute. So
 this module, run as a program, loads the service with each use of a number replaced by a read from
@@ -52,6 +52,11 @@ Session: TypeAlias = Callable[[int], dict[str, float]]
 """From the number of a seed, below EACH, to figures by name."""
 
 ROOT = Path(__file__).parents[2]
+PROBABILITIES = ("MODE_PRIOR",)  # numbers that sum to 1
+LARGEST_CHANGED = {
+    "PLANNED_LIMIT_SHARES": 1.0,
+    "LEAST_STAGE_PROBABILITY": 1 / 64,
+}  # numbers that the code needs below a limit
 STAGES = ("intake", "skill", "setpoint", "arm", "separation", "limiter", "decision")  # in the order of measurement
 FACTORS = (0.5, 2.0)
 EVENTS = ("handover", "grasp", "carry")
@@ -129,15 +134,29 @@ class Number(NamedTuple):
         return ast.parse(f"_memory.{kind}({self.at}{more})", mode="eval").body
 
     def changed(self, factor: float) -> Any:
-        """The number times a factor; a count is rounded and differs by at least 1."""
+        """The number times a factor. A count is a whole number that differs by at least 1, a share
+        is at most 1, and probabilities become more or less equal.
+        """
+        if self.name in PROBABILITIES:
+            powers = np.asarray(self.value) ** factor
+            return powers / powers.sum()
         if not isinstance(self.value, int):
-            return np.asarray(self.value) * factor
+            most = LARGEST_CHANGED.get(
+                self.name, 1.0 if self.name.endswith("_SHARE") and np.max(self.value) < 1.0 else math.inf
+            )
+            return np.minimum(np.asarray(self.value) * factor, most)
         return max(self.value + 1, round(self.value * factor)) if factor > 1 else min(self.value - 1, self.value // 2)
+
+    def is_of(self, row: Mapping[str, Any]) -> bool:
+        """True if a row of the result, which has five digits, was measured with these values."""
+        pairs = [(row["value"], self.value)]
+        pairs += [(row["changed"][f"{factor:g}"]["to"], self.changed(factor)) for factor in FACTORS]
+        return all(np.allclose(one, other, rtol=1e-4, atol=0.0) for one, other in pairs)
 
 
 class Tuning(NamedTuple):
     """The tuned numbers of the core by key, and for each name the expression that reads it: a name
-    whose value names others is no number of its own, but a formula of them.
+    defined by other names is a formula, and no tuned number.
     """
 
     numbers: dict[str, Number]
@@ -531,8 +550,8 @@ def in_fork(work: Callable[[], Any]) -> Callable[[], Any]:
     def result() -> Any:
         with open(reading, "rb") as pipe:
             found = pipe.read()
-        os.waitpid(child, 0)
-        return json.loads(found) if found else f"no result within {LIMIT_S} s"
+        _, status = os.waitpid(child, 0)
+        return json.loads(found) if found else f"no result: exit {os.waitstatus_to_exitcode(status)}"
 
     return result
 
@@ -558,16 +577,16 @@ def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
     yield {"tuned": here._asdict()}
     for key in keys:
         one, began = known[key], time.monotonic()
-        values = {f"{factor:g}": one.changed(factor) for factor in FACTORS}
-        work = {f: functools.partial(at_other_value, one, value, here, all_sessions) for f, value in values.items()}
+        others = {f"{factor:g}": one.changed(factor) for factor in FACTORS}
+        work = {f: functools.partial(at_other_value, one, value, here, all_sessions) for f, value in others.items()}
         if workers == 1:
             figures = {factor: in_fork(measure)() for factor, measure in work.items()}
         else:
             started = {factor: in_fork(measure) for factor, measure in work.items()}
             figures = {factor: result() for factor, result in started.items()}
-        changed = {f: {"to": np.asarray(value).tolist(), "figures": figures[f]} for f, value in values.items()}
-        row = {"value": np.asarray(one.value).tolist(), "changed": changed}
-        yield {"number": key, "row": row | {"seconds": round(time.monotonic() - began, 1)}}
+        changed = {f: {"to": np.asarray(value).tolist(), "figures": figures[f]} for f, value in others.items()}
+        measured = {"value": np.asarray(one.value).tolist(), "changed": changed}
+        yield {"number": key, "row": measured | {"seconds": round(time.monotonic() - began, 1)}}
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -578,9 +597,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     before = result_of(results.folder, results.name) or {}
     same = before.get("depends_on") == results.origin["depends_on"]
     rows: dict[str, Any] = {
-        key: row
-        for key, row in before.get("numbers", {}).items()
-        if same and key in known and np.allclose(row["value"], known[key].value, rtol=1e-4)  # the file has five digits
+        key: row for key, row in before.get("numbers", {}).items() if same and key in known and known[key].is_of(row)
     }
     wanted = [key for key in known if key not in rows and options.numbers in ("", key, *key.split("."))]
     out: dict[str, Any] = {"tuned": before.get("tuned", {}) if same else {}, "numbers": rows, "unmeasured": []}
@@ -608,7 +625,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 def effects(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[tuple[float, str, str, float]]:
     """Changes of figures by a number: how many times the noise, factor, figure, and the change.
 
-    A figure without noise is left out, except for those of the golden session.
+    A figure that no seed changes has no noise: its change counts as one noise, so that it comes
+    before all changes below the noise. A figure that is no number any more counts as the largest.
     """
     for factor, found in row["changed"].items():
         if isinstance(found["figures"], str):
@@ -616,10 +634,16 @@ def effects(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[tuple[
             continue
         for session, figures in found["figures"].items():
             for name, value in figures.items():
-                change = float(value) - float(tuned["figures"][session][name])
-                noise = float(tuned["noise"][session][name])
-                if noise > 0.0 and math.isfinite(change):
+                before, noise = float(tuned["figures"][session][name]), float(tuned["noise"][session][name])
+                change = float(value) - before
+                if not math.isfinite(before):
+                    continue
+                if not math.isfinite(change):
+                    yield math.inf, factor, f"{session} {name}", change
+                elif noise > 0.0:
                     yield abs(change) / noise, factor, f"{session} {name}", change
+                elif change != 0.0:
+                    yield 1.0, factor, f"{session} {name}", change
 
 
 def worst(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> str:

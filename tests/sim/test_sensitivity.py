@@ -103,6 +103,11 @@ def test_the_largest_change_is_named_beside_the_noise() -> None:
     }
     assert sensitivity.worst(row, tuned) == "calm a +0.3 at 0.5 times the value, 3.0 times the noise"
     assert sensitivity.worst({"changed": {"2": {"figures": {}}}}, tuned) == "no session reads it"
+    tuned["figures"]["calm"]["c"], tuned["noise"]["calm"]["c"] = 1.0, 0.0  # always succeeds
+    row["changed"]["2"]["figures"]["calm"]["c"] = 0.0
+    assert (1.0, "2", "calm c", -1.0) in sensitivity.effects(row, tuned)
+    row["changed"]["2"]["figures"]["calm"]["a"] = math.nan
+    assert "calm a +nan" in sensitivity.worst(row, tuned)
     failed = {"changed": {"2": {"figures": "ZeroDivisionError: division by zero"}}}
     assert next(sensitivity.effects(failed, tuned))[0] == math.inf
 

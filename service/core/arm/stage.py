@@ -94,6 +94,7 @@ class Arm:
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
+            far_speed=0.5 * closing.speed,
             constrained_speed=CONSTRAINED_SPEED_MPS,
             max_tool_speed=TOOL_SPEED_SHARE * top,
             max_turn_speed=float(settings.tool.max_turn_speed),

@@ -14,7 +14,6 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.arm.least_squares import solve
 from service.core.arm.tuning import (
-    FAR_SPEED_MPS,
     IDLE_BRAKE_SHARE,
     NEAR_LIMIT_RAD,
     POSTURE_GAIN_PER_S,
@@ -116,7 +115,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         w (3,)      target angular velocity of the tool [rad/s], from `_turn`
         l, R        turn lever [m] and rotation (3, 3) of the tool
         h (J,)      velocities toward the configured posture, at most POSTURE_SPEED_RADPS each
-        damping     of `describe`, plus far_damping max(rate |e| - FAR_SPEED_MPS, 0)²
+        damping     of `describe`, plus far_damping max(rate |e| - far_speed, 0)²
 
     With u the goal's velocity, e = goal position - position - period u, g the position gain and B
     the closing braking:
@@ -149,7 +148,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     rate = arm.position_gain
     if distance > near:
         rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
-    excess = max(rate * distance - FAR_SPEED_MPS, 0.0)
+    excess = max(rate * distance - arm.far_speed, 0.0)
     damping += arm.far_damping * excess * excess
     for i in range(3):  # implicit step: in proportion to the error at the end of the period
         error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# Costs of the least-squares problem, for an arm of the WAM's reach; they scale with the arm's own.
+# Costs of the least-squares problem. Lever, dampings in m² and volume are for the WAM's reach, and
+# scale with that of the arm.
 # 3e-3 to 0.1. More: orientation is kept better. Less: position is kept better.
 TURN_LEVER_M = 0.0115  # an error of 1 rad/s in the tool's turn costs as much as one of 0.0115 m/s in its velocity
 # 1e-6 to 1e-3. More: joints move less. Less: the tool is more exact.
@@ -19,13 +20,13 @@ SINGULAR_DAMPING_M2 = 2e-3  # [m²] additional damping at a singular posture
 # 0.01 to 0.1. More: damping begins earlier. Less: damping begins later.
 SINGULAR_VOLUME_M3 = 0.04  # [m³] manipulability below which damping is added; 0.06 to 0.13 over the WAM's table
 # 0 to 20. More: unreachable targets are calm. Less: far targets close faster.
-FAR_DAMPING_S2 = 4.0  # [s²] damping at unreachable targets = 4 s² * (closing speed - FAR_SPEED_MPS)²
+FAR_DAMPING_S2 = 4.0  # [s²] damping at unreachable targets / (closing speed - half of the largest one)²
 # Speed of the tool that constraints take away, at which half of SINGULAR_DAMPING_M2 is added. Where
 # several constraints leave few directions free, the least motion would change the solution much.
 # 5e-3 to 0.1. More: constrained joints move more. Less: constrained joints are calm.
-CONSTRAINED_SPEED_MPS = 0.02  # speed lost to constraints at which half of that damping is added
+CONSTRAINED_SPEED_MPS = 0.02  # speed lost to constraints at which half of SINGULAR_DAMPING_M2 is added
 # 0 to 2. More: weak joints move less. Less: all joints move alike.
-SPARING_POWER = 0.8  # weight of a joint's speed = acceleration limit^-0.8, so that joints with low limits move less
+SPARING_POWER = 0.8  # weight of a joint's speed = acceleration limit ^ -power: joints with low limits move less
 
 # Closing in on the setpoint.
 # 10 to 200. More: the tool lags less. Less: the joints are calm.
@@ -36,14 +37,13 @@ POSITION_GAIN_RATE_SHARE = 2.0  # upper limit of the position gain / (jerk / acc
 TURN_GAIN_SHARE = 0.2  # decay of a small orientation error / position gain; with more, the joints oscillate
 # 0.1 to 1. More: large errors close faster. Less: large errors close calmly.
 CLOSING_SPEED_MPS = 0.3  # largest speed at which an error is closed
-FAR_SPEED_MPS = 0.5 * CLOSING_SPEED_MPS  # closing speed above which the damping for unreachable targets begins
 # 0.03 to 0.5. More: large errors close faster. Less: the joints are calm.
 CLOSING_BRAKE_SHARE = 0.1  # share of the tool's deceleration for closing in; with more, the joints oscillate
 # 2e-3 to 0.05. More: turns go on. Less: position is kept in turns.
 TURN_HORIZON_S = 0.008  # a turn is scaled down unless its joint velocities can be reached within this time
 # 0.5 to 1. More: the setpoint is faster. Less: joints can correct more.
 PLANNED_LIMIT_SHARES = np.array([0.97, 0.95, 0.85])  # shares of joint speed, acceleration, jerk for the setpoint
-TOOL_SPEED_SHARE = 0.5 * (1.0 + float(PLANNED_LIMIT_SHARES[0]))  # of max_speed for setpoint and closing in together
+TOOL_SPEED_SHARE = 0.5 * (1.0 + float(PLANNED_LIMIT_SHARES[0]))  # speed of setpoint and closing in / max_speed
 
 # The posture, in what is left free.
 # 0.1 to 10. More: the posture is kept closely. Less: the posture may drift.

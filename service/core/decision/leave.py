@@ -24,14 +24,15 @@ class WayOut:
 
     def __init__(self, settings: Settings) -> None:
         self._mps = min(WAY_MPS, settings.tool.max_speed)
-        self._radps = min(WAY_RADPS, *settings.joints.velocity)
+        self._per_rad = np.array(settings.joints.per_rad)
+        self._radps = min(WAY_RADPS, float((np.array(settings.joints.velocity) / self._per_rad).min()))
 
     def take(self, state: Record, event: Event) -> None:
         """Start on a planned way out, if the tool is still stuck and the way begins within
         WAY_START_RAD of the commanded joints.
         """
         path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1]))
-        if state["stuck"] and np.abs(path[:1] - state["joints"][0]).max(initial=0.0) < WAY_START_RAD:
+        if state["stuck"] and (np.abs(path[:1] - state["joints"][0]) / self._per_rad).max(initial=0.0) < WAY_START_RAD:
             count = state["way_count"] = len(path)
             state["way"][:count] = path
             state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
@@ -40,8 +41,8 @@ class WayOut:
         """Joint velocities (J,) [rad/s] toward the next posture of the way out; None if there is
         none.
 
-        With the difference d (J,) from the commanded joints, D = max |d_j| and the tool's Jacobian
-        J_p, the first three rows of `tasks`:
+        With the difference d (J,) from the commanded joints, D = max |d_j| / per_rad_j and the
+        tool's Jacobian J_p, the first three rows of `tasks`:
 
             u = d min(radps, WAY_GAIN_PER_S D) / max(D, WAY_NEAR_RAD)
             velocity = u / max(1, |J_p u| / mps)
@@ -52,7 +53,7 @@ class WayOut:
         if state["way_next"] >= state["way_count"]:
             return None
         off: Vector = state["way"][state["way_next"]] - state["joints"][0]
-        far = float(np.abs(off).max())
-        velocity = off * (min(self._radps, WAY_GAIN_PER_S * far) / max(far, WAY_NEAR_RAD))
+        far = float((np.abs(off) / self._per_rad).max())
+        velocity: Vector = off * (min(self._radps, WAY_GAIN_PER_S * far) / max(far, WAY_NEAR_RAD))
         state["way_next"] += far < WAY_NEAR_RAD
         return velocity / max(1.0, float(np.linalg.norm(tasks[:3] @ velocity)) / self._mps)

@@ -171,8 +171,8 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
         g_0 - g > min(PROGRESS_SHARE g_0, PROGRESS_SPEED_SHARE max_speed STUCK_S)
 
     and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
-    anew; so they are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved by
-    more than that.
+    anew. They also are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved
+    by more than that.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by

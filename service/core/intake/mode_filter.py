@@ -4,7 +4,8 @@ A hand rests, reaches, or changes its motion. Each mode is a Kalman filter with 
 `motion_model`: position p, velocity v, acceleration a, tremor y and its velocity w. A sample
 measures p + y; tremor is seen by the tracker but is no part of the hand's motion.
 
-Three rules are added to the published filter:
+Modes are mixed at the time of a sample, after the prediction. Three rules are added to the
+published filter:
 
 * The mode CHANGE has no tremor (σ = 0), because the beginning of a change would otherwise be
   explained as tremor.
@@ -53,7 +54,7 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
         mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
 
     with σ_v = START_SPEED_STD_MPS and the mode's tremor σ. The variance of the acceleration is the
-    stationary one of the mode CHANGE at a given velocity. The probabilities are MODE_PRIOR.
+    stationary one of the mode CHANGE. The probabilities are MODE_PRIOR.
     """
     of_acceleration = MODE_INTENSITIES_M2PS5[CHANGE] / (2.0 * MODE_ACCELERATION_REVERSIONS_PER_S[CHANGE])
     means[:] = 0.0
@@ -143,11 +144,12 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 
 @compiled
-def _bounded(square: float) -> float:
-    """Squared, normalised innovation on three axes, at most 6 log(1 / LEAST_MODE_PROBABILITY). What
-    is as improbable on each axis as a mode can be is then equally unlikely in all modes.
+def _bounded(innovation: float) -> float:
+    """Squared, normalised innovation x on three axes, at most so large that exp(-½ x) =
+    LEAST_MODE_PROBABILITY³, a factor for each axis: a less probable sample does not distinguish
+    modes.
     """
-    return min(square, -6.0 * math.log(LEAST_MODE_PROBABILITY))
+    return min(innovation, -6.0 * math.log(LEAST_MODE_PROBABILITY))
 
 
 @compiled

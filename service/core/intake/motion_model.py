@@ -13,8 +13,8 @@ tremor's stationary standard deviation σ (TREMOR_STDS_M) differ between the mod
 TREMOR_RATE_PER_S and ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
 
 The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
-sample, the velocity of a hand that reaches or changes does not revert to zero. That would report
-the end of a motion while its next sample may only be late.
+sample, the velocity of a hand that reaches or changes does not revert to zero: otherwise the end of
+a motion would be reported although the next sample may only be late.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ source that contradicts the first. The rules are the same for both hands and for
 * A hand that appears where the other hand was, while that one is no longer seen there, is taken for
   the other one: the tracker has swapped them. The new position is accepted after `hands.swapped_s`,
   within which the tracker may correct itself.
-* A source is contested when at least CONTESTED_ON_SHARE of its samples within about
+* A source is contested when more than CONTESTED_ON_SHARE of its samples within about
   TRACKER_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
   arm, these are samples that jumped. For a hand, they alternate between two positions, or they
   jumped by the same offset as the last one that jumped, with accepted samples between them; the
@@ -126,9 +126,10 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
 def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
     """True if an earlier sample deviated by about the same `offset` (3,) [m] from its neighbours.
 
-    All retained samples before number `order` are checked. The deviation of a sample is x_k -
-    (x_(k-1) + x_(k+1)) / 2; it may differ from the offset by SOURCE_SPREAD_SHARE |offset|. A second
-    source repeats its offset, the outliers of one tracker do not.
+    The retained samples from number `order` + 2 on are checked; the one before is a neighbour of
+    the new deviation. The deviation of a sample is x_k - (x_(k-1) + x_(k+1)) / 2; it may differ
+    from the offset by SOURCE_SPREAD_SHARE |offset|. A second source repeats its offset, the
+    outliers of one tracker do not.
     """
     state, around = states[0], np.empty((3, 3))
     for before in range(order + 2, state.kept[side] - 1):

@@ -19,29 +19,29 @@ END_SHARE = 0.8  # a hold for a measured reason lasts until its measure is below
 
 # The hand filter's modes: rest, reach, change.
 # 0.05 to 0.8. More: a mode is entered more often. Less: a mode is entered less often.
-MODE_PRIOR = np.array([0.3, 0.5, 0.2])  # probabilities before anything is known
+MODE_PRIOR = np.array([0.3, 0.5, 0.2])  # probabilities before anything is known, and after a switch
 # 0.01 to 10. More: changes are seen sooner. Less: estimates are smoother.
-MODE_SWITCH_RATES_PER_S = np.array([0.03, 3.0, 3.0])  # [1/s] rates at which modes are left; noise must not end rest
+MODE_SWITCH_RATES_PER_S = np.array([0.03, 3.0, 3.0])  # [1/s] rates at which the mode is drawn anew; low in rest
 # 1e-7 to 100. More: the estimate follows faster. Less: noise is reduced more.
 MODE_INTENSITIES_M2PS5 = np.array([1e-6, 1.0, 30.0])  # [m²/s⁵] intensity of the white jerk
 # 3 to 40. More: accelerations end sooner. Less: accelerations last longer.
 MODE_ACCELERATION_REVERSIONS_PER_S = np.array([10.0, 14.0, 14.0])  # [1/s] decay of the acceleration
 # 0.1 to 300. More: motions are expected to end sooner. Less: motions are expected to go on.
-MODE_VELOCITY_REVERSIONS_PER_S2 = np.array([0.3, 95.0, 95.0])  # [1/s²] slow hands keep their velocity, reaches end
+MODE_VELOCITY_REVERSIONS_PER_S2 = np.array([0.3, 95.0, 95.0])  # [1/s²] low in rest, where drift goes on; reaches end
 # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
-TREMOR_STDS_M = np.array([5e-4, 3e-4, 0.0])  # standard deviation on each axis; larger tremor shows by its rhythm
+TREMOR_STDS_M = np.array([5e-4, 3e-4, 0.0])  # standard deviation on each axis; larger tremor has the same frequency
 # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
 TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] angular frequency; physiological tremor has 8 to 12 Hz
 # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
 TREMOR_DAMPING = 0.18  # damping ratio of the tremor's oscillator
 # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
 MAX_TREMOR_M = 6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
-# 0.1 to 1. More: new hands move sooner. Less: they rest longer; their speed counts as known.
+# 0.1 to 1. More: new hands move sooner. Less: new hands rest longer.
 START_SPEED_STD_MPS = 0.3  # standard deviation of the speed after a hand's first sample
 # 3e-3 to 0.03. More: faster drift counts as rest. Less: rest is left sooner.
 REST_SPEED_STD_MPS = 0.01  # standard deviation of a resting hand, each axis: hands that hold something drift
-REST_ACCELERATION_STD_MPS2 = REST_SPEED_STD_MPS  # [m/s²] a resting hand changes its drift within a second
-REST_MAX_SPEED_MPS = OUTLIER_STDS * REST_SPEED_STD_MPS  # so the beginning of a reach is seen at once
+REST_ACCELERATION_STD_MPS2 = REST_SPEED_STD_MPS  # [m/s²] it changes its drift by as much in a second
+REST_MAX_SPEED_MPS = OUTLIER_STDS * REST_SPEED_STD_MPS  # a faster hand does not rest: reaches are seen at once
 # 1e-6 to 1e-2. More: modes switch sooner. Less: modes switch later.
 LEAST_MODE_PROBABILITY = 1e-4  # no mode becomes less probable, so that each can return
 REAPPEARED_VARIANCE_SHARE = OUTLIER_STDS**2  # squared distance / variance of a hand that continues its filter
@@ -61,17 +61,17 @@ STILLNESS_FALL_S = 0.03  # time constant with which stillness ends
 
 # Late samples.
 # 0.03 to 0.3. More: later samples are used. Less: late samples are rejected sooner.
-MAX_LATE_S = 0.1  # a sample may be this much older than the newest one, and later than the minimum delay
+MAX_LATE_S = 0.1  # samples that are older than the newest one by more are rejected; longer delays count as this
 VELOCITY_KEPT_S = MAX_LATE_S  # after the newest sample, the velocity is extrapolated for this time
 # 0.3 to 5. More: judgements are steadier. Less: drifting clocks and second sources are seen sooner.
 TRACKER_MEMORY_S = 1.0  # time over which a tracker's minimum delay and its contradictions are judged
 # 2e-3 to 0.05. More: worse clocks are trusted. Less: good clocks are doubted.
-DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this; clocks 1 % apart do not
+DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this: 1 % of drift between two clocks
 
 # Jumps, and two sources that contradict each other.
 # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
 MAX_HAND_DISTANCE_M = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
-JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation, which the prediction adds to, is no jump
+JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation is no jump; twice, as the prediction is uncertain too
 # 2 to 10. More: jumps are followed later. Less: outliers are followed.
 CONFIRMED_SAMPLES = 3  # a jump is accepted after this number of successive samples that agree
 # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
@@ -86,9 +86,10 @@ TO_AND_FRO_MPS2 = 50.0  # [m/s²] below this acceleration, a single hand could h
 CONTESTED_ON_SHARE = 0.25  # a source is contested above this share of contradicting samples
 TO_AND_FRO_MAX_SHARE = 2.0 * CONTESTED_ON_SHARE  # alternating samples raise the contested share up to this limit
 CONTESTED_OFF_SHARE = END_SHARE * CONTESTED_ON_SHARE  # a contested source remains so until its share is below this
-SCATTER_ON_M = SOURCES_APART_M  # a hand is contested above this standard deviation of its samples on each axis
+# 5e-3 to 0.03. More: scatter is tolerated. Less: noisy trackers hold the arm.
+SCATTER_ON_M = 0.012  # a hand is contested above this standard deviation of its samples on each axis
 SCATTER_OFF_M = END_SHARE * SCATTER_ON_M  # a contested hand remains so until the standard deviation is below this
-SCATTER_LEAST_SAMPLES = NOISE_SAMPLES // 2  # fewer do not show scatter, because one outlier affects four of them
+SCATTER_LEAST_SAMPLES = NOISE_SAMPLES // 2  # with fewer, one outlier in four differences looks like scatter
 
 # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
 # 20 to 1000. More: wrong samples pass. Less: fast arms are rejected.

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.core.intake.tuning import START_SPEED_STD_MPS
+
 # Planning keeps more distance than the rule requires, so that the rule is not reached.
 # 0 to 0.05. More: the arm stays farther away. Less: the rule itself limits the arm.
 PLANNED_MARGIN_M = 0.01  # distance kept beyond the clearance
 # 0.4 to 1. More: the arm comes faster. Less: ramps are never too short.
-PLANNED_BRAKE_SHARE = 0.8  # share of the braking that is planned with; its ramps need the rest
+PLANNED_BRAKE_SHARE = 0.8  # share of braking and of contact speed that is planned with; ramps need the rest
 # 0.2 to 1. More: the arm comes faster. Less: braking is gentle.
 PLANNED_BRAKE_LIMITS = np.array([1.0, 0.5, 0.5])  # largest braking / tool's deceleration: people, things, own parts
 # 5e-3 to 0.1. More: the arm slows down early. Less: joints oscillate.
@@ -21,22 +23,23 @@ PLANNED_REACTION_S = 0.02  # smallest reaction time that is planned with; joints
 
 # Inside of a clearance.
 # 1 to 20. More: the arm returns faster. Less: the arm returns softly.
-CLEARANCE_GAIN_PER_S = 5.0  # [1/s] planned speed = 5 /s * distance left to the clearance; negative inside
+CLEARANCE_GAIN_PER_S = 5.0  # [1/s] planned speed / distance left to the clearance; negative inside
 # 0.02 to 0.5. More: fewer postures return. Less: joints are strained.
 RETREAT_AUTHORITY_MPS = 0.1  # a part returns only if the joints can move it at this speed
 # 2e-3 to 0.05. More: the rule is exceeded more. Less: the arm stops for rounding.
 SLIP_SPEED_MPS = 0.01  # excess that is tolerated, as joints do not all reach their velocities at the same time
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # largest speed of the return to the clearance
 # 1e-4 to 5e-3. More: excess is allowed deeper inside. Less: the arm stops for rounding.
-SLIP_DEPTH_M = 0.0005  # inside a clearance the tolerated excess falls, to a tenth near this depth
+SLIP_DEPTH_M = 0.0005  # inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this depth
 
 # Hands: what may happen until the arm reacts.
 # 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
 BRAKE_RAMP_S = 0.08  # time until a deceleration has built up, and until a hand's new velocity is measured
 HAND_ACCELERATION_FADE_S = BRAKE_RAMP_S  # time constant with which a hand's acceleration fades
 LOOKAHEAD_S = 0.5 * BRAKE_RAMP_S * np.arange(5.0)  # times ahead at which the rule is evaluated
-# 0.05 to 0.5. More: new hands are trusted sooner. Less: the arm waits longer.
-UNKNOWN_VELOCITY_STD_MPS = 0.2  # a hand with a larger standard deviation is assumed to approach at `unknown_speed`
+# A hand is assumed to approach at `unknown_speed` until its velocity is better known than after its
+# first sample.
+UNKNOWN_VELOCITY_STD_MPS = 2.0 * START_SPEED_STD_MPS / 3.0  # on each axis
 # 1 to 20. More: the arm retreats sooner. Less: hands may appear closer than planned.
 UNSEEN_ACCELERATION_MPS2 = 5.0  # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
 # 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
@@ -45,4 +48,5 @@ CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a vi
 # The body.
 # 0 to 0.03. More: the arm folds less. Less: parts come nearer.
 OWN_CLEARANCE_M = 0.01  # largest clearance between own parts; more would keep the arm from folding
-CAPSULE_EXCESS_M = OWN_CLEARANCE_M  # capsules around meshes exceed them by about as much
+# 0 to 0.03. More: overlaps are forgiven. Less: mesh capsules collide falsely.
+CAPSULE_EXCESS_M = 0.01  # capsules around meshes exceed them by about this

@@ -46,7 +46,7 @@ def tracker_gains(jerk_weight: float) -> Vector:
 
     jerk_weight is in s⁶. The target is assumed to move as a hand that reaches, r''' = -k_v r' - k_a
     r'' with the reversions of `motion_model`. The gains solve the continuous algebraic Riccati
-    equation.
+    equation, whose dynamics are shifted by -1e-6 /s: the target's motion is not controllable.
     """
     a = np.zeros((5, 5))  # dz/dt = a z + b jerk
     a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = (

@@ -8,12 +8,13 @@ line follows from others.
 from __future__ import annotations
 
 from service.core.arm.tuning import PLANNED_LIMIT_SHARES, POSITION_GAIN_PER_S, TURN_GAIN_SHARE
+from service.core.intake.tuning import LEAST_NOISE_M, MODE_INTENSITIES_M2PS5
 
 # The tracker: a linear-quadratic one, whose input is jerk.
 # 0.5 to 2. More: the setpoint follows faster. Less: the joints follow calmly.
 TRACKER_RATE_SHARE = 1.1  # largest tracker rate / (jerk / acceleration); joints oscillate with a larger one
 # 20 to 500. More: errors close faster. Less: large errors saturate less.
-STIFFEST_PER_M = 100.0  # [1/m] jerk gain / max_jerk; an error below 1 / 100 m does not saturate the jerk
+STIFFEST_PER_M = 100.0  # [1/m] jerk gain / max_jerk of a tool with little jerk: errors below 1 / 100 m do not saturate
 
 # Stopping where the hands would stop at the soonest.
 # 0 to 5e-3. More: less lag, more overshoot. Less: more lag, less overshoot.
@@ -21,10 +22,9 @@ STOP_OVERSHOOT_M = 0.0012  # the setpoint may stop this far beyond the hand's ea
 # 3 to 50. More: more lag, less overshoot. Less: less lag, more overshoot.
 HAND_BRAKE_MPS2 = 7.0  # [m/s²] largest mean deceleration of a hand, from when it begins to brake
 # 0.03 to 0.3. More: ends of reaches are braked early. Less: stops are passed.
-DECELERATION_LOOKAHEAD_S = 0.11  # predicted speed = v + 0.11 s * min(a, 0)
-# A slow tracker shows a stop late: delay = 4 * (response time - 28.5 ms), at most 8 mm of travel.
-# 0.01 to 0.1. More: slow trackers lag less. Less: slow trackers overshoot less.
-PROMPT_RESPONSE_S = 0.0285  # response time of the hand filter with a good tracker at 30 Hz
+DECELERATION_LOOKAHEAD_S = 0.11  # predicted speed = speed + this * min(acceleration, 0)
+# A slow tracker shows a stop late: by LATE_STOP_SHARE * (response time - PROMPT_RESPONSE_S).
+PROMPT_RESPONSE_S = float((LEAST_NOISE_M**2 / 30.0 / MODE_INTENSITIES_M2PS5[2]) ** (1 / 6))  # good tracker, 30 Hz
 # 0 to 10. More: slow trackers overshoot less. Less: slow trackers lag less.
 LATE_STOP_SHARE = 4.0  # delay of a stop / excess of the response time
 # 0 to 0.02. More: slow trackers overshoot less. Less: slow trackers lag less.
@@ -39,17 +39,18 @@ MEETING_BRAKE_LEAST_SHARE = 0.15  # smallest planned braking / largest braking, 
 BARRIER_RATE_PER_S = 100.0  # [1/s] largest rate at which the distance left shrinks
 # 1e-3 to 0.01. More: long periods brake late. Less: long periods brake early.
 BARRIER_TIME_S = 0.0035  # limits the share in long periods, where the prediction over one period is less accurate
-PLANNED_BRAKE_SHARE = float(PLANNED_LIMIT_SHARES[1])  # of acceleration and jerk; the rest corrects errors
-PLANNED_SPEED_SHARE = float(PLANNED_LIMIT_SHARES[0])  # share of max_speed that is planned with
+# Of the tool's limits, and again of the joints', which `joint_costs` has reduced already:
+PLANNED_BRAKE_SHARE = float(PLANNED_LIMIT_SHARES[1])  # planned share of acceleration and jerk; the rest corrects errors
+PLANNED_SPEED_SHARE = float(PLANNED_LIMIT_SHARES[0])  # planned share of max_speed
 
 # A tool that falls behind.
 # 0 to 0.02. More: a late tool is waited for less. Less: small lags slow the setpoint.
 GAP_FREE_M = 0.003  # a tool this far behind its setpoint does not slow it
 # 3e-3 to 0.05. More: a late tool is waited for less. Less: lags slow the setpoint.
-GAP_SLOW_M = 0.012  # share of the speed = 1 / (1 + (gap - free) / 12 mm)
-GAP_WAITING_M = GAP_FREE_M + 9.0 * GAP_SLOW_M  # where a tenth of the speed is left, the setpoint begins to wait
+GAP_SLOW_M = 0.012  # share of the speed = 1 / (1 + (gap - GAP_FREE_M) / GAP_SLOW_M)
 # 0.05 to 1. More: the setpoint runs ahead. Less: the setpoint waits sooner.
 GAP_STOPPED_M = 0.2  # the setpoint stops at this distance from its tool
+GAP_WAITING_M = 0.5 * GAP_STOPPED_M  # from here on its target is moved closer: a tenth of its speed is left
 
 # Bounds around the last targets: docs/bounds.md has the proof.
 # 0.1 to 2. More: old targets stay in bounds. Less: the bounds follow closely.
@@ -61,4 +62,4 @@ STOP_JERK_ERROR_M = HULL_MARGIN_M  # a planned stop uses at most the tracker's j
 RETURN_SHARE = 1 / 16  # share of max_speed at which a setpoint beyond its bounds returns, on each axis
 
 # Orientation.
-ORIENTATION_GAIN_PER_S = TURN_GAIN_SHARE * POSITION_GAIN_PER_S  # [1/s] decay of a small error, as in the arm
+ORIENTATION_GAIN_PER_S = TURN_GAIN_SHARE * POSITION_GAIN_PER_S  # [1/s] decay of a small error, as of quick joints

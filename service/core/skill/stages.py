@@ -143,7 +143,8 @@ def _near(hands: Vector, stage: Record) -> float:
 
 @compiled
 def _likely(moving: Vector, stage: Record) -> float:
-    """Log likelihood of the hands' motion (3, 6) in a stage, summed over both hands:
+    """Evidence of the hands' motion (3, 6) for a stage, used as its log likelihood, summed over
+    both hands. It has no term of σ, so that no stage is preferred for its accuracy alone:
 
         -½ min(d² / σ², MAX_SQUARED_DEVIATION) + tanh(u / DIRECTION_SPEED_MPS)
 

@@ -11,11 +11,11 @@ from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS
 
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
 # 0.03 to 0.5. More: stages learn apart. Less: stages share more.
-STAGE_DISTANCE = 0.12  # distance between stages as an input of the primitive: most of what one shows holds in all
+STAGE_DISTANCE = 0.12  # distance between stages as an input: small, as most of what one shows holds in all; learned in
 # 0.1 to 2. More: stages learn apart. Less: stages share more.
 STAGE_DISTANCE_BESIDE = 0.5  # the same for orientation and gripper, which belong to one stage
 # 1 to 10. More: resting hands are drawn to ends. Less: rests on the way count.
-REST_SHARPNESS = 4.0  # exponent of the share of a segment of a resting hand
+REST_SHARPNESS = 4.0  # exponent n in λⁿ / (λⁿ + (1 - λ)ⁿ) of a hand that rests at an end
 # 0.02 to 0.1. More: resting hands are drawn to ends. Less: rests on the way count.
 SEGMENT_END_M = 0.05  # on a full segment, a hand that rests this near to an end is at that end
 SEGMENT_MIDDLE_M = 2.0 * SEGMENT_END_M  # one that rests this far from both ends waits on its way
@@ -25,7 +25,7 @@ LEAST_SEGMENT_M = 0.01  # a hand whose via-points are nearer to each other than 
 # 1 to 8. More: the tool joins a hand later. Less: the tool joins a hand sooner.
 WITH_HAND_POWER = 4  # exponent of the share with which the tool moves with a hand to or from a via-point
 # 0.03 to 0.2. More: stages change sooner. Less: stages change later.
-STAGE_END_M = 0.08  # a stage ends, and the next begins, within this distance of a via-point
+STAGE_END_M = 0.08  # width of the Gaussian around a via-point in which stages change
 # 0.3 to 5. More: stages change and are repeated sooner. Less: they change later.
 STAGE_CHANGE_PER_S = 1.5  # [1/s] rate of transitions to the next stage and back while the hands are there
 # 1e-6 to 1e-2. More: wrong beliefs recover sooner. Less: the belief is steadier.
@@ -38,9 +38,9 @@ FIRST_STAGE_ODDS = 10.0  # probability of the first stage / probability of any o
 SAMPLE_CORRELATION_S = 0.2  # samples within this time carry the same evidence
 MAX_SQUARED_DEVIATION = OUTLIER_STDS**2  # larger deviations from a segment carry no more evidence
 # 0.05 to 0.5. More: slow motions weigh less. Less: slow motions weigh more.
-DIRECTION_SPEED_MPS = 0.15  # speed at which a hand's direction along the segment has half of its weight
-# 1e-3 to 0.05. More: fewer stages are mixed. Less: more stages are mixed.
-LEAST_STAGE_PROBABILITY = 0.01  # a less probable stage is left out of the prediction
+DIRECTION_SPEED_MPS = 0.15  # evidence of a direction = tanh(speed along the segment / 0.15 m/s)
+# 1e-3 to 0.015. More: fewer stages are mixed. Less: more stages are mixed.
+LEAST_STAGE_PROBABILITY = 0.01  # a less probable stage is left out; less than 1 / 64, or all of 64 might be
 # 0.1 to 0.5. More: the arm holds less. Less: the arm holds more.
 AMBIGUOUS_PROBABILITY = 0.3  # the skill is ambiguous if the tool belongs elsewhere with this probability
 # 0.1 to 1. More: the arm holds later. Less: transitions hold the arm.
@@ -56,12 +56,12 @@ LEAST_STD_M = 0.003  # lower limit of the standard deviation on each axis
 # 0.05 to 0.3. More: fewer targets are unsure. Less: more targets are unsure.
 UNSURE_M = 0.10  # the skill is unsure if the 95 % region reaches farther: the tool may belong to another thing
 AMBIGUOUS_M = 0.5 * UNSURE_M  # tools of two stages farther apart than this belong to different things
-TRAIL_S = SAMPLE_CORRELATION_S  # the tool's motion over this time counts as error: a late tool stays off for it
+TRAIL_S = SAMPLE_CORRELATION_S  # mean velocity over this time, by the error of timing, adds to the covariance
 
 # Motion of the target.
-CALM_MPS = DIRECTION_SPEED_MPS  # a slower hand trembles: its velocity does not predict its motion
+CALM_MPS = DIRECTION_SPEED_MPS  # a slower hand may tremble: its velocity does not predict its motion
 # 1 to 10. More: targets turn sharply. Less: targets turn softly.
-MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration
+MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration on each axis
 # 10 to 200. More: via-points act locally. Less: via-points act widely.
 PULL_SHARPNESS_PER_M2 = 50.0  # [1/m²] k: a via-point moves the tool with the weight exp(-k |hands - its hands|²)
 
@@ -72,12 +72,12 @@ MEMORY_LONGEST_STEP_S = MAX_LATE_S  # upper limit of a step: a hand that is not 
 # 0.01 to 0.1. More: orientations are smoother. Less: orientations follow faster.
 TURN_LAG_S = 0.03  # time constant of the filters of a hand's turn; trackers have noise of some 0.01 rad
 # 0.03 to 0.3. More: orientations weigh more. Less: positions weigh more.
-TURN_WEIGHT_M = 0.1  # entries of a rotation matrix count as distances of a tool fixed to the hand this far away
+TURN_WEIGHT_M = 0.1  # entries of a rotation matrix become lengths: those of a tool fixed to the hand this far away
 
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
 GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure
 GRIPPER_CLOSE_ABOVE = 1.0 - GRIPPER_OPEN_BELOW  # the gripper closes above this closure; between both, it does not move
 # 0.1 to 2. More: it acts rarely. Less: it acts often.
-GRIPPER_MOVES_S = 0.5  # it is left alone for this time after a command
-GRIPPER_THERE_M = LEAST_SEGMENT_M  # it moves only if the tool is as near to its target as via-points that are one
+GRIPPER_MOVES_S = 0.5  # within this time after a command it gets no other one
+GRIPPER_THERE_M = LEAST_SEGMENT_M  # it moves only if the tool is this near to its target, which is one via-point
