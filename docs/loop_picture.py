@@ -63,11 +63,11 @@ BOXES = {
 ARROWS = (
     Arrow("tracker", "intake", f"poses [m]\n{BY_KEY['hands/left'].rate}"),
     Arrow("driver", "intake", f"joints [rad, rad/s]\n{BY_KEY['joints/state'].rate}", -0.95, 0.25),
-    Arrow("client", "intake", "JSON, on demand", 0.0, 0.0),
+    Arrow("client", "intake", "JSON, to the stage\nthat it concerns", 0.0, 0.0),
     Arrow("intake", "skill", "hands: p, v, a\n[m, m/s, m/s²]"),
     Arrow("skill", "decision", "deviation [m]"),
     Arrow("skill", "setpoint", "target: p, v, a\n[m, m/s, m/s²]", -1.1, 0.0),
-    Arrow("decision", "setpoint", "mode, reason", 0.8, 0.0),
+    Arrow("decision", "setpoint", "mode, reason\n(to the limiter\ntoo)", 0.75, 0.0),
     Arrow("intake", "separation", "hands", 0.42, 0.0),
     Arrow("separation", "arm", "rows: row · q' ≤ limit [m/s]", 0.95, 0.45),
     Arrow("separation", "limiter", "", 0.0, 0.0),

@@ -74,7 +74,7 @@ def drawn(evidence: Evidence) -> Figure:
     inside = 100 * evidence.inside
     regions.plot(100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations")
     regions.set(title="share of the samples inside each predicted region")
-    regions.set(xlabel="the region should hold [%]", ylabel="it holds [%]")
+    regions.set(xlabel="the region should contain [%]", ylabel="samples inside [%]")
     regions.set(xlim=(0, 100), ylim=(0, 100))
     regions.legend(frameon=False)
 

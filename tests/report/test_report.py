@@ -170,7 +170,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     asked = held[Reason.OPERATOR]
     assert (asked.why, asked.remedy) == ("an operator requested a hold, or the daemon was stopped", "thirdhand resume")
     far = re.fullmatch(
-        r"a hand's distance from its ways between via-points is (.*) cm, 11.0 accepted",
+        r"the distance of a hand from its segments is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
     )
     assert far is not None

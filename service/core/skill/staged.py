@@ -153,7 +153,7 @@ class StagedKMP:
     delay_s: float
     via_points: tuple[ViaPoint, ...] = ()
 
-    measure: ClassVar[str] = "a hand's distance from its ways between via-points"
+    measure: ClassVar[str] = "the distance of a hand from its segments"
     formats: ClassVar[tuple[int, ...]] = (5,)
     units: ClassVar[str] = TASK_UNITS
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = TASK_RANGES
