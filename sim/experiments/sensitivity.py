@@ -41,7 +41,10 @@ from numba.extending import intrinsic
 from sim.experiments.results import ExperimentError
 
 if TYPE_CHECKING:  # the rest of the service is imported after `begin`
+    from service.learning.skill_file import StoredSkill
     from service.settings.config import Settings
+    from sim.experiments.catalogue import Stream
+    from sim.experiments.people.left_out import LeftOut
     from sim.experiments.people.moving_hands import Moving
     from sim.experiments.rehearsal import Rehearsed
     from sim.experiments.results import Array, Options, Results
@@ -447,29 +450,27 @@ def sessions() -> dict[str, Session]:
 
         return run_one
 
-    def partners(seed: int) -> dict[str, float]:
-        stream = streams["made"]
+    def taught_by_two(kind: str, stream: Stream, seed: int, *, named: bool) -> tuple[StoredSkill, list[LeftOut]]:
+        """The skill of two people's takes, and a take of a third one, with or without named
+        via-points.
+        """
         who = stream.numbers[3 * seed : 3 * seed + 3]
-        learned, asked = (
-            takes(MADE, people=who[:2], each=2, seed=stream.seed),
-            takes(MADE, people=who[2:], each=1, seed=stream.seed),
-        )
-        skill = learn([take.demonstration for take in learned])
-        seen = [left_out("", "", take.demonstration) for take in asked]
+        taken = [takes(kind, people=who[:2], each=2, seed=stream.seed)]
+        taken += [takes(kind, people=who[2:], each=1, seed=stream.seed)]
+        learned, asked = ([take.demonstration for take in part] for part in taken)
+        if not named:
+            learned = [one._replace(places=()) for one in learned]
+        return learn(learned), [left_out("", "", one) for one in asked]
+
+    def partners(seed: int) -> dict[str, float]:
+        skill, seen = taught_by_two(MADE, streams["made"], seed, named=True)
         there = [adapted(skill, one.demonstration.places, tolerance=TOLERANCE_M) for one in seen]
         found = summary([judged(one, predicted(at, one)) for one, at in zip(seen, there, strict=True)])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "held", "unsure")}
 
     def untold(seed: int) -> dict[str, float]:
-        """A skill of both hands and their memory, for a task whose places are not told."""
-        stream = streams["untold"]
-        who = stream.numbers[3 * seed : 3 * seed + 3]
-        shown, asked = (
-            takes(UNTOLD_KIND, people=who[:2], each=2, seed=stream.seed),
-            takes(UNTOLD_KIND, people=who[2:], each=1, seed=stream.seed),
-        )
-        skill = learn([take.demonstration._replace(places=()) for take in shown])
-        seen = [left_out("", "", take.demonstration) for take in asked]
+        """A skill of both hands and their memory, for a task without named via-points."""
+        skill, seen = taught_by_two(UNTOLD_KIND, streams["untold"], seed, named=False)
         found = summary([judged(one, predicted(skill, one)) for one in seen])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
 

@@ -224,9 +224,8 @@ def take_hand(
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
             if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
-                another = _turns_hard(
-                    states, side, at, in_base, passed_s, period_s
-                )  # a higher share would only decay later
+                # a higher share would only decay later
+                another = _turns_hard(states, side, at, in_base, passed_s, period_s)
                 another = another and is_to_and_fro(states, side, order, in_base)
             note(states, side, another, stale_ticks * period_s, period_s)
         elif cause != REPEATED:
