@@ -19,19 +19,15 @@ import subprocess
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
 
 import aiohttp
-import zenoh
 from aiohttp import web
 from yarl import URL
 
-from service.client import Client, RefusedError, decoded
-from service.contract import channels
-from service.contract.explain import ExplainedError, in_words
-from service.contract.incidents import ORDERS, in_brief, title
-from service.contract.requests import Status
+from service.client import Client
+from service.contract.explain import in_words
+from service.contract.incidents import ORDERS
+from service.trackers.cell_view import Latest, carried_out
 from service.trackers.web_server import HTML, INLINE, JSON, Address, WebServer, answer, filled, write
 
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
@@ -46,45 +42,9 @@ HISTORY_S = 2.0  # the samples of the past, which arrive first, are left out for
 SAMPLES = re.compile(rb"\n[\x80-\xff]*.\x12[\x80-\xff]*.\n.\x08\x01.*8\0", re.DOTALL)
 FOLDER = Path(__file__).parent
 UNKNOWN = "There is no such page. The page of this cell is at /."
-_COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 _OF_A_CONNECTION = {"connection", "keep-alive", "transfer-encoding", "content-length"}  # headers that are not passed on
 _DROPPED_OF_REQUEST = {*_OF_A_CONNECTION, "host", "origin"}
 _DROPPED_OF_ANSWER = {*_OF_A_CONNECTION, "date", "server"}
-
-
-class Latest:
-    """The newest status of the daemon, and its age."""
-
-    def __init__(self, session: zenoh.Session, cell: str, first: Status) -> None:
-        self._status, self._at = first, time.monotonic()
-        self._subscriber = session.declare_subscriber(channels.key(cell, "status"), self._take)
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        with contextlib.suppress(RefusedError):
-            self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
-
-    @property
-    def stream(self) -> Address:
-        """The server of the live view; it changes when the scribe is started again."""
-        parts = urlsplit(str(self._status.scribe.get("live") or "").removeprefix("rerun+"))
-        return Address(parts.hostname or "127.0.0.1", parts.port or 0)
-
-    def summary(self) -> dict[str, Any]:
-        """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
-        [s], the daemon's time [ms], the live view that it serves, and further facts in one line.
-        """
-        now, age_s = self._status, time.monotonic() - self._at
-        hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
-        near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
-        facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
-        names = ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m")
-        shown = {name: getattr(now, name) for name in names} | {"title": title(now.reason)}
-        remedy = _COMMAND.sub(
-            lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
-            now.remedy,
-        )
-        now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
-        return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
 class Room:
@@ -175,14 +135,9 @@ class LivePage:
         """Carry out hold, resume or reset, even if the browser disconnects meanwhile."""
         if not self.server.has_token(request.headers.get("X-Thirdhand-Token", "")):
             return answer(403, "The token of the page is needed: reload it.")
-        name = request.match_info["order"]
-        try:
-            reply = await asyncio.shield(asyncio.to_thread(self._client.ask, name))
-        except ExplainedError as error:
-            return answer(502, f"{name} was NOT carried out: {error}")
-        now = in_brief(reply.get("mode", ""), reply.get("reason", "")).replace("_", " ")
-        note = f"; {reply['note']}" if reply.get("note") else ""
-        return answer(200, f"{name} carried out at tick {reply['tick']}; mode then: {now}{note}")
+        order = asyncio.to_thread(carried_out, self._client, request.match_info["order"])
+        is_done, text = await asyncio.shield(order)
+        return answer(200 if is_done else 502, text)
 
     async def _pass_on(
         self,

@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from PIL import Image, ImageDraw, ImageFont
 
 from service.cli.clients import ask
-from service.cli.live_page import Latest, LivePage, web_viewer
+from service.cli.live_page import LivePage, web_viewer
 from service.cli.usage import UsageError, check_writable, reached
 from service.cli.web_address import serve_page, web_address
 from service.client import Client
@@ -35,6 +35,7 @@ from service.files.steps import Gap
 from service.process.progress import progress, say
 from service.settings import palette
 from service.settings.network import is_local
+from service.trackers.cell_view import Latest
 from service.trackers.web_server import Address
 from service.viewer import vulkan
 from service.viewer.blueprint import TABS, TIMELINE

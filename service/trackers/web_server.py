@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from cryptography import x509
 
+from service.client import CERTIFICATE, KEY
 from service.contract.explain import ExplainedError, in_words
 
 HTML = "text/html; charset=utf-8"
@@ -53,8 +54,9 @@ class ServerCertificate(NamedTuple):
     names: frozenset[str]
 
 
-def server_certificate(certificate: Path, key: Path) -> ServerCertificate:
-    """The certificate and key in two PEM files. Raises ExplainedError."""
+def server_certificate(folder: Path) -> ServerCertificate:
+    """The certificate and key in a folder. Raises ExplainedError."""
+    certificate, key = folder / CERTIFICATE, folder / KEY
 
     def locked() -> str:
         raise ExplainedError(f"{key} has a passphrase: a key without one needed")
@@ -68,7 +70,7 @@ def server_certificate(certificate: Path, key: Path) -> ServerCertificate:
         mismatch = isinstance(error, ssl.SSLError) and "the key does not belong to the certificate"
         raise ExplainedError(
             f"cannot serve with {certificate} and {key}: {mismatch or in_words(error)}; a certificate and its key in "
-            "PEM needed, like certificate.pem and key.pem in the folder `web` that `thirdhand certificates` makes"
+            "PEM needed, as in the folder `headset` that `thirdhand certificates` makes"
         ) from None
     try:
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
