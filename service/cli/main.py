@@ -35,14 +35,14 @@ SIM = "Runs the simulated bench: it publishes hands and joint states, and follow
 RATE = "the rate of the control loop (default: the rate in the cell's settings)"
 ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
-    "run": ("demo", "serve", "follow", "sim", "play"),
+    "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
     "set up": ("arm", "certificates", "completion"),
 }
-CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # on Ctrl-C these commands first end their processes
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands")  # on Ctrl-C these commands first end their processes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -140,6 +140,19 @@ def parser() -> argparse.ArgumentParser:
     option(c, "file", "FILE", "the recording or demonstration: an MCAP file with hands/left and hands/right")
     option(c, "--speed", "X", "play this many times as fast as recorded", 1.0, type=within(float, 0.01, 100))
     c.add_argument("--loop", action="store_true", help="start again at the end, until Ctrl-C")
+    _reach(c)
+
+    c = command(
+        "hands",
+        "Publishes your hands as the browser of a headset tracks them. Open the address that it prints there.",
+        "thirdhand hands --web\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset",
+    )
+    kinds = c.add_mutually_exclusive_group(required=True)
+    kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")
+    address = "serve the page at this address; port 0: any free one; for other machines with --https"
+    option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
+    https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
+    option(c, "--https", "DIR", https)
     _reach(c)
 
     c = command(
@@ -285,7 +298,13 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand certificates secrets --host bench.local",
     )
     option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
-    option(c, "--host", "NAME", "a name or address at which clients reach the daemon; may be repeated", action="append")
+    option(
+        c,
+        "--host",
+        "NAME",
+        "a name or address at which the daemon and pages are reached; may be repeated",
+        action="append",
+    )
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
     option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from service.contract import channels, ros2
 
-DAEMON, ROUTER = "daemon", "router"
-SERVERS = (DAEMON, ROUTER)  # others connect to them
+DAEMON, ROUTER, HEADSET = "daemon", "router", "headset"
+SERVERS = (DAEMON, ROUTER, HEADSET)  # others connect to them; browsers to the last one
 HANDS = ("hands/left", "hands/right")
 ARM = ("joints/state", "gripper/state")
 TOOL, OBJECTS = ("tool/pose",), ("objects",)
@@ -30,6 +30,9 @@ class Role(NamedTuple):
 
 ROLES = {
     "tracker": Role("may publish hands, objects, and the tool in demonstrations", (*HANDS, *TOOL, *OBJECTS)),
+    HEADSET: Role(
+        "may publish hands, send requests and hear all, and serves a page to browsers", HANDS, hears=True, asks=True
+    ),
     "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
     "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL, *OBJECTS), hears=True),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
