@@ -1,4 +1,4 @@
-"""`thirdhand hands`: the hands of a person, as a browser tracks them, for a cell."""
+"""`thirdhand hands`: the hands of a person for a cell, as a browser or a camera tracks them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,26 @@ LOOPBACK_NAMES = {"localhost", "127.0.0.1", "::1"}
 
 
 def hands(args: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C; exit code 0 if it is ended by SIGTERM."""
+    """Publish hands until Ctrl-C; exit code 0 if a video file or SIGTERM ends it."""
+    return _camera(args) if args.camera is not None else _web(args)
+
+
+def _camera(args: argparse.Namespace) -> int:
+    from service.trackers.camera import HandCamera, mediapipe, publish  # slow imports, which only this source needs
+    from service.trackers.hand_model import hand_model
+
+    mediapipe()  # before the model is downloaded
+    with (
+        HandCamera(hand_model(args.model, say), view_deg=args.view, hand_length=args.hand_length) as camera,
+        reached(args, None) as session,
+        Tracker(session, args.cell, timeout_s=None) as tracker,
+    ):
+        say(f"publishing the hands that camera {args.camera} sees; Ctrl-C ends it")
+        publish(tracker, camera, args.camera, say)
+    return 0
+
+
+def _web(args: argparse.Namespace) -> int:
     listen = web_address("--listen", args.listen)
     certificate = server_certificate(args.https) if args.https else None
     if certificate is None and not is_local(f"tcp/{listen}"):

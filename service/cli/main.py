@@ -144,15 +144,24 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "hands",
-        "Publishes your hands as the browser of a headset tracks them. Open the address that it prints there.",
-        "thirdhand hands --web\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset",
+        "Publishes your hands, as a headset's browser or a camera of this machine tracks them.",
+        "thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n  "
+        "thirdhand hands --camera --hand-length 0.19",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
     kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")
+    camera = "the hands that this camera sees (default: camera 0), or a video file; needs thirdhand[camera]"
+    option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
     address = "serve the page at this address; port 0: any free one; for other machines with --https"
     option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
     https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
     option(c, "--https", "DIR", https)
+    length = "of --camera: length of your hand, from the crease of the wrist to the tip of the middle finger"
+    option(c, "--hand-length", "M", length, 0.18, type=within(float, 0.1, 0.3, " m"))
+    view = "of --camera: horizontal angle of view of its lens, in degrees"
+    option(c, "--view", "DEG", view, 60.0, type=within(float, 20, 150, " degrees"))
+    model = "of --camera: hand_landmarker.task, or the wheel of mediapipe 0.10.21 (default: it is downloaded once)"
+    option(c, "--model", "FILE", model)
     _reach(c)
 
     c = command(

@@ -54,9 +54,9 @@ def too_late() -> None:
 
 
 def _raise_to_clean_up(number: int, frame: FrameType | None) -> None:
-    """Handle SIGINT in Python. `_serve` does the same without waiting for bytecode, except to raise."""
+    """Handle SIGINT in Python. `_serve` handles it too, without waiting for bytecode."""
     if not _CLEANS_UP.is_set() or _RAISED.is_set():
-        end_at_once()  # also if clean_up_first() begins before `_serve` gets its turn, which then does nothing
+        end_at_once()  # `_serve` does nothing if clean_up_first() begins before its turn
     _RAISED.set()
     raise KeyboardInterrupt
 

@@ -6,6 +6,8 @@ It needs `pip install 'thirdhand[camera]'`.
 from __future__ import annotations
 
 import contextlib
+import importlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -44,7 +46,7 @@ class HandCamera(AbstractContextManager["HandCamera"]):
         the tip of the middle finger. Raises CameraError.
         """
         self._view_deg, self._length, self._last_ms = view_deg, hand_length, 0
-        self._mediapipe = _module("mediapipe")
+        self._mediapipe = mediapipe()
         vision = self._mediapipe.tasks.vision
         options = vision.HandLandmarkerOptions(
             self._mediapipe.tasks.BaseOptions(model_asset_path=str(model)),
@@ -52,7 +54,8 @@ class HandCamera(AbstractContextManager["HandCamera"]):
             num_hands=2,
         )
         try:
-            self._landmarker = vision.HandLandmarker.create_from_options(options)
+            with _silenced():
+                self._landmarker = vision.HandLandmarker.create_from_options(options)
         except (RuntimeError, ValueError) as error:
             raise CameraError(f"{model} is no model of hands that MediaPipe loads: {error}") from None
 
@@ -61,9 +64,11 @@ class HandCamera(AbstractContextManager["HandCamera"]):
 
         MediaPipe names the sides. If it takes both hands for the same one, the surer is that.
         """
+        quiet = _silenced() if self._last_ms == 0 else contextlib.nullcontext()
         self._last_ms = max(at_ms, self._last_ms + 1)
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
-        seen = self._landmarker.detect_for_video(image, self._last_ms)
+        with quiet:
+            seen = self._landmarker.detect_for_video(image, self._last_ms)
         hands = zip(seen.handedness, seen.hand_landmarks, seen.hand_world_landmarks, strict=True)
         found = dict[str, HandPoints]()
         for kinds, *parts in sorted(hands, key=lambda hand: hand[0][0].score, reverse=True):
@@ -79,13 +84,14 @@ class HandCamera(AbstractContextManager["HandCamera"]):
         height, width = picture.shape[:2]
         lens = Lens.of_view(self._view_deg, width, height)
         poses = {
-            side: palm_pose(hand.picture, hand.shape, lens, self._length)
+            side: palm_pose(side, hand.picture, hand.shape, lens, self._length)
             for side, hand in self.hands(picture, at_ms).items()
         }
         return {side: pose for side, pose in poses.items() if pose is not None}
 
     def __exit__(self, *_: object) -> None:
-        self._landmarker.close()
+        with _silenced():
+            self._landmarker.close()
 
 
 def pictures(source: str) -> Iterator[tuple[int, Any]]:
@@ -128,9 +134,25 @@ def publish(tracker: Tracker, camera: HandCamera, source: str, say: Callable[[st
             count, since, last = 0, time.monotonic(), {}
 
 
-def _module(name: str) -> Any:
-    import importlib
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """A context in which MediaPipe's libraries cannot write their notes on standard error."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
+
+def mediapipe() -> Any:
+    """The package MediaPipe. Raises CameraError."""
+    return _module("mediapipe")
+
+
+def _module(name: str) -> Any:
     with contextlib.suppress(ImportError):
         return importlib.import_module(name)
     raise CameraError("MediaPipe is not installed: pip install 'thirdhand[camera]'")

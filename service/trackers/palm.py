@@ -24,6 +24,7 @@ AVERAGE_PALM = np.array(
     [[0.0, 0.0, 0.0], [0.505, 0.125, 0.0], [0.515, 0.0, 0.0], [0.475, -0.115, 0.0], [0.41, -0.215, 0.0]]
 )
 CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # their mean is the palm's position
+_AHEAD = AVERAGE_PALM[CORNERS].sum(axis=0) / np.linalg.norm(AVERAGE_PALM[CORNERS].sum(axis=0))
 MAX_ERROR = 0.02  # root mean square of x / z and y / z; a larger one is that of no palm
 STEPS = 10  # of Gauss and Newton; the pose changes by less than 0.1 mm in the last
 MAX_TURN_RAD = 0.3  # of one step
@@ -50,17 +51,18 @@ class Lens(NamedTuple):
 class PalmPose(NamedTuple):
     """A palm in the camera's frame: x to the right in the picture, y down, z away, in metres.
 
-    `position` (3,) is the mean of wrist, index knuckle and little knuckle; `orientation` has x from
-    the wrist to the middle knuckle, y towards the thumb and z = x × y.
+    `position` (3,) is the mean of the wrist and of the knuckles of index and little finger. The
+    axes of `orientation` are those of a headset: -z from the wrist to the middle of these two
+    knuckles, y out of the back of the hand, x to the right.
     """
 
     position: Array
     orientation: Rotation
 
 
-def palm_pose(picture: Array, shape: Array, lens: Lens, hand_length: float) -> PalmPose | None:
-    """The palm whose points are seen at `picture` (21, 2), 0 to 1 of width and height; None if no
-    palm of this size [m] explains them.
+def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: float) -> PalmPose | None:
+    """The palm of the `left` or `right` hand whose points are seen at `picture` (21, 2), 0 to 1 of
+    width and height; None if no palm of this size [m] explains them.
 
     The points s of the palm, turned by R and moved by t, are seen at u: R and t minimise
 
@@ -89,7 +91,9 @@ def palm_pose(picture: Array, shape: Array, lens: Lens, hand_length: float) -> P
         turn, at = Rotation.from_rotvec(step[:3]) * turn, at + step[3:]
     if np.sqrt(np.mean(errors**2)) > MAX_ERROR:
         return None
-    return PalmPose((turn.apply(palm) + at)[CORNERS].mean(axis=0), turn)
+    back = np.array([0.0, 0.0, 1.0 if side == "right" else -1.0])
+    axes = np.stack([np.cross(back, -_AHEAD), back, -_AHEAD], axis=1)
+    return PalmPose((turn.apply(palm) + at)[CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
 
 
 def _crossed(vectors: Array) -> Array:

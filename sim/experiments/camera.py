@@ -38,7 +38,7 @@ VIEW_DEG, WIDTH, HEIGHT = 56.0, 640, 480
 PICTURES, RATE_HZ = 40, 15.0  # of each sequence
 DISTANCES_M = (0.4, 0.55, 0.75)
 LENS = Lens.of_view(VIEW_DEG, WIDTH, HEIGHT)
-SCALES = (1.0, 0.95, 1.05)  # of the hand's length: the true one, and two that were measured badly
+SCALES = {"rigid palm, true hand length": 1.0, "5 % too short": 0.95, "5 % too long": 1.05}
 BROWSER_OPTIONS = (
     "--headless=new",
     "--no-sandbox",
@@ -68,7 +68,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         frames = rendered(Path(folder), stream.seed, sequences)
     results.say(f"{len(frames)} pictures of two hands are rendered")
-    methods = {f"palm of {scale:g} times the length": _by_palm(scale * HAND_LENGTH_M) for scale in SCALES}
+    methods = {name: _by_palm(scale * HAND_LENGTH_M) for name, scale in SCALES.items()}
     errors = _errors(frames, sequences, methods | {RIVAL: _by_shape})
     for name, of_method in errors.items():
         results.say(f"{name}: {brief(_summary(of_method))}")
@@ -88,7 +88,7 @@ def _by_palm(length: float) -> Callable[[HandPoints], Array | None]:
     """The service's method, with this length of the hand [m]."""
 
     def position(hand: HandPoints) -> Array | None:
-        pose = palm_pose(hand.picture, hand.shape, LENS, length)
+        pose = palm_pose("right", hand.picture, hand.shape, LENS, length)  # its position does not depend on the side
         return None if pose is None else pose.position
 
     return position

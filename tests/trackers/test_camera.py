@@ -40,10 +40,15 @@ def test_a_palm_is_where_it_was_seen(seed: int) -> None:
     turn, centre = drawn(seed)
     picture, shape, position = seen(turn, centre)
     rough = Rotation.from_rotvec(np.random.default_rng(seed).uniform(-0.3, 0.3, 3)).apply(shape)
-    found = palm_pose(picture, rough, LENS, LENGTH_M)
-    assert found is not None
-    np.testing.assert_allclose(found.position, position, atol=1e-4)
-    assert (found.orientation.inv() * turn).magnitude() < 1e-3
+    ahead, thumb = (position - centre) / np.linalg.norm(position - centre), turn.apply([0.0, 1.0, 0.0])
+    for side, right in (("right", -thumb), ("left", thumb)):
+        found = palm_pose(side, picture, rough, LENS, LENGTH_M)
+        assert found is not None
+        np.testing.assert_allclose(found.position, position, atol=1e-4)
+        x, y, z = found.orientation.as_matrix().T
+        np.testing.assert_allclose(z, -ahead, atol=1e-3)
+        np.testing.assert_allclose(y, np.cross(z, x), atol=1e-9)
+        assert x @ right > 0.99
 
 
 def test_noise_of_a_pixel_costs_a_centimetre() -> None:
@@ -51,7 +56,7 @@ def test_noise_of_a_pixel_costs_a_centimetre() -> None:
     for seed in range(100):
         picture, shape, position = seen(*drawn(seed))
         noise = np.random.default_rng(seed).standard_normal(picture.shape) / [LENS.width, LENS.height]
-        found = palm_pose(picture + noise, shape, LENS, LENGTH_M)
+        found = palm_pose("left", picture + noise, shape, LENS, LENGTH_M)
         assert found is not None
         errors.append(np.linalg.norm(found.position - position))
     assert np.median(errors) < 0.01
@@ -61,7 +66,7 @@ def test_noise_of_a_pixel_costs_a_centimetre() -> None:
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_a_wrong_length_scales_the_distance(scale: float) -> None:
     picture, shape, position = seen(*drawn(1))
-    found = palm_pose(picture, shape, LENS, scale * LENGTH_M)
+    found = palm_pose("left", picture, shape, LENS, scale * LENGTH_M)
     assert found is not None
     np.testing.assert_allclose(found.position, scale * position, rtol=1e-3)
 
@@ -72,7 +77,7 @@ def test_a_wrong_length_scales_the_distance(scale: float) -> None:
 )
 def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) -> None:
     picture, shape, _ = seen(*drawn(2))
-    assert palm_pose(spoil(picture), shape, LENS, LENGTH_M) is None
+    assert palm_pose("left", spoil(picture), shape, LENS, LENGTH_M) is None
 
 
 @pytest.mark.parametrize(
