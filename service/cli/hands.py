@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import socket
+import webbrowser
 
 from service.cli.usage import UsageError, reached
 from service.cli.web_address import serve_page, web_address
@@ -12,6 +13,7 @@ from service.process.progress import say
 from service.settings.network import is_local
 from service.trackers.cell_view import Latest
 from service.trackers.headset_page import HeadsetPage
+from service.trackers.mouse_page import MousePage
 from service.trackers.web_server import Address, ServerCertificate, server_certificate
 
 ORDER_TIMEOUT_S = 5.0  # a page waits for the answer to its order for this long
@@ -23,18 +25,23 @@ def hands(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; exit code 0 if it is ended by SIGTERM."""
     listen = web_address("--listen", args.listen)
     certificate = server_certificate(args.https) if args.https else None
-    if certificate is None and not is_local(f"tcp/{listen}"):
+    if certificate is None and args.web and not is_local(f"tcp/{listen}"):
         raise UsageError(
             f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: --https DIR with the "
             "folder `headset` of `thirdhand certificates` needed, or 127.0.0.1 and a cable (`adb reverse`)"
         )
     with reached(args, None) as session, Tracker(session, args.cell, timeout_s=None) as tracker:
         client = Client(session, args.cell, timeout_s=ORDER_TIMEOUT_S)
-        page = HeadsetPage(tracker, client, Latest(session, args.cell), cell=args.cell, certificate=certificate)
+        kind = MousePage if args.mouse else HeadsetPage
+        page = kind(tracker, client, Latest(session, args.cell), cell=args.cell, certificate=certificate)
 
         def listening(address: Address) -> None:
             shown = Address(_name_for_browsers(address.host, certificate), address.port)
-            print(f"{page.server.scheme}://{shown}/?token={page.server.token}", flush=True)
+            url = f"{page.server.scheme}://{shown}/?token={page.server.token}"
+            print(url, flush=True)
+            if args.mouse:
+                invite(url, address, browser=args.open)
+                return
             if certificate is None:
                 say(f"for a headset on a cable: adb reverse tcp:{address.port} tcp:{address.port}")
             else:
@@ -47,6 +54,16 @@ def hands(args: argparse.Namespace) -> int:
             found = page.hands
             say(f"{found.published} messages with hands published, {found.lost} lost, {found.delayed} too late")
     return 0
+
+
+def invite(url: str, address: Address, *, browser: bool) -> None:
+    """Print what to do with the page for a mouse, and open it if `browser`."""
+    if not is_local(f"tcp/{address}"):
+        say("everyone who has this address with its token, and reaches it, can move the arm")
+    if browser and webbrowser.open(url):
+        say("the page opens in your browser: drag both hands there; Ctrl-C ends it")
+    else:
+        say("open this address in a browser, and drag both hands there; Ctrl-C ends it")
 
 
 def _name_for_browsers(host: str, certificate: ServerCertificate | None) -> str:

@@ -2,7 +2,7 @@
 
 A page sends messages of hands and pings as bytes (`hand_message`), and orders as text, `hold`,
 `resume` or `reset`. It receives pongs as bytes, and as text the status ten times a second
-(`{"status": ...}`) and the answers to its orders (`{"answer": ..., "done": ...}`). What is wrong
+(`{"status": ..., "objects": ...}`) and the answers to its orders (`{"answer": ..., "done": ...}`). What is wrong
 closes the page's own websocket with a reason, and no other one.
 """
 
@@ -128,7 +128,7 @@ class BrowserHands:
         """Send the status until the page leaves. A page that does not read it is disconnected."""
         with contextlib.suppress(ConnectionError):
             while True:
-                status = json.dumps({"status": self._latest.summary()})
+                status = json.dumps({"status": self._latest.summary(), "objects": self._latest.objects()})
                 try:
                     async with asyncio.timeout(web_server.FROZEN_S):
                         await page.send_str(status)

@@ -67,6 +67,28 @@ class Tab:
         screen = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
         self._call("Emulation.setDeviceMetricsOverride", screen, self._session)
 
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`."""
+        button = {"button": "none" if kind == "Wheel" else "left", "buttons": int(kind in ("Pressed", "Moved"))}
+        self._call(
+            "Input.dispatchMouseEvent",
+            {"type": f"mouse{kind}", "x": x, "y": y, "clickCount": 1} | button | more,
+            self._session,
+        )
+
+    def touch(self, kind: str, *points: tuple[float, float]) -> None:
+        """An event of fingers, which are at these pixels: `Start`, `Move` or `End`."""
+        fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        self._call("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": fingers}, self._session)
+
+    def cover(self) -> None:
+        """Hide the page behind another one."""
+        self._call("Target.createTarget", {"url": "about:blank"})
+
+    def uncover(self) -> None:
+        """Show the page again."""
+        self._call("Page.bringToFront", {}, self._session)
+
     def picture(self, path: Path) -> None:
         """Saves what the page shows as PNG."""
         found = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
