@@ -219,9 +219,7 @@ class Bridge:
         ]
 
     def _receive_hand(self, sample: zenoh.Sample) -> None:
-        """Store the pose of a tracked hand. Unreadable ones are ignored, because the service reports
-        them.
-        """
+        """Store the pose of a tracked hand. The service reports unreadable ones."""
         assert self._tracked is not None
         try:
             pose = cdr.decode_pose(sample.payload.to_bytes())

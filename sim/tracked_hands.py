@@ -84,7 +84,7 @@ class TrackedHands:
         self._over, self._reached_s, self._ended_s = 0, math.inf, self._timeout_s
 
     def truth(self, t: float) -> HandMotions:
-        """The newest positions of both hands; before the first sample, those at the scene's start."""
+        """The newest positions of both hands; before the first sample, the scene's start."""
         scene = self.scene
         left, right = (
             PointMotion(np.array(self._newest[side].position if side in self._newest else start), STILL, STILL)

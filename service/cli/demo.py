@@ -38,7 +38,7 @@ PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
 OUTCOME_S = 1.0  # the page shows the outcome before its server ends
 NEVER_THERE = "the hands were never at its places"
-REACHED = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm at [\d.]+ s)")  # a line of the bench
+REACHED = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
 CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
 VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
@@ -128,7 +128,9 @@ def _played_on_page(
     browser: bool,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """The report of the bench, whose hands a person plays on a page. Raises LaunchError, UsageError."""
+    """The report of the bench, whose hands a person plays on a page. Raises LaunchError,
+    UsageError.
+    """
     running: list[subprocess.Popen[str]] = []
 
     def end() -> None:
@@ -140,7 +142,7 @@ def _played_on_page(
     def heard(line: str) -> None:
         say(line)
         if found := REACHED.fullmatch(line):
-            task.lines.append(f"{EVENT_TITLES[found[1]]}: {found[2]}")
+            task.lines.append(f"{EVENT_TITLES[found[1]]}, the tool was {found[2]} off")
 
     with Tracker(session) as tracker:
         shown = MousePage(tracker, client, Latest(session, CELL), cell=CELL, task=task)
@@ -161,7 +163,8 @@ def _played_on_page(
             if report is None:
                 raise DemoError("the task was ended before both hands were seen on the page")
             reached = sum(event["reached"] for event in report["events"].values())
-            task.outcome = f"{reached} of {len(EVENT_TITLES)} events reached. The report is in the terminal."
+            task.is_done = report["success"]
+            task.outcome = f"the task has ended: {reached} of {len(EVENT_TITLES)} events reached"
             time.sleep(OUTCOME_S)
     return report
 
@@ -175,9 +178,12 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     found = reported(recording)
     timing = found.columns.timing
     bench = too_busy(report)
+    begun_s = (report["begun_ns"] - found.columns.start_ns) / 1e9
     for name, event in report["events"].items():
-        if not event["reached"]:
-            event["why"] = NEVER_THERE if event["error_mm"] is None else _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+        if event["error_mm"] is None:
+            event["why"] = NEVER_THERE
+        elif not event["reached"]:
+            event["why"] = _why(found, begun_s, report["events"], name)
     return {
         "success": report["success"],
         "events": report["events"],

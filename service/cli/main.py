@@ -152,7 +152,8 @@ def parser() -> argparse.ArgumentParser:
         "hands",
         "Publishes your hands, as the browser of a headset tracks them, or as you drag them with a mouse or a finger. "
         "Open the address that it prints.",
-        "thirdhand hands --mouse --open\n  thirdhand hands --web\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset",
+        "thirdhand hands --mouse --open\n  thirdhand hands --web\n"
+        "  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
     kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")

@@ -49,8 +49,9 @@ def page_served(server: WebServer, option: str, listen: Address) -> Iterator[Add
 
 
 def serve_page(server: WebServer, option: str, listen: Address, listening: Callable[[Address], object]) -> None:
-    """Serve until SIGTERM, Ctrl-C or the server's `end`; call `listening` with the address taken. Raises UsageError if
-    it is not available.
+    """Serve until SIGTERM, Ctrl-C or the server's `end`; call `listening` with the address taken.
+
+    Raises UsageError if it is not available.
     """
     try:
         asyncio.run(server.serve(listen, listening))

@@ -190,8 +190,8 @@ def _std(covariance: Any) -> float:
 
 
 def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
-    """Names and hands (6,) [m] of the learned via-points, in the order of the task; one unnamed pair
-    of demonstrated hands of a skill that has none.
+    """Names and hands (6,) [m] of the learned via-points, in the order of the task; for a skill
+    without via-points, one unnamed pair of demonstrated hands.
     """
     hands = skill.model.hands
     found = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]

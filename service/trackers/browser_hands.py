@@ -1,9 +1,10 @@
 """The websocket by which a page sends hands, and receives what the cell does.
 
 A page sends messages of hands and pings as bytes (`hand_message`), and orders as text, `hold`,
-`resume` or `reset`. It receives pongs as bytes, and as text the status ten times a second
-(`{"status": ..., "objects": ...}`) and the answers to its orders (`{"answer": ..., "done": ...}`). What is wrong
-closes the page's own websocket with a reason, and no other one.
+`resume` or `reset`. It receives pongs as bytes, and as text ten times a second the status and the
+objects on the bench (`{"status": ..., "objects": ...}`), and the answers to its orders
+(`{"answer": ..., "done": ...}`). What is wrong closes the page's own websocket with a reason, and
+no other one.
 """
 
 from __future__ import annotations

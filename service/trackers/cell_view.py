@@ -45,13 +45,11 @@ class Latest:
             self._objects = channels.BY_KEY["objects"].codec.decode(sample.payload.to_bytes())
 
     def objects(self) -> list[dict[str, Any]]:
-        """The objects on the bench: name, shape, position [m], size [m], colour, and whether the arm
-        holds it, in whose frame its position then is.
+        """The objects on the bench: name, shape, position [m], size [m], colour, `held`: true if
+        the position is in a frame of the arm, which holds it.
         """
         fields = ("name", "shape", "position", "size", "colour")
-        return [
-            {name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects
-        ]
+        return [{name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects]
 
     @property
     def stream(self) -> Address:

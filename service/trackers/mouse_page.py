@@ -20,8 +20,12 @@ from service.trackers.web_server import HTML, INLINE, JSON, ServerCertificate, W
 FOLDER = Path(__file__).parent
 UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with its token."
 COLOURS = {
-    **{"left": palette.LEFT, "right": palette.RIGHT, "tool": palette.TOOL, "target": palette.TARGET},
-    **{"arm": palette.ARM_BODY, "table": palette.TABLE, "grid": palette.GRID, "place": palette.PLACE},
+    "left": palette.LEFT,
+    "right": palette.RIGHT,
+    "tool": palette.TOOL,
+    "target": palette.TARGET,
+    "arm": palette.ARM_BODY,
+    "grid": palette.GRID,
 }
 
 
@@ -33,10 +37,11 @@ class PlayedTask:
         self.end = end
         self.lines: list[str] = []
         self.outcome = ""  # not empty once the task has ended
+        self.is_done = False  # true if everything was achieved
 
     def shown(self) -> dict[str, Any]:
         """The task as the page shows it."""
-        return {"lines": self.lines, "outcome": self.outcome}
+        return {"lines": self.lines, "outcome": self.outcome, "isDone": self.is_done}
 
 
 class MousePage:

@@ -106,8 +106,8 @@ class WebServer:
         self._application.cleanup_ctx.extend(around)
 
     async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
-        """Serve until SIGTERM, SIGHUP or `end`; call `listening` with the address taken. Raises OSError if
-        the address is not available.
+        """Serve until SIGTERM, SIGHUP or `end`; call `listening` with the address taken. Raises
+        OSError if the address is not available.
         """
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
         self.end = lambda: loop.call_soon_threadsafe(ended.set)

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from support.chromium import Tab
 
@@ -30,21 +30,24 @@ class Person:
 
     def hand(self, side: str, what: str = "at") -> tuple[float, float, float]:
         """Where a hand is drawn, or with `aim` where it was dragged to [m]."""
-        x, y, z = json.loads(self.tab.ask(f"JSON.stringify(hands.{side}.{what})"))
+        x, y, z = self._found(f"hands.{side}.{what}")
         return x, y, z
 
     def pixel(self, at: tuple[float, float, float]) -> tuple[float, float]:
         """The pixel of the page at which a point of the bench is drawn."""
-        where = f"[{at[0]}, {at[1]}, {at[2]}]"
         corner = "canvas.getBoundingClientRect()"
-        x, y = json.loads(
-            self.tab.ask(f"JSON.stringify((shown.plan ?? plan()).flat({where}).map((v, i) => v + {corner}[i ? 'y' : 'x']))")
-        )
+        x, y = self._found(f"(shown.plan ?? plan()).flat({list(at)}).map((v, i) => v + {corner}[i ? 'y' : 'x'])")
         return x, y
 
     def goals(self) -> list[Goal]:
         """The places that the page shows."""
-        return [Goal(**one) for one in json.loads(self.tab.ask("JSON.stringify(places().map(({side, at}) => ({side, at})))"))]
+        return [
+            Goal(side, (at[0], at[1], at[2])) for side, at in self._found("places().map(one => [one.side, one.at])")
+        ]
+
+    def _found(self, expression: str) -> Any:
+        """The value of an expression, which may be an array or an object."""
+        return json.loads(self.tab.ask(f"JSON.stringify({expression})"))
 
     def drag(self, side: str, to: tuple[float, float, float]) -> None:
         """Drag a hand to a point with the mouse, and turn the wheel until it is as high."""
