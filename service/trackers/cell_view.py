@@ -18,7 +18,18 @@ from service.contract.requests import Status
 from service.trackers.web_server import Address
 
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
-SHOWN_FIELDS = ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief")
+SHOWN_FIELDS = (
+    "mode",
+    "reason",
+    "because",
+    "hands_m",
+    "tool_m",
+    "target_m",
+    "std_m",
+    "stage",
+    "stage_belief",
+    "trackers",
+)
 
 
 class Latest:

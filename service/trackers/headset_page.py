@@ -15,7 +15,7 @@ from service.trackers.cell_view import Latest
 from service.trackers.web_server import HTML, INLINE, ServerCertificate, WebServer, answer, filled
 
 FRAME = "webxr"  # x to the right, y up, -z ahead of where the headset was when its floor was set, metres
-PAGE = Path(__file__).with_name("headset.html")
+PAGE_FOLDER = Path(__file__).parent
 UNKNOWN_PAGE = "There is no such page. Open the address that `thirdhand hands` printed."
 
 
@@ -30,11 +30,12 @@ class HeadsetPage:
         *,
         cell: str,
         certificate: ServerCertificate | None = None,
+        token: str = "",
     ) -> None:
         self._cell = cell
         self.hands = BrowserHands(tracker, client, latest, frame=FRAME, has_token=self._has_token)
         routes = [web.get("/", self._front), web.get("/hands", self.hands.socket)]
-        self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate)
+        self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 
     def _has_token(self, given: str) -> bool:
         return self.server.has_token(given)
@@ -44,4 +45,6 @@ class HeadsetPage:
             return answer(403, NO_TOKEN)
         socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"
         policy = f"connect-src 'self' {socket}; {INLINE}; frame-ancestors 'none'"
-        return answer(200, filled(PAGE, cell=html.escape(self._cell), frame=FRAME), kind=HTML, policy=policy)
+        scripts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in ("link", "scene")}
+        text = filled(PAGE_FOLDER / "headset.html", cell=html.escape(self._cell), frame=FRAME, **scripts)
+        return answer(200, text, kind=HTML, policy=policy)
