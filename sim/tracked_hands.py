@@ -16,7 +16,7 @@ from sim.world import LEVEL
 
 REST_S = 0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
 PLACE_OPACITY = 0.3
-COLOURS = dict(zip(SIDES, (palette.LEFT, palette.RIGHT), strict=True))
+HAND_COLOURS = dict(zip(SIDES, (palette.LEFT, palette.RIGHT), strict=True))
 STILL = np.zeros(3)
 
 
@@ -124,5 +124,5 @@ class TrackedHands:
 
 
 def _faint(side: str) -> tuple[float, float, float, float]:
-    red, green, blue = (value / 255 for value in COLOURS[side])
+    red, green, blue = (value / 255 for value in HAND_COLOURS[side])
     return red, green, blue, PLACE_OPACITY

@@ -66,6 +66,7 @@ class CellStatus(NamedTuple):
             rejected=_by_cause(sources),
             sources=sources,
             frames=frames(settings),
+            trackers={settings.hands.frame: settings.hands.base_from_tracker},
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),

@@ -21,7 +21,7 @@ from service.trackers.web_server import Address
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 SHOWN_FIELDS = (
     *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief"),
-    *("demonstrated_m", "hands_at_m"),
+    *("demonstrated_m", "hands_at_m", "trackers"),
 )
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from aiohttp import web
@@ -13,13 +11,12 @@ from aiohttp import web
 from service.client import Client, Tracker
 from service.contract.messages import BASE
 from service.settings import palette
-from service.trackers.browser_hands import NO_TOKEN, BrowserHands
+from service.trackers.browser_hands import NO_TOKEN
 from service.trackers.cell_view import Latest
-from service.trackers.web_server import HTML, INLINE, JSON, ServerCertificate, WebServer, answer, filled
+from service.trackers.hands_page import HandsPage
+from service.trackers.web_server import JSON, ServerCertificate, answer
 
-FOLDER = Path(__file__).parent
-UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with its token."
-COLOURS = {
+PAGE_COLOURS = {
     "left": palette.LEFT,
     "right": palette.RIGHT,
     "tool": palette.TOOL,
@@ -33,7 +30,7 @@ class PlayedTask:
     """A task that a person plays on the page: what was achieved, and its end."""
 
     def __init__(self, end: Callable[[], None]) -> None:
-        """`end` is called when the person ends the task. It may be called from any thread."""
+        """`end` is called when the person ends the task."""
         self.end = end
         self.lines: list[str] = []
         self.outcome = ""  # not empty once the task has ended
@@ -44,8 +41,8 @@ class PlayedTask:
         return {"lines": self.lines, "outcome": self.outcome, "isDone": self.is_done}
 
 
-class MousePage:
-    """The page and its server."""
+class MousePage(HandsPage):
+    """The page and its server; with a `task`, the page shows it and can end it."""
 
     def __init__(
         self,
@@ -58,39 +55,28 @@ class MousePage:
         token: str = "",
         task: PlayedTask | None = None,
     ) -> None:
-        self._cell, self._task = cell, task
-        self.hands = BrowserHands(tracker, client, latest, frame=BASE, has_token=self._has_token)
-        routes = [web.get("/", self._front), web.get("/hands", self.hands.socket)]
-        if task:
-            routes += [web.get("/task", self._shown_task), web.post("/end", self._end)]
-        self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate)
+        async def show(_: web.Request) -> web.Response:
+            assert task is not None
+            return answer(200, json.dumps(task.shown()), kind=JSON)
 
-    def _has_token(self, given: str) -> bool:
-        return self.server.has_token(given)
+        async def end(request: web.Request) -> web.Response:
+            assert task is not None
+            if not self.has_token(request.headers.get("X-Thirdhand-Token", "")):
+                return answer(403, NO_TOKEN)
+            task.end()
+            return answer(200, "The task ends.")
 
-    async def _front(self, request: web.Request) -> web.Response:
-        if not self._has_token(request.query.get("token", "")):
-            return answer(403, NO_TOKEN)
-        socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"
-        policy = f"connect-src 'self' {socket}; {INLINE}; frame-ancestors 'none'"
-        text = filled(
-            FOLDER / "mouse.html",
-            cell=html.escape(self._cell),
-            link=filled(FOLDER / "link.js"),
-            colours=json.dumps(COLOURS),
+        super().__init__(
+            *(tracker, client, latest),
+            cell=cell,
+            page="mouse.html",
+            scripts=("link",),
+            frame=BASE,
+            certificate=certificate,
+            token=token,
+            more=[web.get("/task", show), web.post("/end", end)] if task else (),
+            colours=json.dumps(PAGE_COLOURS),
             left=" ".join(map(str, palette.LEFT)),
             right=" ".join(map(str, palette.RIGHT)),
-            task=json.dumps(self._task is not None),
+            task=json.dumps(task is not None),
         )
-        return answer(200, text, kind=HTML, policy=policy)
-
-    async def _shown_task(self, _: web.Request) -> web.Response:
-        assert self._task is not None
-        return answer(200, json.dumps(self._task.shown()), kind=JSON)
-
-    async def _end(self, request: web.Request) -> web.Response:
-        assert self._task is not None
-        if not self._has_token(request.headers.get("X-Thirdhand-Token", "")):
-            return answer(403, NO_TOKEN)
-        self._task.end()
-        return answer(200, "The task ends.")

@@ -2,7 +2,7 @@
 
 It answers requests from its own pages only: `Host` must name this machine, and `Origin`, where a
 browser sends it, must be the same host and port. What changes something also needs the token of
-this run. Bodies are short, connections without a request are closed, every answer has the headers
+the server. Bodies are short, connections without a request are closed, every answer has the headers
 that keep a browser from fetching anything elsewhere, and every refusal says why.
 """
 
@@ -85,7 +85,7 @@ class WebServer:
     """A server of some routes: by HTTPS with a certificate, else by HTTP.
 
     `unknown` is the answer to requests for anything else. `around` are contexts, as aiohttp's
-    `cleanup_ctx` takes them, that last as long as the server.
+    `cleanup_ctx` takes them, that last as long as the server. `token` is a new one by default.
     """
 
     def __init__(
@@ -95,8 +95,9 @@ class WebServer:
         unknown: str,
         certificate: ServerCertificate | None = None,
         around: Iterable[Callable[[web.Application], AsyncIterator[None]]] = (),
+        token: str = "",
     ) -> None:
-        self.token = secrets.token_urlsafe(24)
+        self.token = token or secrets.token_urlsafe(24)
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
