@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
         "demo",
         "Runs the soldering scenario once, without a window: simulated bench, service and recording. Then reports how "
         "the task went.",
-        "thirdhand demo --scene my-scene.toml",
+        "thirdhand demo --scene my-scene.toml\n  thirdhand demo --mouse --open",
     )
     output = "write the recording, the drawing and the service's log to this folder"
     option(c, "--output", "DIR", output, Path("thirdhand-demo"))
@@ -85,6 +85,12 @@ def parser() -> argparse.ArgumentParser:
     engine = "the physics engine of the bench (default: the first that is installed)"
     c.add_argument("--engine", choices=("pybullet", "mujoco"), help=engine)
     option(c, "--rate", "HZ", RATE)
+    mouse = (
+        "play the hands yourself, with a mouse or a finger, on a page that is served at this address (default: any "
+        "port of this machine)"
+    )
+    option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
+    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
@@ -144,12 +150,15 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "hands",
-        "Publishes your hands, as a headset's browser or a camera of this machine tracks them.",
-        "thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n  "
-        "thirdhand hands --camera --hand-length 0.19",
+        "Publishes your hands, as a headset's browser or a camera of this machine tracks them, or as you drag them "
+        "with a mouse or a finger. Open the address that it prints.",
+        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n"
+        "  thirdhand hands --camera --hand-length 0.19",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
     kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")
+    mouse = "serve a page on which both hands are dragged over the bench, seen from above"
+    kinds.add_argument("--mouse", action="store_true", help=mouse)
     camera = "the hands that this camera sees (default: camera 0), or a video file; needs thirdhand[camera]"
     option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
     address = "serve the page at this address; port 0: any free one; for other machines with --https"
@@ -162,6 +171,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--view", "DEG", view, 60.0, type=within(float, 20, 150, " degrees"))
     model = "of --camera: hand_landmarker.task, or the wheel of mediapipe 0.10.21 (default: it is downloaded once)"
     option(c, "--model", "FILE", model)
+    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     _reach(c)
 
     c = command(

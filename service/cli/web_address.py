@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
-from collections.abc import Callable
+import queue
+import threading
+from collections.abc import Callable, Iterator
 
 from service.cli.usage import UsageError
 from service.trackers.web_server import Address, WebServer
+
+END_TIMEOUT_S = 5.0  # a page's server ends within this time
 
 
 def web_address(option: str, given: str) -> Address:
@@ -18,9 +23,35 @@ def web_address(option: str, given: str) -> Address:
     return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
+@contextlib.contextmanager
+def page_served(server: WebServer, option: str, listen: Address) -> Iterator[Address]:
+    """The address of a page that another thread serves while the context lasts. Raises UsageError
+    if it is not available.
+    """
+    listening: queue.SimpleQueue[Address | UsageError] = queue.SimpleQueue()
+
+    def serve() -> None:
+        try:
+            serve_page(server, option, listen, listening.put)
+        except UsageError as error:
+            listening.put(error)
+
+    thread = threading.Thread(target=serve, name="page", daemon=True)
+    thread.start()
+    try:
+        found = listening.get()
+        if isinstance(found, UsageError):
+            raise found
+        yield found
+    finally:
+        server.end()
+        thread.join(END_TIMEOUT_S)
+
+
 def serve_page(server: WebServer, option: str, listen: Address, listening: Callable[[Address], object]) -> None:
-    """Serve until SIGTERM or Ctrl-C; call `listening` with the address taken. Raises UsageError if
-    it is not available.
+    """Serve until SIGTERM, Ctrl-C or the server's `end`; call `listening` with the address taken.
+
+    Raises UsageError if it is not available.
     """
     try:
         asyncio.run(server.serve(listen, listening))

@@ -22,6 +22,7 @@ from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
+from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEY_OF_SOURCE, frames
 from service.settings.config import Settings
 
@@ -65,6 +66,7 @@ class CellStatus(NamedTuple):
             rejected=_by_cause(sources),
             sources=sources,
             frames=frames(settings),
+            trackers={settings.hands.frame: settings.hands.base_from_tracker},
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
@@ -73,6 +75,7 @@ class CellStatus(NamedTuple):
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
             },
+            hands_at_m={name: (_point(at[:3]), _point(at[3:])) for name, at in _hands_at(skill)},
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
@@ -185,6 +188,15 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
 
 def _std(covariance: Any) -> float:
     return round(float(standard_deviations(covariance)), 5)
+
+
+def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
+    """Names and hands (6,) [m] of the learned via-points, in the order of the task; for a skill
+    without via-points, one unnamed pair of demonstrated hands.
+    """
+    hands = skill.model.hands
+    found = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    return [(name, at) for name, at in found if np.isfinite(at).all()]
 
 
 def _point(values: Any) -> Vector3:

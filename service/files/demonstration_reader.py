@@ -252,7 +252,9 @@ def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
 
 
 def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) in frame `base` [m], given those in the tracker's frame and unit."""
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
+    if hands.axes == "left-handed":
+        positions = positions * (1.0, 1.0, -1.0)
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
 
@@ -289,7 +291,8 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
         if problem := unknown_frame(track.name, track.frame, hands):
             raise RecordingError(f"{path}: {problem}")
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
-    if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
+    is_left_handed = hands.axes == "left-handed"
+    if hands.unit == "m" and not is_left_handed and not origin.any() and np.array_equal(axes, np.eye(3)):
         return list(tracks), []
     turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
     for i, track in enumerate(tracks):
@@ -297,7 +300,8 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
             poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
             if some.any():
                 poses[some, :3] = from_tracker(track.poses[some, :3], hands)
-                poses[some, 3:] = (turn * Rotation.from_quat(track.poses[some, 3:])).as_quat()
+                given = track.poses[some, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
+                poses[some, 3:] = (turn * Rotation.from_quat(given)).as_quat()
             out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
     remark = f"{', '.join(mapped)} transformed to frame {BASE} by [hands] unit and base_from_tracker"

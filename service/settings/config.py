@@ -57,7 +57,8 @@ class HandSettings(Section, frozen=True):
 
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after unit and axes
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
     unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time

@@ -1,9 +1,10 @@
 """The websocket by which a page sends hands, and receives what the cell does.
 
 A page sends messages of hands and pings as bytes (`hand_message`), and orders as text, `hold`,
-`resume` or `reset`. It receives pongs as bytes, and as text the status ten times a second
-(`{"status": ...}`) and the answers to its orders (`{"answer": ..., "done": ...}`). What is wrong
-closes the page's own websocket with a reason, and no other one.
+`resume` or `reset`. It receives pongs as bytes, and as text ten times a second the status and the
+objects on the bench (`{"status": ..., "objects": ...}`), and the answers to its orders
+(`{"answer": ..., "done": ...}`). What is wrong closes the page's own websocket with a reason, and
+no other one.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from service.trackers.cell_view import Latest, carried_out
 from service.trackers.hand_message import PageHands, decode_hands, is_ping, pong
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
-MAX_MESSAGE_BYTES = 256
-SILENT_S = 10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
+MAX_PAGE_MESSAGE_BYTES = 256
+PAGE_SILENCE_S = 10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
-MAX_DELAY_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
-STATUS_S = 0.1  # interval of the status
+MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
+PAGE_STATUS_S = 0.1  # interval of the status
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
-NO_TOKEN = "Open the address that `thirdhand hands` printed: its token is new with each start."
-SILENT = f"This page has sent nothing for {SILENT_S:g} s."
+NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
+SILENT = f"This page has sent nothing for {PAGE_SILENCE_S:g} s."
 
 
 class BrowserHands:
@@ -59,7 +60,7 @@ class BrowserHands:
             return await web_server.refused(request, 403, NO_TOKEN)
         if len(self._pages) >= MAX_PAGES:
             return await web_server.refused(request, 429, FULL)
-        page = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, compress=False, timeout=1.0)
+        page = web.WebSocketResponse(max_msg_size=MAX_PAGE_MESSAGE_BYTES, compress=False, timeout=1.0)
         if not page.can_prepare(request).ok:
             return web_server.answer(426, "A websocket is needed here.")
         self._pages.add(page)
@@ -80,7 +81,7 @@ class BrowserHands:
     async def _receive(self, page: web.WebSocketResponse, orders: set[asyncio.Task[None]]) -> None:
         while True:
             try:
-                message = await page.receive(SILENT_S)
+                message = await page.receive(PAGE_SILENCE_S)
             except TimeoutError:
                 return await web_server.close(page, 408, SILENT)
             if message.type == WSMsgType.BINARY:
@@ -113,7 +114,7 @@ class BrowserHands:
         if self._number is not None:
             self.lost += (hands.number - self._number - 1) & 0xFFFF
         self._number, self._owned_s = hands.number, now_s
-        if time.time_ns() - hands.stamp_ns > 1e9 * MAX_DELAY_S:
+        if time.time_ns() - hands.stamp_ns > 1e9 * MAX_HELD_UP_S:
             self.delayed += 1
             return True
         frame_id = f"{self._frame}{hands.epoch or ''}"
@@ -128,7 +129,7 @@ class BrowserHands:
         """Send the status until the page leaves. A page that does not read it is disconnected."""
         with contextlib.suppress(ConnectionError):
             while True:
-                status = json.dumps({"status": self._latest.summary()})
+                status = json.dumps({"status": self._latest.summary(), "objects": self._latest.objects()})
                 try:
                     async with asyncio.timeout(web_server.FROZEN_S):
                         await page.send_str(status)
@@ -136,7 +137,7 @@ class BrowserHands:
                     if transport is not None:
                         transport.abort()
                     return
-                await asyncio.sleep(STATUS_S)
+                await asyncio.sleep(PAGE_STATUS_S)
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
         """Carry out an order, even if the page disconnects meanwhile."""

@@ -14,23 +14,42 @@ from service.client import Client, RefusedError, decoded
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.incidents import ORDERS, in_brief, title
+from service.contract.messages import BASE, SceneObject, WireError
 from service.contract.requests import Status
 from service.trackers.web_server import Address
 
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
-SHOWN_FIELDS = ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief")
+SHOWN_FIELDS = (
+    *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief"),
+    *("demonstrated_m", "hands_at_m", "trackers"),
+)
 
 
 class Latest:
-    """The newest status of the daemon, and its age."""
+    """The newest status of the daemon, its age, and the objects on the bench."""
 
     def __init__(self, session: zenoh.Session, cell: str, first: Status | None = None) -> None:
         self._status, self._at = first, time.monotonic()
-        self._subscriber = session.declare_subscriber(channels.key(cell, "status"), self._take)
+        self._objects: tuple[SceneObject, ...] = ()
+        self._subscribers = [
+            session.declare_subscriber(channels.key(cell, suffix), take)
+            for suffix, take in (("status", self._take), ("objects", self._take_objects))
+        ]
 
     def _take(self, sample: zenoh.Sample) -> None:
         with contextlib.suppress(RefusedError):
             self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
+
+    def _take_objects(self, sample: zenoh.Sample) -> None:
+        with contextlib.suppress(WireError):  # the daemon reports them
+            self._objects = channels.BY_KEY["objects"].codec.decode(sample.payload.to_bytes())
+
+    def objects(self) -> list[dict[str, Any]]:
+        """The objects on the bench: name, shape, position [m], size [m], colour, `held`: true if
+        the position is in a frame of the arm, which holds it.
+        """
+        fields = ("name", "shape", "position", "size", "colour")
+        return [{name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects]
 
     @property
     def stream(self) -> Address:

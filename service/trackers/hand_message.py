@@ -26,7 +26,7 @@ from service.contract.messages import Quaternion, Vector3, WireError, finite
 from service.contract.records import SIDES
 
 HANDS_MAGIC, PING_MAGIC = 0x53444E48, 0x474E4950
-HANDS = struct.Struct("<IBBHdd12f12f")
+HANDS_LAYOUT = struct.Struct("<IBBHdd12f12f")
 PING, SERVER_TIME = struct.Struct("<I4xd"), struct.Struct("<d")
 HAND_FLOATS = 12
 MAX_AHEAD_MS = 200.0  # a headset predicts less than this
@@ -72,9 +72,9 @@ def decode_hands(data: bytes, now_ns: int) -> PageHands:
     A prediction is stamped as if it were measured now: stamp = min(predicted, now). Raises
     WireError for anything that no page of this service sends.
     """
-    if len(data) != HANDS.size:
-        raise WireError(f"a message of {len(data)} bytes, {HANDS.size} needed")
-    magic, seen, epoch, number, at_ms, ahead_ms, *values = HANDS.unpack(data)
+    if len(data) != HANDS_LAYOUT.size:
+        raise WireError(f"a message of {len(data)} bytes, {HANDS_LAYOUT.size} needed")
+    magic, seen, epoch, number, at_ms, ahead_ms, *values = HANDS_LAYOUT.unpack(data)
     if magic != HANDS_MAGIC or not 1 <= seen <= 3:
         raise WireError("not a message of hands")
     if not 0.0 <= ahead_ms <= MAX_AHEAD_MS:

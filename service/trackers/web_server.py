@@ -2,7 +2,7 @@
 
 It answers requests from its own pages only: `Host` must name this machine, and `Origin`, where a
 browser sends it, must be the same host and port. What changes something also needs the token of
-this run. Bodies are short, connections without a request are closed, every answer has the headers
+the server. Bodies are short, connections without a request are closed, every answer has the headers
 that keep a browser from fetching anything elsewhere, and every refusal says why.
 """
 
@@ -16,6 +16,7 @@ import re
 import secrets
 import signal
 import ssl
+import threading
 from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,7 +85,7 @@ class WebServer:
     """A server of some routes: by HTTPS with a certificate, else by HTTP.
 
     `unknown` is the answer to requests for anything else. `around` are contexts, as aiohttp's
-    `cleanup_ctx` takes them, that last as long as the server.
+    `cleanup_ctx` takes them, that last as long as the server. `token` is a new one by default.
     """
 
     def __init__(
@@ -94,22 +95,26 @@ class WebServer:
         unknown: str,
         certificate: ServerCertificate | None = None,
         around: Iterable[Callable[[web.Application], AsyncIterator[None]]] = (),
+        token: str = "",
     ) -> None:
-        self.token = secrets.token_urlsafe(24)
+        self.token = token or secrets.token_urlsafe(24)
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
+        self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
         self._idle: set[web.RequestHandler] = set()  # connections on which no request has arrived yet
         self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
         self._application.add_routes(routes)
         self._application.cleanup_ctx.extend(around)
 
     async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
-        """Serve until SIGTERM or SIGHUP; call `listening` with the address taken. Raises OSError if
-        the address is not available.
+        """Serve until SIGTERM, SIGHUP or `end`; call `listening` with the address taken. Raises
+        OSError if the address is not available.
         """
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(ended.set))
+        self.end = lambda: loop.call_soon_threadsafe(ended.set)
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, lambda *_: self.end())
         runner = web.AppRunner(
             self._application,
             access_log=None,

@@ -13,6 +13,7 @@ from service.contract.messages import PoseStamped
 from service.contract.records import Cause
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
+from service.core.intake.stage import z_reversed
 from service.settings.config import HandSettings
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
@@ -32,6 +33,19 @@ def test_a_trackers_unit_becomes_metres(unit: str, scale: float) -> None:
 def test_a_turned_tracker_is_scaled_then_turned_then_moved() -> None:
     hands = Hands(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
     np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
+
+
+def test_left_handed_axes_become_right_handed_by_their_z_before_all_else() -> None:
+    mapping = (1.0, 2.0, 3.0, *QUARTER_TURN)
+    hands = Hands(HandSettings(unit="mm", axes="left-handed", base_from_tracker=mapping))
+    np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 - 0.003])
+    mirrored = np.diag([1.0, 1.0, -1.0])
+    for turn in (QUARTER_TURN, (0.1, -0.5, 0.7, 0.5)):
+        sample = z_reversed(PoseStamped(1, "unity", (0.1, 0.2, 0.3), turn))
+        assert sample.position == (0.1, 0.2, -0.3)
+        np.testing.assert_allclose(rotation(sample.orientation), mirrored @ rotation(turn) @ mirrored, atol=1e-15)
+    own = Hands(HandSettings(frame="unity", axes="left-handed"))
+    np.testing.assert_allclose(own.hand(1, (0.5, 0.1, 0.2)), [0.5, 0.1, 0.2])
 
 
 def test_a_rotation_turns_as_its_quaternion_does() -> None:

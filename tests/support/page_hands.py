@@ -16,7 +16,7 @@ from service.client import Client, Tracker, endpoints, open_session
 from service.contract.cdr import decode_pose
 from service.contract.messages import PoseStamped
 from service.trackers.cell_view import Latest
-from service.trackers.hand_message import HANDS, HANDS_MAGIC
+from service.trackers.hand_message import HANDS_LAYOUT, HANDS_MAGIC
 from service.trackers.headset_page import HeadsetPage
 from service.trackers.web_server import Address
 
@@ -28,7 +28,7 @@ def hands_message(**given: Any) -> bytes:
     values = {"magic": HANDS_MAGIC, "seen": 3, "epoch": 0, "number": 0, "ahead_ms": 0.0, "left": PALM, "right": PALM}
     values |= {"at_ms": time.time_ns() / 1e6, **given}
     order = ("magic", "seen", "epoch", "number", "at_ms", "ahead_ms")
-    return HANDS.pack(*(values[name] for name in order), *values["left"], *values["right"])
+    return HANDS_LAYOUT.pack(*(values[name] for name in order), *values["left"], *values["right"])
 
 
 class Heard:

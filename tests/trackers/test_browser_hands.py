@@ -23,7 +23,7 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.trackers import browser_hands
 from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
-from service.trackers.hand_message import HANDS, PING, PING_MAGIC, decode_hands
+from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
 from service.trackers.headset_page import HeadsetPage
 from service.trackers.web_server import FOREIGN, server_certificate
 from support.cell import told
@@ -174,7 +174,7 @@ def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
 
 def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
-    monkeypatch.setattr(browser_hands, "SILENT_S", 0.6)
+    monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
 
     async def scenario() -> None:
         async with serving_page(page) as at, opened(page, at) as silent:
@@ -248,7 +248,7 @@ def test_a_certificate_of_this_command_serves_https_under_its_names_alone(tmp_pa
 
 @given(
     st.binary(max_size=200)
-    | st.binary(min_size=HANDS.size, max_size=HANDS.size).map(lambda b: hands_message()[:4] + b[4:])
+    | st.binary(min_size=HANDS_LAYOUT.size, max_size=HANDS_LAYOUT.size).map(lambda b: hands_message()[:4] + b[4:])
 )
 def test_no_bytes_are_an_unexplained_error(data: bytes) -> None:
     with contextlib.suppress(WireError):

@@ -27,6 +27,12 @@ from service.settings.config import Settings
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
 
+def z_reversed(sample: PoseStamped) -> PoseStamped:
+    """A pose in left-handed axes, as it is in right-handed ones whose z points the other way."""
+    (x, y, z), (i, j, k, w) = sample.position, sample.orientation
+    return sample._replace(position=(x, y, -z), orientation=(-i, -j, k, w))
+
+
 def _stale_ticks(key: str, settings: Settings) -> int:
     """Number of ticks, at least one, after which a channel's source is silent. The duration is
     rounded first, so that the period's rounding does not add a tick.
@@ -86,6 +92,7 @@ class Intake:
         self._in_base = np.eye(3, 4)
         # If the tracker has a frame of its own, samples in frame base have been mapped already.
         self._maps_base = hands.frame in ("", BASE)
+        self._is_left_handed = hands.axes == "left-handed"
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(hands, settings.period_s, self._models)
@@ -119,6 +126,9 @@ class Intake:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
             return
+        is_by_tracker = self._maps_base or sample.frame_id != BASE
+        if is_by_tracker and self._is_left_handed:
+            sample = z_reversed(sample)
         cause = take_hand(
             as_array(state),
             self._parameters,
@@ -127,7 +137,7 @@ class Intake:
             sample.stamp_ns,
             sample.position,
             sample.orientation,
-            self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
+            self._tracker if is_by_tracker else self._in_base,
         )
         if cause >= 0:
             self._note(state, side, cause, sample)
