@@ -14,9 +14,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract import ros2
+from service.contract.channels import CellName
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.arm_description import SettingsError, UnreadableError, check, completed, description
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.arm_description import check, completed, description
+from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
 from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
@@ -26,14 +27,6 @@ MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
 REACHED_SHARE = 0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
 LEAST_REACHED_SHARE = 0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
-Cell = Annotated[
-    str,
-    msgspec.Meta(
-        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
-    ),
-]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
@@ -250,7 +243,7 @@ class Files(Section, frozen=True):
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
-    cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
+    cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
     rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)

@@ -10,7 +10,8 @@ import pytest
 
 from service.daemon.launch import described
 from service.files.shipped import cell_of
-from service.settings.config import WAM, Files, Settings, SettingsError, load, parse, robot_description
+from service.settings.config import WAM, Files, Settings, load, parse, robot_description
+from service.settings.file_content import SettingsError
 from service.settings.network import Network, is_local
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
