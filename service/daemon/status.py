@@ -22,7 +22,7 @@ from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
-from service.daemon.input_monitor import KEY_OF_SOURCE, frames
+from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.settings.config import Settings
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
@@ -64,7 +64,7 @@ class CellStatus(NamedTuple):
             places=tuple(point.name for point in skill.via_points),
             rejected=_by_cause(sources),
             sources=sources,
-            frames=frames(settings),
+            frames=settings.tracker_frames,
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),

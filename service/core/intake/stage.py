@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.contract.channels import BY_KEY
 from service.contract.joint_states import measured
@@ -22,9 +23,15 @@ from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
 from service.core.intake.tuning import JOINT_JUMP_RADPS, MAX_LATE_S, MAX_OUTSIDE_RAD
-from service.settings.config import Settings
+from service.settings.config import HandSettings, Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
+
+
+def base_from(hands: HandSettings) -> NDArray[np.float64]:
+    """The mapping (3, 4) of positions in a tracker's frame and unit to frame `base` [m]."""
+    origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+    return np.column_stack((UNIT_M[hands.unit] * axes, origin))
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -61,7 +68,7 @@ class Intake:
         self.stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
-        self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        self._names = settings.joints.names
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
@@ -81,11 +88,10 @@ class Intake:
             per_rad=per_rad,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
-        origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
-        self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
-        self._in_base = np.eye(3, 4)
-        # If the tracker has a frame of its own, samples in frame base have been mapped already.
-        self._maps_base = hands.frame in ("", BASE)
+        self._mappings = {frame: base_from(settings.hands_in(frame)) for frame in settings.tracker_frames}
+        if hands.frame not in ("", BASE):
+            # If the tracker has a frame of its own, samples in frame base have been mapped already.
+            self._mappings[BASE] = np.eye(3, 4)
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(hands, settings.period_s, self._models)
@@ -115,7 +121,8 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""
-        if sample.frame_id not in self._frames:
+        mapping = self._mappings.get(sample.frame_id)
+        if mapping is None:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
             return
@@ -127,7 +134,7 @@ class Intake:
             sample.stamp_ns,
             sample.position,
             sample.orientation,
-            self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
+            mapping,
         )
         if cause >= 0:
             self._note(state, side, cause, sample)
