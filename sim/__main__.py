@@ -23,7 +23,7 @@ from service.contract.printable import printable_lines
 from service.daemon.launch import ENGINES, LaunchError, engine_of
 from service.files.shipped import ARMS, cell_of
 from service.process import interrupt
-from service.settings.arm_description import SettingsError, UnreadableError
+from service.settings.file_content import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, ScriptPause
 

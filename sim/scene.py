@@ -22,8 +22,8 @@ import msgspec
 from service.contract import requests
 from service.contract.explain import InvalidError, in_words, validated
 from service.files.shipped import ARMS, cell_of
-from service.settings.arm_description import SettingsError
 from service.settings.config import Reach
+from service.settings.file_content import SettingsError
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]

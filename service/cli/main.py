@@ -23,7 +23,7 @@ from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 from service.process import interrupt
 from service.process.progress import say
-from service.settings.arm_description import SettingsError, UnreadableError
+from service.settings.file_content import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),

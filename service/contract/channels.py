@@ -13,12 +13,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
 
 from service.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # default endpoint of daemons and their clients
 LARGEST_REQUEST = 256 * 1024  # bytes
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
+CellName = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
+    ),
+]
 _ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
 _ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
 PRESENCE = "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions

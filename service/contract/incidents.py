@@ -29,8 +29,8 @@ Condition = enum.StrEnum(
     "Condition",
     "MALFORMED CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
-    "HAND_ELSEWHERE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED TICKS_LOST "
-    "DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
+    "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
+    "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
     "PORT_FOREIGN NO_ARM",
 )
 
@@ -88,6 +88,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.DRIVES_OFF, None, "drives off",
             "a joint has not moved since commands began",
             "are the drives on? Check their power, brakes and emergency stop; then `thirdhand reset`"),
+        Incident(Condition.ARM_LATE, None, "arm late",
+            "the arm follows its commands late",
+            "let the arm's driver lead by the lag: write position + lag * velocity, as examples/own_arm.py does "
+            "by its lag_s; then measure again"),
         Incident(Condition.NO_ARM, None, "arm assumed",
             "the daemon assumes the arm's posture, and measures nothing",
             "with an arm, start the daemon with `--joints state`"),

@@ -13,7 +13,7 @@ from statistics import median
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, word
 from service.contract.joint_states import measured
-from service.contract.messages import BASE, PoseStamped, WireError
+from service.contract.messages import PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
@@ -118,19 +118,21 @@ class InputMonitor:
             self._counted_s = now_s
 
 
-def frames(settings: Settings) -> tuple[str, ...]:
-    """The names of frames that a hand's pose may have; the empty name stands for the tracker's."""
-    own = settings.hands.frame
-    return (BASE, "") if own in ("", BASE) else (BASE, own, "")
+def _too_far(sample: PoseStamped, settings: Settings) -> str:
+    """Message about a position that is too far away, with the setting of its unit."""
+    unit = settings.hands_in(sample.frame_id).unit
+    return too_far(sample.position, unit, f"{settings.tracker_section(sample.frame_id)} unit is {unit!r}")
 
 
 def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
     """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
-    seen = Evidence(settings=settings, sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
+    seen = Evidence(
+        settings=settings, sample=sample, newest_ns=newest_ns, frames=settings.tracker_frames, held_up_s=held_up_s
+    )
     if isinstance(sample, PoseStamped):
-        mistake = too_far(sample.position, settings.hands.unit) if cause is Cause.OUT_OF_RANGE else ""
+        mistake = _too_far(sample, settings) if cause is Cause.OUT_OF_RANGE else ""
         return seen._replace(mistake=mistake)
     try:
         position, velocity = measured(sample, settings.joints.names)

@@ -23,7 +23,7 @@ from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
-from service.daemon.input_monitor import KEY_OF_SOURCE, frames
+from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.settings.config import Settings
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
@@ -65,8 +65,9 @@ class CellStatus(NamedTuple):
             places=tuple(point.name for point in skill.via_points),
             rejected=_by_cause(sources),
             sources=sources,
-            frames=frames(settings),
-            trackers={settings.hands.frame: settings.hands.base_from_tracker},
+            frames=settings.tracker_frames,
+            trackers={settings.hands.frame: settings.hands.base_from_tracker}
+            | {name: tracker.base_from_tracker for name, tracker in settings.trackers.items()},
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),

@@ -6,6 +6,7 @@ Each number has its unit in its name or in its comment. All defaults are safe.
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +15,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract import ros2
+from service.contract.channels import CellName
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.arm_description import SettingsError, UnreadableError, check, completed, description
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.contract.messages import BASE
+from service.settings.arm_description import check, completed, description
+from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
 from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
@@ -26,14 +29,6 @@ MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
 REACHED_SHARE = 0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
 LEAST_REACHED_SHARE = 0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
-Cell = Annotated[
-    str,
-    msgspec.Meta(
-        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
-    ),
-]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
@@ -67,6 +62,16 @@ class HandSettings(Section, frozen=True):
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
     jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
     swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
+
+
+class TrackerSettings(Section, frozen=True):
+    """One more tracker beside that of `[hands]`. NAME is the frame of its poses: hands in that
+    frame, and the tool in demonstrations, are mapped by this table. `[hands]` maps its own `frame`.
+    """
+
+    unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
+    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
 
 
 class ToolSettings(Section, frozen=True):
@@ -251,9 +256,10 @@ class Files(Section, frozen=True):
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
-    cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
+    cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
     rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
+    trackers: dict[str, TrackerSettings] = {}
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
     joints: JointSettings = msgspec.field(default_factory=JointSettings)
@@ -290,8 +296,14 @@ class Settings(Section, frozen=True):
             yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
         if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
             yield f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, in any order"
+        for name in self.trackers:
+            if not re.fullmatch(r"[\w./-]{1,64}", name):
+                yield f"$.trackers: the frame {name!r} given; 1 to 64 letters, digits and _ . / - accepted"
+            elif name in (BASE, self.hands.frame):
+                yield f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and $.hands.frame needed"
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
+            *((f"$.trackers.{name}.base_from_tracker", one.base_from_tracker) for name, one in self.trackers.items()),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
@@ -342,6 +354,27 @@ class Settings(Section, frozen=True):
             return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
         n = len(self.joints.names)
         return {name: (-math.inf if name == "lower" else math.inf,) * n for name in LIMITS}
+
+    @property
+    def tracker_frames(self) -> tuple[str, ...]:
+        """Names of the frames that a hand's pose may have; the empty name stands for the frame of
+        `[hands]`.
+        """
+        own = () if self.hands.frame in ("", BASE) else (self.hands.frame,)
+        return (BASE, *own, "", *self.trackers)
+
+    def tracker_section(self, frame: str) -> str:
+        """The table that maps poses in a frame."""
+        return f"[trackers.{frame}]" if frame in self.trackers else "[hands]"
+
+    def hands_in(self, frame: str) -> HandSettings:
+        """`[hands]` for poses in a frame: with the frame, unit and pose of its tracker, if it has
+        settings of its own.
+        """
+        if (tracker := self.trackers.get(frame)) is None:
+            return self.hands
+        of_tracker = {"unit": tracker.unit, "axes": tracker.axes, "base_from_tracker": tracker.base_from_tracker}
+        return msgspec.structs.replace(self.hands, frame=frame, **of_tracker)
 
     @property
     def period_s(self) -> float:

@@ -272,6 +272,23 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
 
 
 @pytest.mark.parametrize(
+    ("lag_ms", "level", "words"),
+    [
+        (None, "ok", "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"),
+        (12.3, "ok", "the arm follows its commands 12 ms late"),
+        (51.7, "note", "the arm follows its commands 52 ms late"),
+    ],
+)
+def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, level: str, words: str) -> None:
+    found = findings(HEALTHY, HEALTHY, own_ns=HEALTHY.time_ns, own_version="0.1.0", lag_ms=lag_ms)
+    (one,) = (finding for finding in found if finding.what == "arm's lag")
+    assert (one.level, one.found) == (level, words)
+    assert ("lead by the lag: write position + lag * velocity" in one.text()) == (level == "note")
+    alone = msgspec.structs.replace(HEALTHY, sources={"left": GOOD, "right": GOOD})
+    assert "arm's lag" not in {finding.what for finding in findings(alone, alone, own_ns=0, own_version="0.1.0")}
+
+
+@pytest.mark.parametrize(
     "changed",
     [
         {"mode": "fault", "reason": "arm_silent"},

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.contract.channels import BY_KEY
 from service.contract.joint_states import measured
@@ -22,7 +23,7 @@ from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
 from service.core.intake.tuning import JOINT_JUMP_RADPS, MAX_LATE_S, MAX_OUTSIDE_RAD
-from service.settings.config import Settings
+from service.settings.config import HandSettings, Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
@@ -31,6 +32,12 @@ def z_reversed(sample: PoseStamped) -> PoseStamped:
     """A pose in left-handed axes, as it is in right-handed ones whose z points the other way."""
     (x, y, z), (i, j, k, w) = sample.position, sample.orientation
     return sample._replace(position=(x, y, -z), orientation=(-i, -j, k, w))
+
+
+def base_from(hands: HandSettings) -> NDArray[np.float64]:
+    """The mapping (3, 4) of positions in a tracker's frame and unit to frame `base` [m]."""
+    origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+    return np.column_stack((UNIT_M[hands.unit] * axes, origin))
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -67,7 +74,7 @@ class Intake:
         self.stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
-        self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        self._names = settings.joints.names
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
@@ -87,12 +94,13 @@ class Intake:
             per_rad=per_rad,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
-        origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
-        self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
-        self._in_base = np.eye(3, 4)
-        # If the tracker has a frame of its own, samples in frame base have been mapped already.
-        self._maps_base = hands.frame in ("", BASE)
-        self._is_left_handed = hands.axes == "left-handed"
+        self._mappings = {
+            frame: (base_from(of_frame := settings.hands_in(frame)), of_frame.axes == "left-handed")
+            for frame in settings.tracker_frames
+        }
+        if hands.frame not in ("", BASE):
+            # If the tracker has a frame of its own, samples in frame base have been mapped already.
+            self._mappings[BASE] = np.eye(3, 4), False
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(hands, settings.period_s, self._models)
@@ -122,12 +130,12 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""
-        if sample.frame_id not in self._frames:
+        if sample.frame_id not in self._mappings:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
             return
-        is_by_tracker = self._maps_base or sample.frame_id != BASE
-        if is_by_tracker and self._is_left_handed:
+        mapping, is_left_handed = self._mappings[sample.frame_id]
+        if is_left_handed:
             sample = z_reversed(sample)
         cause = take_hand(
             as_array(state),
@@ -137,7 +145,7 @@ class Intake:
             sample.stamp_ns,
             sample.position,
             sample.orientation,
-            self._tracker if is_by_tracker else self._in_base,
+            mapping,
         )
         if cause >= 0:
             self._note(state, side, cause, sample)
