@@ -205,6 +205,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     frames: tuple[str, ...] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
     joints: tuple[str, ...] = ()  # their names, in order
     hands_m: dict[str, Vector3] = {}  # estimated positions of the hands that were seen, frame `base`
+    below_table_m: dict[str, float] = {}  # depth of hands below the table top: an error of the tracker's calibration
     demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of the demonstrated box
     tool_m: Vector3 | None = None  # commanded position; None before the first tick
     tool_measured_m: Vector3 | None = None  # by the newest joint state; None: not recent
