@@ -27,6 +27,7 @@ FREE_MB = 2000.0  # least free space
 DISK_LASTS_H = 1.0  # least time until the disk is full
 MISSED_SHARE = 0.01  # largest share of missed deadlines
 LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
+MAX_BELOW_TABLE_M = 0.03  # a hand that is farther below the table top shows that the calibration is off
 OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
 COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
 LATE_ARM_MS = 30.0  # largest lag of an arm, with the delay of its driver's playback
@@ -243,6 +244,17 @@ def _driver(before: Status, now: Status) -> Finding:
 
 def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     now, boxes = seen[-1], seen[-1].demonstrated_m
+    below = {side: min(one.below_table_m.get(side, 0.0) for one in seen) for side in SIDES}
+    if max(below.values()) > MAX_BELOW_TABLE_M:
+        depths = " and ".join(
+            f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm" for side, depth in below.items() if depth > MAX_BELOW_TABLE_M
+        )
+        yield wrong(
+            "calibration",
+            f"below the table top: {depths}",
+            "hands above the table",
+            what_to_do(Condition.CALIBRATION_OFF),
+        )
     positions = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
     off = {side: _outside(at, boxes[side]) for side, at in positions.items()}
     crossed = [

@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from service.cli import record_options
+from service.cli import calibrate_options, record_options
 from service.cli.usage import ARM_HELP, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
@@ -40,9 +40,9 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
-    "set up": ("arm", "certificates", "completion"),
+    "set up": ("arm", "calibrate", "certificates", "completion"),
 }
-CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands")  # on Ctrl-C these commands first end their processes
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -309,6 +309,10 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--packages", "DIR", "a folder with ROS packages, for the arm's meshes; may be repeated", action="append")
     output = "write the cell's settings to this file, and the picture to a .png beside it"
     option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)
+
+    c = command("calibrate", calibrate_options.ABOUT_CALIBRATE, calibrate_options.CALIBRATE_EXAMPLE)
+    calibrate_options.add_options(c)
+    _reach(c)
 
     c = command(
         "certificates",

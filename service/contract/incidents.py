@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM",
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF",
 )
 
 
@@ -168,12 +168,17 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.Y_UP, None, "tracker's axes",
             "y of the tracker seems to point up; in frame `base`, z does",
             "turn the tracker's frame by `base_from_tracker` under [hands]"),
+        Incident(Condition.CALIBRATION_OFF, None, "calibration off",
+            "a hand is measured where no hand can be, below the table top",
+            "the tracker has moved, or its pose is wrong: `thirdhand calibrate --check` measures by how much, "
+            "`thirdhand calibrate` finds the pose; check the height of `[table]` too"),
         Incident(Condition.HANDS_EXCHANGED, None, "hands exchanged",
             "each hand is where the skill knows the other one",
             "left and right look swapped: publish each hand under the other's key"),
         Incident(Condition.HAND_ELSEWHERE, None, "hand elsewhere",
             "a hand is far from where the task was demonstrated",
-            "move the hand there, or demonstrate this too; check `[hands] unit` and `base_from_tracker`"),
+            "move the hand there, or demonstrate this too; check `[hands] unit`, and the tracker's pose by "
+            "`thirdhand calibrate --check`"),
     ),
     "A hand or the arm's joint states are rejected": (
         Incident(Cause.NOT_FINITE, None, "not finite",
@@ -207,7 +212,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "let the tracker see both hands apart for a moment: it takes left for right"),
         Incident(Cause.WRONG_FRAME, None, "wrong frame",
             "a pose in a frame that is neither `base` nor `[hands] frame`",
-            "set `[hands] frame` and `base_from_tracker`, or publish in `base`"),
+            "find `[hands] frame` and `base_from_tracker` by `thirdhand calibrate`, also after the tracker was "
+            "recentred, which changes its frame; or publish in `base`"),
         Incident(Condition.MALFORMED, None, "malformed",
             "bytes that are not the message of their key; they are counted by key",
             "publish the type and encoding that docs/wire.md lists for the key"),

@@ -73,6 +73,9 @@ class CellStatus(NamedTuple):
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
+            below_table_m={
+                side: depth for i, side in enumerate(SIDES) if seen[i] and (depth := self._below_table_m(i))
+            },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
             },
@@ -91,6 +94,12 @@ class CellStatus(NamedTuple):
             threshold_m=round(skill.threshold, 5),
             **more,
         )
+
+    def _below_table_m(self, side: int) -> float:
+        """Depth of a hand below the table top [m]; 0 above it and beside it."""
+        x, y, z = (self.frame["hands"][side] - np.array(self.settings.table.centre)).tolist()
+        half_x, half_y = self.settings.table.half_size
+        return round(max(0.0, -z), 4) if abs(x) < half_x and abs(y) < half_y else 0.0
 
     def _turned(self) -> float:
         """Angle between the tool and its target, or between their directions [rad]."""

@@ -281,7 +281,7 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
         "the left hand has not been seen yet, as what arrives is rejected as wrong_frame: "
         "frame 'camera'; 'base', 'optitrack' or none accepted"
     )
-    assert told.remedy == "set [hands] frame and base_from_tracker, or publish in base"
+    assert told.remedy.startswith("find [hands] frame and base_from_tracker by thirdhand calibrate, also after the")
     assert told.frames == ("base", "optitrack", "")
     assert told.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
     assert (told.sources["right"].fresh, told.sources["left"].fresh) == (True, False)
