@@ -156,7 +156,7 @@ def _with_name(path: str, given: Any, kind: Any) -> str:
     """The path of an error with the name of the table for which msgspec writes `[...]`."""
     before, dots, after = path.partition("[...]")
     tables, node, _ = _at(before, given, inspect.type_info(kind)) if dots else (None, None, "")
-    if isinstance(node, inspect.DictType) and isinstance(node.value_type, inspect.StructType):
+    if tables is not None and isinstance(node, inspect.DictType) and isinstance(node.value_type, inspect.StructType):
         for name, table in tables.items():
             try:
                 msgspec.convert(table, node.value_type.cls)

@@ -66,8 +66,10 @@ class CellStatus(NamedTuple):
             rejected=_by_cause(sources),
             sources=sources,
             frames=settings.tracker_frames,
-            trackers={settings.hands.frame: settings.hands.base_from_tracker}
-            | {name: tracker.base_from_tracker for name, tracker in settings.trackers.items()},
+            trackers={
+                frame: settings.hands_in(frame).base_from_tracker
+                for frame in (settings.hands.frame, *settings.trackers)
+            },
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
