@@ -28,7 +28,7 @@ class Link {
       // The server closes with 4000 + a status of HTTP and its reason. Only silence (408) is worth another try.
       const isRefused = event.code >= 4000 && event.code !== 4408;
       this.refusal = isRefused ? event.reason : "";
-      this.problem = isRefused ? event.reason : "not connected: `thirdhand hands` has ended, or the network is down";
+      this.problem = event.reason || "`thirdhand hands` has ended, or the network is down";
       this.status = {};
       if (!isRefused) setTimeout(() => this.connect(), Link.RETRY_MS);
       this.shown();

@@ -43,6 +43,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
     "contract",
 )
 SLOW = (  # the longest first: so they begin first
+    "trackers/test_headset.py",
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "daemon/test_start.py",

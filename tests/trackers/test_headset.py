@@ -229,7 +229,7 @@ def test_the_page_goes_on_by_itself_where_the_server_is_started_again(
             tab.ask(STILL)
             until(lambda: heard.poses["left"], within_s=TIMEOUT_S)
             first.close()
-            assert tab.until("link.problem").startswith("not connected")
+            assert tab.until("link.problem") == "`thirdhand hands` has ended, or the network is down"
             count = sent(tab)
             with headset.serving_hands(endpoint, tmp_path, port=port) as again:
                 assert again.url == served.url  # the token is kept
