@@ -24,6 +24,7 @@ GROUPS = {
     "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm"),
     "How to": (
         "install",
+        "mouse",
         "record-takes",
         "other-recordings",
         "arrays",

@@ -25,7 +25,7 @@ from service.contract.messages import BASE, SceneObject
 from service.settings.config import Settings
 from sim.engines import world_of
 from sim.scene import ARRIVED_M, GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND, Scene
-from sim.script import GRIP_S, Array, HandMotions, Progress
+from sim.script import GRIP_S, Array, HandMotions, TaskProgress
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_RANGE_S = (0.5, 2.5)  # shortest and longest time for the arm to settle before the script begins
@@ -116,7 +116,7 @@ class BenchHands(Protocol):
 
     def sample(self, t: float) -> tuple[Array, Array]: ...
 
-    def progress(self, t: float, reached: int) -> Progress: ...
+    def progress(self, t: float, reached: int) -> TaskProgress: ...
 
     def places(self) -> tuple[SceneObject, ...]: ...
 

@@ -44,7 +44,7 @@ class HandMotions(NamedTuple):
     right: PointMotion
 
 
-class Progress(NamedTuple):
+class TaskProgress(NamedTuple):
     """The progress of the task: the index of the event that is observed, 0 to 2 (None: none is),
     and the number of events that are over.
     """
@@ -181,7 +181,7 @@ class HandScript:
     def begin(self) -> None:
         """Do nothing: a script depends on time alone."""
 
-    def progress(self, t: float, reached: int) -> Progress:
+    def progress(self, t: float, reached: int) -> TaskProgress:
         """The progress at a time `t` [s]: each event is observed in the rest after its motion, the
         last one until the end, however many have been `reached`.
         """
@@ -189,7 +189,7 @@ class HandScript:
         first, second, third = self.scene.dwells
         rests = (first, second, (third[0], math.inf))
         observed = (i for i, (begin, end) in enumerate(rests) if begin <= script_s <= end)
-        return Progress(next(observed, None), (script_s > first[1]) + (script_s > second[1]))
+        return TaskProgress(next(observed, None), (script_s > first[1]) + (script_s > second[1]))
 
     def places(self) -> tuple[SceneObject, ...]:
         """No places are drawn: nobody has to find them."""

@@ -11,13 +11,13 @@ from service.contract.messages import BASE, PoseStamped, SceneObject
 from service.contract.records import SIDES
 from service.settings import palette
 from sim.scene import ARRIVED_M, HAND_ORIENTATION, Point, Scene
-from sim.script import Array, HandMotions, PointMotion, Progress
+from sim.script import Array, HandMotions, PointMotion, TaskProgress
 from sim.world import LEVEL
 
-REST_S = 0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
+OBSERVED_S = 0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
 PLACE_OPACITY = 0.3
 HAND_COLOURS = dict(zip(SIDES, (palette.LEFT, palette.RIGHT), strict=True))
-STILL = np.zeros(3)
+AT_REST = np.zeros(3)
 
 
 class HandPlace(NamedTuple):
@@ -44,7 +44,7 @@ class TrackedHands:
     """Hands that are received while the bench runs, in place of a `HandScript`.
 
     The person decides when: an event is observed while the hands are within ARRIVED_M of its
-    places. The next event begins REST_S after it was reached, or when the hands leave.
+    places. The next event begins OBSERVED_S after it was reached, or when the hands leave.
     """
 
     seed = 0
@@ -87,7 +87,7 @@ class TrackedHands:
         """The newest positions of both hands; before the first sample, the scene's start."""
         scene = self.scene
         left, right = (
-            PointMotion(np.array(self._newest[side].position if side in self._newest else start), STILL, STILL)
+            PointMotion(np.array(self._newest[side].position if side in self._newest else start), AT_REST, AT_REST)
             for side, start in zip(SIDES, (scene.left_start, scene.right_start), strict=True)
         )
         return HandMotions(left, right)
@@ -97,20 +97,20 @@ class TrackedHands:
         left, right = (np.concatenate((hand.position, HAND_ORIENTATION)) for hand in self.truth(t))
         return left, right
 
-    def progress(self, t: float, reached: int) -> Progress:
+    def progress(self, t: float, reached: int) -> TaskProgress:
         """The progress at a time `t` [s], when `reached` events in a row have been reached."""
         hands = self.truth(t)._asdict()
         if self._over == len(self._places):
-            return Progress(None, self._over)
+            return TaskProgress(None, self._over)
         arrived = all(math.dist(hands[side].position, at) <= ARRIVED_M for side, at, _ in self._places[self._over])
         if reached > self._over:
             self._reached_s = min(self._reached_s, t)
-            if not arrived or t - self._reached_s >= REST_S:
+            if not arrived or t - self._reached_s >= OBSERVED_S:
                 self._over, self._reached_s = self._over + 1, math.inf
                 if self._over == len(self._places):
                     self._ended_s = min(t, self._timeout_s)
-                return Progress(None, self._over)
-        return Progress(self._over if arrived else None, self._over)
+                return TaskProgress(None, self._over)
+        return TaskProgress(self._over if arrived else None, self._over)
 
     def places(self) -> tuple[SceneObject, ...]:
         """The places to which the hands belong next, as viewers draw them: a ball each, whose name

@@ -31,14 +31,14 @@ from service.trackers.cell_view import Latest
 from service.trackers.mouse_page import MousePage, PlayedTask
 from service.trackers.web_server import Address
 
-CELL = "thirdhand"  # of the demo
+DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
 OUTCOME_S = 1.0  # the page shows the outcome before its server ends
 NEVER_THERE = "the hands were never at its places"
-REACHED = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
+REACHED_LINE = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
 CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
 VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
@@ -141,11 +141,11 @@ def _played_on_page(
 
     def heard(line: str) -> None:
         say(line)
-        if found := REACHED.fullmatch(line):
+        if found := REACHED_LINE.fullmatch(line):
             task.lines.append(f"{EVENT_TITLES[found[1]]}, the tool was {found[2]} off")
 
     with Tracker(session) as tracker:
-        shown = MousePage(tracker, client, Latest(session, CELL), cell=CELL, task=task)
+        shown = MousePage(tracker, client, Latest(session, DEMO_CELL), cell=DEMO_CELL, task=task)
         with page_served(shown.server, "--mouse", listen) as address:
             url = f"http://{address}/?token={shown.server.token}"
             say(f"  {url}")

@@ -34,7 +34,8 @@ class Tab:
             self._call("Page.addScriptToEvaluateOnNewDocument", {"source": before}, self._session)
             self._call("Page.navigate", {"url": url}, self._session)
 
-    def _call(self, method: str, params: dict[str, Any], session: str = "") -> Any:
+    def _post(self, method: str, params: dict[str, Any], session: str = "") -> None:
+        """Call a method without waiting for its answer."""
         self._number += 1
         message = {
             "id": self._number,
@@ -43,6 +44,9 @@ class Tab:
             **({"sessionId": session} if session else {}),
         }
         os.write(self._to, json.dumps(message).encode() + b"\0")
+
+    def _call(self, method: str, params: dict[str, Any], session: str = "") -> Any:
+        self._post(method, params, session)
         while True:
             while b"\0" not in self._rest:
                 left_s = self._until - time.monotonic()
@@ -81,9 +85,12 @@ class Tab:
         )
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """An event of fingers, which are at these pixels: `Start`, `Move` or `End`."""
+        """An event of fingers, which are at these pixels: `Start`, `Move` or `End`.
+
+        Its answer is not waited for, because the browser gives none where it merges movements.
+        """
         fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
-        self._call("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": fingers}, self._session)
+        self._post("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": fingers}, self._session)
 
     def cover(self) -> None:
         """Hide the page behind another one."""

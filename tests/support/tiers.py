@@ -44,6 +44,7 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
 )
 SLOW = (  # the longest first: so they begin first
     "trackers/test_headset.py",
+    "trackers/test_mouse_page.py",
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "daemon/test_start.py",

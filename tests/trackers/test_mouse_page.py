@@ -202,7 +202,8 @@ def test_open_without_a_page_for_a_mouse_is_refused() -> None:
 
 @pytest.mark.timed
 def test_a_person_plays_the_demo_on_the_page_and_it_is_scored(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "service", "demo", "--mouse", "--json", "--output", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "service", "demo", "--mouse", "--rate", "100", "--json"]
+    command += ["--output", str(tmp_path / "out")]
     errors = tmp_path / "said"
     with (
         errors.open("w") as said,
