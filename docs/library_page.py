@@ -59,7 +59,7 @@ KMP_GROUPS = {
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
 }
 CLIENT_GROUPS = {
-    "Connect": ("connect", "Connection", "Watch"),
+    "Connect": ("connect", "Connection", "Watch", "SceneObject"),
     "Requests": ("Client",),
     "Hands and joints": ("Tracker", "Follower", "Command"),
     "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),

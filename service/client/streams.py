@@ -149,8 +149,11 @@ class _Received(AbstractContextManager[Any]):
 
 
 class Watch(_Received, Iterator[Any]):
-    """An iterator over the messages of one channel, each decoded to its type, in the order of
-    arrival; a context.
+    """An iterator over the messages of one channel, in the order of arrival; a context.
+
+    Poses have `stamp_ns`, `frame_id`, `position` [m] and `orientation`, and `tool/target` also its
+    `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
+    of SceneObject, and `status` a `service.contract.requests.Status`.
 
     It waits for the next message. After `timeout_s` [s] without one it yields None; None: never.
     A slow loop gets the newest 256 messages. Messages that cannot be decoded are skipped:
