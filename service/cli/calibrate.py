@@ -1,4 +1,4 @@
-"""`thirdhand calibrate`: find the tracker's pose from a hand at the tool, check it, and write it."""
+"""`thirdhand calibrate`: find the tracker's pose from a hand at the tool, check and write it."""
 
 from __future__ import annotations
 
@@ -159,7 +159,9 @@ def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> No
     begun_s = time.monotonic()
     while missing := live.missing(args.hand, needs_joints=needs_joints):
         if time.monotonic() - begun_s > args.wait:
-            unreadable = "".join(f"; {count} messages on {key} are not readable" for key, count in live.malformed.items())
+            unreadable = "".join(
+                f"; {count} messages on {key} are not readable" for key, count in live.malformed.items()
+            )
             raise CalibrationError(
                 f"not received: {', '.join(missing)}{unreadable}. Are tracker and arm running, connected to the same "
                 f"endpoint, and in the same cell?"
@@ -203,7 +205,9 @@ def _touched(
             if len(hand) >= MIN_POINTS:
                 try:
                     found = solve_points(np.array(hand), np.array(base), corners)
-                    say(f"residual {1e3 * found.rms_m:.1f} mm, accuracy {1e3 * found.std_m:.1f} mm; Ctrl-C ends it here")
+                    say(
+                        f"residual {1e3 * found.rms_m:.1f} mm, accuracy {1e3 * found.std_m:.1f} mm; Ctrl-C ends it here"
+                    )
                 except CalibrationError as error:
                     say(f"not enough yet: {error}")
     except KeyboardInterrupt:

@@ -44,6 +44,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     accept = "accept this standard deviation of a mapped position at the corners of the bench"
     option(c, "--accept", "MM", accept, 10.0, type=within(float, 0.1, MAX_ACCEPTED_MM, " mm"))
     option(c, "--seconds", "S", "lead the tool for this time at most", 120.0, type=within(float, 5, 3600, " s"))
-    option(c, "--wait", "S", "wait this long for hands and arm to be published", 30.0, type=within(float, 0, 3600, " s"))
+    option(
+        c, "--wait", "S", "wait this long for hands and arm to be published", 30.0, type=within(float, 0, 3600, " s")
+    )
     listen = "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
     option(c, "--listen", "EP", listen)

@@ -175,7 +175,12 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
 
 def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED_JUST_BEFORE], capture_output=True, text=True, cwd=ROOT, timeout=30, check=False
+        [sys.executable, "-c", INTERRUPTED_JUST_BEFORE],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=30,
+        check=False,
     )
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 
