@@ -1,4 +1,4 @@
-"""`thirdhand calibrate`: find the tracker's pose from a hand at the tool, check it, and write it."""
+"""`thirdhand calibrate`: find the tracker's pose from a hand at the tool, check and write it."""
 
 from __future__ import annotations
 

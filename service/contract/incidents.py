@@ -177,8 +177,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "left and right look swapped: publish each hand under the other's key"),
         Incident(Condition.HAND_ELSEWHERE, None, "hand elsewhere",
             "a hand is far from where the task was demonstrated",
-            "move the hand there, or demonstrate this too; check `[hands] unit`, and the tracker's pose by "
-            "`thirdhand calibrate --check`"),
+            "move the hand there, or demonstrate this too; check `[hands] unit` and `base_from_tracker`, "
+            "by `thirdhand calibrate --check`"),
     ),
     "A hand or the arm's joint states are rejected": (
         Incident(Cause.NOT_FINITE, None, "not finite",

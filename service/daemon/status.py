@@ -76,7 +76,7 @@ class CellStatus(NamedTuple):
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
             below_table_m={
-                side: depth for i, side in enumerate(SIDES) if seen[i] and (depth := self._below_table_m(i))
+                side: depth_m for i, side in enumerate(SIDES) if seen[i] and (depth_m := self._below_table_m(i))
             },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)

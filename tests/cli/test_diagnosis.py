@@ -79,6 +79,16 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     assert told >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
 
 
+def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
+    """Only if it is there all the time, and deeper than a hand's noise."""
+    before = msgspec.structs.replace(HEALTHY, below_table_m={"right": 0.05, "left": 0.01})
+    now = msgspec.structs.replace(before, tick=2000, time_ns=before.time_ns + 2 * 10**9)
+    (text,) = wrongs(findings(before, now, own_ns=now.time_ns, own_version="0.1.0"))
+    assert "calibration        below the table top: right hand 5 cm" in text
+    assert "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose" in text
+    assert wrongs(findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0")) == []
+
+
 def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
     refused = {"fresh": False, "age_ms": None, "rejected": {"wrong_frame": 200}, "cause": "wrong_frame"}
     (told,) = wrongs(diagnosed(sources=source("right", **refused)))

@@ -97,6 +97,7 @@ SLOW = (  # the longest first: so they begin first
     "files/test_damage.py",
     "daemon/test_requests.py",
     "test_hand_sample.py",
+    "trackers/test_calibration.py",
     "trackers/test_taking.py::test_a_demonstration_is_recorded_shown_trimmed_and_deleted",
 )
 SMOKE = (

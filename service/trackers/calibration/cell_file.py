@@ -97,7 +97,7 @@ def _replace(path: Path, data: bytes, mode: int) -> None:
 
 
 def recorded(path: Path, settings: Settings) -> CalibrationRecord:
-    """The record of a cell's calibration, with the pose in its settings. Raises CalibrationError."""
+    """The record of a calibration, with the pose in the settings. Raises CalibrationError."""
     beside = record_path(path.resolve())
     try:
         given = msgspec.json.decode(content(beside, LARGEST_CONFIGURATION))

@@ -1,4 +1,4 @@
-"""Collecting for a calibration: hands and tool of a running cell or of a recording, in common time."""
+"""Hands and tool for a calibration, of a running cell or of a recording, in common time."""
 
 from __future__ import annotations
 
@@ -201,8 +201,8 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
     """
     if not is_by_tracker(hand.name, hand.frame, hands):
         raise CalibrationError(
-            f"{hand.name} is in frame {BASE!r}, and [hands] frame is {hands.frame!r}: its publisher maps it already, so "
-            "that base_from_tracker has no effect. Let it publish in the tracker's own frame"
+            f"{hand.name} is in frame {BASE!r}, and [hands] frame is {hands.frame!r}: its publisher maps it already, "
+            "and base_from_tracker has no effect. Let it publish in the tracker's own frame"
         )
     remarks: list[str] = []
     (hand_ns, hand_is_foreign), (tool_ns, tool_is_foreign) = map(_clock, (hand, tool))
@@ -210,7 +210,7 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
         hand_ns, tool_ns = hand.logged_ns, tool.logged_ns
         whose = hand.name if hand_is_foreign else JOINT_STATES
         remarks.append(f"the stamps of {whose} are of another clock: times of arrival are used")
-    finite = np.isfinite(hand.poses[:, :3]).all(axis=1)
+    finite = np.asarray(np.isfinite(hand.poses[:, :3]).all(axis=1))
     if not finite.all():
         remarks.append(f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite and not used")
     tool_ns, tool_rows = np.unique(tool_ns, return_index=True)

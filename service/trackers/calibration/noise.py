@@ -40,11 +40,12 @@ class WanderingNoise(NamedTuple):
 def candidate(times_s: Vector, share: float, time_s: float) -> WanderingNoise:
     """The noise of samples at times (N,) [s] with this share and time of the wandering error."""
     correlation = share * np.exp(-np.abs(times_s[:, None] - times_s[None, :]) / time_s)
-    return WanderingNoise(share, time_s, np.linalg.cholesky(correlation + (1.0 - share) * np.eye(len(times_s))))
+    factor = np.linalg.cholesky(correlation + (1.0 - share) * np.eye(len(times_s)))
+    return WanderingNoise(share, time_s, np.asarray(factor, np.float64))
 
 
 def estimated(times_s: Vector, off: Vector, jacobian: Vector) -> WanderingNoise:
-    """The most likely noise of residuals (N, 3) at times (N,) [s], of a fit with Jacobian (N, 3, K).
+    """The most likely noise of residuals (N, 3) [m] at times (N,) [s]; the Jacobian is (N, 3, K).
 
     The time is chosen at the middle share, then the share at that time.
     """
@@ -54,11 +55,9 @@ def estimated(times_s: Vector, off: Vector, jacobian: Vector) -> WanderingNoise:
         residual, slopes = noise.whitened(off).ravel(), noise.whitened(jacobian).reshape(count, parameters)
         base, triangle = np.linalg.qr(slopes)
         square = float(residual @ residual - np.square(base.T @ residual).sum())
-        return (
-            (count - parameters) * math.log(max(square, 1e-300))
-            + 6.0 * float(np.log(np.diag(noise.factor)).sum())
-            + 2.0 * float(np.log(np.maximum(np.abs(np.diag(triangle)), 1e-300)).sum())
-        )
+        determinants = 3.0 * np.log(np.diag(noise.factor)).sum()
+        determinants += np.log(np.maximum(np.abs(np.diag(triangle)), 1e-300)).sum()
+        return float((count - parameters) * math.log(max(square, 1e-300)) + 2.0 * determinants)
 
     middle = SHARES[len(SHARES) // 2]
     wandering = min((candidate(times_s, middle, time_s) for time_s in WANDERING_TIMES_S), key=cost)

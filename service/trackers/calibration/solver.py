@@ -20,13 +20,14 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.optimize import approx_fprime, least_squares
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from service.contract.explain import ExplainedError
 from service.core.frame import Vector
 from service.settings.config import Point, Pose, Settings
-from service.trackers.calibration.noise import estimated
+from service.trackers.calibration.noise import WanderingNoise, estimated
 
 FIRST_SCALE_M = 0.01  # in the first fit, larger residuals have a bounded influence
 SCALES_M = (0.001, 0.05)  # bounds of that scale in the next fits, where it is 2 robust standard deviations
@@ -116,7 +117,9 @@ def coverage(tool: Vector, turn: Vector) -> Coverage:
     turned = np.linalg.svd((rotations.mean().inv() * rotations).as_rotvec(), compute_uv=False)
     share = EXTENT_DEVIATIONS / math.sqrt(len(tool))
     narrow = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
-    return Coverage(share * stretch, narrow.round(1) + 0.0, share * turned)  # -0.0 becomes 0.0
+    return Coverage(
+        np.asarray(share * stretch), np.asarray(narrow.round(1) + 0.0), np.asarray(share * turned)
+    )  # -0.0 becomes 0.0
 
 
 def bench_corners(settings: Settings) -> Vector:
@@ -164,10 +167,12 @@ def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SA
     flips = np.where(np.sum(held.turn[1:] * held.turn[:-1], axis=1) < 0, -1.0, 1.0)
     turn = held.turn * np.cumprod(np.r_[1.0, flips])[:, None]  # so that neighbours can be interpolated
     poses = [*held.tool.T, *turn.T]
-    rows = np.arange(0, len(held.hand), math.ceil(len(held.hand) / max_samples))
-    times_s, span_s = held.hand_s[rows], (held.tool_s[0], held.tool_s[-1])
+    rows = np.arange(0, len(held.hand), math.ceil(len(held.hand) / max_samples), dtype=np.intp)
+    span_s = (held.tool_s[0], held.tool_s[-1])
 
-    def problem(rows: Vector, times_s: Vector) -> _Problem:
+    def problem(rows: NDArray[np.intp]) -> _Problem:
+        times_s = held.hand_s[rows]
+
         def tool_at(delay_s: float) -> tuple[Vector, Rotation]:
             at_s = np.clip(times_s - delay_s, *span_s)
             x, y, z, *quaternion = (np.interp(at_s, held.tool_s, values) for values in poses)
@@ -175,9 +180,9 @@ def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SA
 
         return _Problem(held.hand[rows], tool_at, times_s)
 
-    first = _robust(problem(rows, times_s))
+    first = _robust(problem(rows))
     is_near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
-    found = problem(rows[is_near], times_s[is_near])
+    found = problem(rows[is_near])
     hint = f" The tool turned by {_degrees(cover)}" if cover.turned_rad[1] < math.radians(20) else ""
     return _refined(found, first, corners, hint)
 
@@ -296,7 +301,7 @@ def _affine(problem: _Problem) -> tuple[float, Vector, Vector]:
             off = np.linalg.norm(rows @ found - tool, axis=1)
             weights = 1.0 / np.sqrt(FIRST_SCALE_M + off)[:, None]
         if best is None or off.mean() < best[0]:
-            best = float(off.mean()), delay_s, found[:9].reshape(3, 3) / size
+            best = float(off.mean()), delay_s, np.asarray(found[:9].reshape(3, 3) / size)
     assert best is not None
     return best[1], best[2], centre
 
@@ -360,8 +365,8 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
     """
     if abs(first.delay_s) > 0.98 * MAX_STAMP_DELAY_S:
         raise CalibrationError(
-            f"the stamps of hand and arm differ by {MAX_STAMP_DELAY_S:g} s or more: synchronise the clocks, or let each "
-            "program stamp a sample when it is measured"
+            f"the stamps of hand and arm differ by {MAX_STAMP_DELAY_S:g} s or more: synchronise the clocks, or let "
+            "each program stamp a sample when it is measured"
         )
     count, samples = (10 if problem.is_held else 6), len(problem.hand)
 
@@ -369,7 +374,14 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
         return _residual(problem, first.turn, first.centre, x)
 
     def slopes(x: Vector) -> Vector:
-        return np.asarray(approx_fprime(x, lambda x: off(x).ravel(), EPSILON)).reshape(samples, 3, count)
+        here = off(x)
+        return np.stack([(off(x + EPSILON * axis) - here) / EPSILON for axis in np.eye(count)], axis=2)
+
+    def fitted(x: Vector, noise: WanderingNoise | None) -> Vector:
+        def white(x: Vector) -> Vector:
+            return (off(x) if noise is None else noise.whitened(off(x))).ravel()
+
+        return np.asarray(least_squares(white, x, x_scale=0.1).x)
 
     x = first.parameters[:count]
     jacobian = slopes(x)
@@ -377,11 +389,11 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
     if problem.times_s is not None:
         for _ in range(NOISE_ROUNDS):
             noise = estimated(problem.times_s, off(x), jacobian)
-            x = least_squares(lambda x, noise=noise: noise.whitened(off(x)).ravel(), x, x_scale=0.1).x
+            x = fitted(x, noise)
             jacobian = slopes(x)
         white, weighted = noise.whitened(off(x)), noise.whitened(jacobian)
     else:
-        x = least_squares(lambda x: off(x).ravel(), x, x_scale=0.1).x
+        x = fitted(x, None)
         white, weighted = off(x), slopes(x)
     information = np.einsum("nik,nil->kl", weighted, weighted)
     variance = np.square(white).sum() / max(3 * samples - count, 1)
