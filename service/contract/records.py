@@ -40,6 +40,7 @@ class Reason(enum.IntEnum):
     SERVICE = 11
     BLOCKED = 12
     AMBIGUOUS = 13
+    CLUTCH = 14
 
 
 class Flag(enum.IntFlag):

@@ -59,7 +59,7 @@ from service.settings.config import Settings
 # Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
-SAMPLES = ("hands/left", "hands/right", "joints/state")
+SAMPLES = ("hands/left", "hands/right", "joints/state", "clutch", "gripper/wish")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
@@ -74,7 +74,7 @@ def start_state(settings: Settings, skill: Skill) -> Record:
     Intake(settings).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
-    state["orientation"], state["closure"] = skill.orientation, NO_GRIPPER
+    state["orientation"], state["closure"], state["gripper_wish"] = skill.orientation, NO_GRIPPER, NO_GRIPPER
     state["skill"], state["trail_tick"] = np.frombuffer(skill.digest, np.uint8), NEVER
     return state
 

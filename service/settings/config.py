@@ -66,6 +66,9 @@ class HandSettings(Section, frozen=True):
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
     jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
     swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
+    clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
+    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
+    gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
 
 
 class ToolSettings(Section, frozen=True):

@@ -13,6 +13,8 @@ from service.core.codes import (
     ARM_SILENT,
     ARM_STILL,
     BLOCKED,
+    CLUTCH,
+    CLUTCH_RELEASED,
     CONTESTED,
     FAR,
     FAULT,
@@ -67,8 +69,9 @@ def step(
     in this order causes a hold; without one, the arm follows:
 
     * TWO_SOURCES: a hand or the arm is contested.
-    * NOT_READY: the arm is not ready.
+    * NOT_READY: the arm is not ready; if it moves back by itself, not while the clutch is released.
     * OPERATOR: the operator holds it.
+    * CLUTCH: the clutch is released.
     * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
       been seen or is not seen now.
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
@@ -90,10 +93,12 @@ def step(
         return starts, error, speed
     if known & CONTESTED:
         reason = TWO_SOURCES
-    elif state.arm_ready != READY:
+    elif state.arm_ready != READY and not (state.arm_ready == RETURNING and known & CLUTCH_RELEASED):
         reason = NOT_READY
     elif state.operator_hold:
         reason = OPERATOR
+    elif known & CLUTCH_RELEASED:
+        reason = CLUTCH
     elif math.isnan(gate_m):
         unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ONE_HAND
         reason = NO_HANDS if unseen else STALE_HAND

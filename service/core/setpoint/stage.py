@@ -98,6 +98,7 @@ class SetpointStage:
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm, self._period_s, self._max_speed = arm, settings.period_s, float(settings.tool.max_speed)
+        self._takes_wishes = settings.hands.gripper == "key"
         self._costs = np.empty((3, 3, len(settings.joints.names)))
         self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
 
@@ -123,15 +124,19 @@ class SetpointStage:
             box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
         if state["closure"] != NO_GRIPPER:
-            self._grip(state, wanted, here)
+            off = math.dist(wanted.target.position.tolist(), tool.tolist())
+            self._grip(state, float(state["closure"]), off)
+        elif self._takes_wishes:
+            self._grip(state, float(state["gripper_wish"]), 0.0)
         finish(states, frames, self._orientation.parameters)
         return met
 
-    def _grip(self, state: Record, wanted: Wanted, here: Kinematics) -> None:
-        """Open or close the gripper as the skill predicts, once the tool is near its target."""
-        before, closure = int(state["gripper"]), float(state["closure"])
+    def _grip(self, state: Record, closure: float, off: float) -> None:
+        """Open or close the gripper for a `closure` that the skill predicts or a person wishes, if
+        the tool is near its target, `off` [m] away.
+        """
+        before = int(state["gripper"])
         since_s = self._period_s * int(state["tick"] - state["gripper_tick"])
-        off = math.dist(wanted.target.position.tolist(), here.record["position"][0].tolist())
         state["gripper"] = decided(before, closure, since_s=since_s, off=off)
         if state["gripper"] != before:
             state["gripper_tick"] = state["tick"]
