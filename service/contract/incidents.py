@@ -146,6 +146,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Flag.TARGET_CLAMPED, Mode.FOLLOW, "target out of reach",
             "the target lies outside the workspace or the arm's reach; the tool moves to the nearest point inside",
             "move the hands nearer to the arm, or teach the via-point elsewhere"),
+        Incident(Flag.ENGAGING, Mode.FOLLOW, "engaging",
+            "following has just begun: the tool moves at {tool.engage_speed m/s} at most until it is within 2 cm of "
+            "its target",
+            "wait; if the tool does not catch up with the hands, hold them still for a moment"),
         Incident(Flag.SPEED_LIMITED, Mode.FOLLOW, "at a speed limit",
             "the hands require more than the limits of the tool or a joint", "nothing: the tool arrives later"),
         Incident(Flag.NEAR_JOINT_LIMIT, Mode.FOLLOW, "near a joint limit",

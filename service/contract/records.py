@@ -52,6 +52,7 @@ class Flag(enum.IntFlag):
     SEPARATION = 8
     STUCK = 16
     UNSURE = 32
+    ENGAGING = 64
 
 
 class Cause(enum.IntEnum):

@@ -59,6 +59,7 @@ from service.settings.config import Settings
 # Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
+ENGAGING = int(Flag.ENGAGING)
 SAMPLES = ("hands/left", "hands/right", "joints/state", "clutch", "gripper/wish")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -218,6 +219,7 @@ class Controller:
             frame["commanded"] = moved.moving
         flags = STUCK * (state["stuck"] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
         flags |= UNSURE * (state["unsure"] > 0) | LIMITED * (met > 0 or solution.speed_limited or moved.limited)
+        flags |= ENGAGING * (state["engaging"] > 0)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
         lap("limiter")
 

@@ -177,7 +177,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
     and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
     anew. They also are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved
-    by more than that.
+    by more than that. While the setpoint engages, engaging_speed takes the place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
@@ -194,7 +194,8 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     if state.stuck == NOTICED:
         least = FREED_SHARE * state.stuck_gap
     else:
-        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * config.max_speed * STUCK_S)
+        max_speed = config.engaging_speed if state.engaging else config.max_speed
+        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * max_speed * STUCK_S)
     if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_GAP_M:
         state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
         return 0
