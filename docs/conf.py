@@ -30,6 +30,7 @@ GROUPS = {
         "places",
         "pose",
         "unseen-hands",
+        "clutch",
         "hardware",
         "own-arm",
         "franka",
