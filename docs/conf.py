@@ -31,6 +31,7 @@ GROUPS = {
         "places",
         "pose",
         "unseen-hands",
+        "clutch",
         "hardware",
         "own-arm",
         "franka",

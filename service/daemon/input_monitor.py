@@ -22,7 +22,7 @@ from service.core.intake.far_away import too_far
 from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
 from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
-from service.daemon.cell_streams import Arrivals
+from service.daemon.cell_streams import Arrivals, heard
 from service.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
@@ -47,8 +47,7 @@ class InputMonitor:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        measured = settings.arm.source == "state"
-        self.arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES if measured or source != "arm"}
+        self.arrivals = {channel.key: Arrivals() for channel in heard(settings)}
         self._histories = {source: _History() for source in SOURCES if KEY_OF_SOURCE[source] in self.arrivals}
         self._counted_s = 0.0
 
@@ -100,6 +99,18 @@ class InputMonitor:
             if source == "arm" or seen < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
         )
+
+    def clutch(self, state: Record) -> str:
+        """The problem with the clutch's messages; empty if there is none, or no clutch."""
+        arrivals = self.arrivals.get("clutch")
+        if arrivals is None:
+            return ""
+        if arrivals.count == arrivals.malformed:
+            why = f"; what arrived is malformed: {arrivals.why}" if arrivals.why else ""
+            return f"the clutch has not been heard yet{why}"
+        silent_ms = self._settings.hands.clutch_stale_ms
+        is_silent = 0 < state["clutch_until_tick"] <= state["tick"]
+        return f"the clutch was last heard as pressed, and then not for {silent_ms:g} ms" if is_silent else ""
 
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:
         """Lines for the log: the first rejection of each cause at once, then counts."""

@@ -43,6 +43,7 @@ class CellStatus(NamedTuple):
     failure: str = ""
     inside: Inside | None = None  # what an arm that is not ready is inside of
     busy: str = ""  # signs of a busy machine when the arm stopped
+    clutch: str = ""  # the problem with the clutch's messages
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
@@ -129,6 +130,7 @@ class CellStatus(NamedTuple):
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
+            clutch=self.clutch,
             busy=self.busy,
         )
 

@@ -62,6 +62,9 @@ class HandSettings(Section, frozen=True):
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
     jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
     swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
+    clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
+    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
+    gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
 
 
 class TrackerSettings(Section, frozen=True):
@@ -79,6 +82,7 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.0  # [m/s] until the tool reaches its target; 0: off
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
@@ -89,6 +93,14 @@ class ToolSettings(Section, frozen=True):
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
     stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
+
+    @property
+    def engaging_speed(self) -> float:
+        """Speed limit of the setpoint [m/s] from the start of following until it is at its target
+        for the first time: `engage_speed`, but at most `max_speed`, which also holds for an
+        `engage_speed` of 0.
+        """
+        return min(self.engage_speed or self.max_speed, self.max_speed)
 
     @property
     def acceleration(self) -> float:
@@ -315,6 +327,11 @@ class Settings(Section, frozen=True):
             yield (
                 f"$.tool.fault_speed: {self.tool.fault_speed} given; "
                 f"at least $.tool.max_speed = {self.tool.max_speed} needed"
+            )
+        if self.tool.engage_speed > max(self.tool.max_speed, ToolSettings().engage_speed):
+            yield (
+                f"$.tool.engage_speed: {self.tool.engage_speed} given; "
+                f"at most $.tool.max_speed = {self.tool.max_speed} accepted"
             )
         if self.reach.inner >= self.reach.outer:
             yield f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"

@@ -1,5 +1,5 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
-at the tick.
+at the tick. The clutch and the wish for the gripper are taken in here too.
 
 `plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
 """
@@ -75,6 +75,7 @@ class Intake:
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names = settings.joints.names
+        self._clutch_ticks = _stale_ticks("clutch", settings)
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
@@ -92,6 +93,7 @@ class Intake:
             joint_jump_speed=max(JOINT_JUMP_RADPS, float((np.array(joints.velocity) / per_rad).max())),
             plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
+            has_clutch=int(hands.clutch == "key"),
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
         self._mappings = {
@@ -117,10 +119,15 @@ class Intake:
         """
         self.advance(state, ticks)
         for event in samples:
-            if event.kind == "joints/state":
-                self.take_arm(state, event.value)
-            else:
-                self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+            match event.kind:
+                case "joints/state":
+                    self.take_arm(state, event.value)
+                case "clutch":
+                    state["clutch_until_tick"] = state["tick"] + self._clutch_ticks if event.value else 0
+                case "gripper/wish":
+                    state["gripper_wish"] = event.value
+                case _:
+                    self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
         return int(report(as_array(state), as_array(frame), self._parameters))
 
     def advance(self, state: Record, ticks: int) -> None:
