@@ -156,10 +156,10 @@ def _with_name(path: str, given: Any, kind: Any) -> str:
     """The path of an error with the name of the table for which msgspec writes `[...]`."""
     before, dots, after = path.partition("[...]")
     tables, node, _ = _at(before, given, inspect.type_info(kind)) if dots else (None, None, "")
-    if isinstance(node, inspect.DictType) and isinstance(node.value_type, inspect.StructType):
+    if isinstance(tables, dict) and isinstance(node, inspect.DictType):
         for name, table in tables.items():
             try:
-                msgspec.convert(table, node.value_type.cls)
+                msgspec.convert(table, node.value_type.cls)  # type: ignore[attr-defined]
             except msgspec.ValidationError:
                 return f"{before}.{name}{after}"
     return path
