@@ -24,6 +24,7 @@ GROUPS = {
     "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm"),
     "How to": (
         "install",
+        "calibrate",
         "record-takes",
         "other-recordings",
         "arrays",
