@@ -24,7 +24,7 @@ from service.settings.config import Settings
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, lines, recorded, write
 from service.trackers.calibration.collecting import (
-    Led,
+    LedTracks,
     LiveLed,
     distances_m,
     from_recording,
@@ -266,7 +266,7 @@ def _write(file: Path | None, record: CalibrationRecord, frame: str, args: argpa
     print(f"written into {file}; the earlier file is {kept.name}. Start the daemon again to use it")
 
 
-def _checked(led: Led, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
+def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
     """Print how far the hand is from where the tool has it; 1 if that is more than accepted."""
     if (track := led.hands.get(record.hand)) is None:
         raise CalibrationError(f"hands/{record.hand} does not arrive, which was calibrated on {record.date}")

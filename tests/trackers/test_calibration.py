@@ -28,7 +28,7 @@ from service.files.shipped import cell_of
 from service.files.track import Track
 from service.settings.config import HandSettings, Settings, load
 from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, record_path, recorded, write
-from service.trackers.calibration.collecting import Led, distances_m, held_tool, progress, solved
+from service.trackers.calibration.collecting import LedTracks, distances_m, held_tool, progress, solved
 from service.trackers.calibration.solver import (
     Calibration,
     CalibrationError,
@@ -217,7 +217,7 @@ def test_points_that_show_nothing_are_refused() -> None:
 BEGIN_NS = 10**18
 
 
-def led_of(held: HeldTool, side: str = "right", **hands: Any) -> Led:
+def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
     """The tracks of a held tool, and those of other hands."""
 
     def track(name: str, at_s: np.ndarray, poses: np.ndarray) -> Track:
@@ -228,7 +228,7 @@ def led_of(held: HeldTool, side: str = "right", **hands: Any) -> Led:
         return track(f"hands/{name}", held.hand_s, np.hstack([held.hand, np.tile([0.0, 0, 0, 1], (len(held.hand), 1))]))
 
     tool = track("tool", held.tool_s, np.hstack([held.tool, held.turn]))._replace(frame="base")
-    return Led({side: of_hand(side, held), **{name: of_hand(name, one) for name, one in hands.items()}}, tool)
+    return LedTracks({side: of_hand(side, held), **{name: of_hand(name, one) for name, one in hands.items()}}, tool)
 
 
 def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -> None:

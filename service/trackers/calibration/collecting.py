@@ -48,7 +48,7 @@ MAX_TOUCH_M = 0.015  # in which the hand moves at most this far
 LEAST_TOUCH_SAMPLES = 5
 
 
-class Led(NamedTuple):
+class LedTracks(NamedTuple):
     """The tracks of the hands that arrived, by side, in the tracker's unit, and of the tool; and
     remarks on what was left out.
     """
@@ -58,7 +58,7 @@ class Led(NamedTuple):
     remarks: Sequence[str] = ()
 
 
-class Found(NamedTuple):
+class SolvedHand(NamedTuple):
     """A calibration, the hand and frame that it is of, what it was computed from, and remarks."""
 
     calibration: Calibration
@@ -68,7 +68,7 @@ class Found(NamedTuple):
     remarks: Sequence[str]
 
 
-def from_recording(path: Path, settings: Settings | None) -> tuple[Led, Settings]:
+def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Settings]:
     """Hands and tool in a recording or demonstration with joint states, and the settings: those
     given, else those in the file. Raises RecordingError, CalibrationError.
     """
@@ -91,7 +91,7 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[Led, Settings
     if not hands:
         raise CalibrationError(f"{path} has no hands: a topic ending in hands/left or hands/right needed")
     tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
-    return Led(hands, tool), settings
+    return LedTracks(hands, tool), settings
 
 
 class LiveLed:
@@ -127,7 +127,7 @@ class LiveLed:
         """Numbers of unreadable messages, by key."""
         return self._capture.malformed
 
-    def led(self, *, most_states: int | None = None, since_s: float | None = None) -> Led:
+    def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
         """What arrived: with at most `most_states` poses of the tool, of the last `since_s` [s].
 
         Of a hand whose frame changed, only the samples in the newest frame are used.
@@ -149,7 +149,7 @@ class LiveLed:
                 logged = np.array([samples[i].arrived_ns for i in kept], np.int64)
                 rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept])
                 hands[side] = Track(ENDINGS[side], "", stamps, logged, rows, frame)
-        return Led(hands, self._tool(most_states, since_s), remarks)
+        return LedTracks(hands, self._tool(most_states, since_s), remarks)
 
     def _tool(self, most: int | None, since_s: float | None) -> Track:
         states = _lately(self._capture.samples[JOINT_STATES], since_s)
@@ -240,12 +240,12 @@ def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
     return track.stamps_ns, bool(abs(np.median(track.logged_ns - track.stamps_ns)) > 1e9 * CLOCK_TOLERANCE_S)
 
 
-def solved(led: Led, settings: Settings, corners: Vector, side: str | None, **more: int) -> Found:
+def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int) -> SolvedHand:
     """The calibration by the hand of a side; without one, by the hand that moves with the tool.
 
     Raises CalibrationError, which names the other hand if that one moves with the tool.
     """
-    found: dict[str, Found] = {}
+    found: dict[str, SolvedHand] = {}
     errors: dict[str, CalibrationError] = {}
     for one in SIDES:
         if (track := led.hands.get(one)) is None:
@@ -256,7 +256,7 @@ def solved(led: Led, settings: Settings, corners: Vector, side: str | None, **mo
         except CalibrationError as error:
             errors[one] = error
         else:
-            found[one] = Found(calibration, one, track.frame, held, [*led.remarks, *remarks])
+            found[one] = SolvedHand(calibration, one, track.frame, held, [*led.remarks, *remarks])
         if one == side and one in found:
             return found[one]
     if side is None and found:
@@ -276,7 +276,7 @@ def solved(led: Led, settings: Settings, corners: Vector, side: str | None, **mo
     raise errors[side] if side is not None else next(iter(errors.values()))
 
 
-class Progress(NamedTuple):
+class LedProgress(NamedTuple):
     """The coverage of the led tool so far, the expected accuracy [m] if known, and what to do."""
 
     coverage: Coverage
@@ -291,7 +291,7 @@ class Progress(NamedTuple):
         return f"led over {moved} cm, turned {turned}; accuracy {known}: {self.advice}"
 
 
-def progress(led: Led, settings: Settings, corners: Vector, side: str | None) -> Progress | None:
+def progress(led: LedTracks, settings: Settings, corners: Vector, side: str | None) -> LedProgress | None:
     """The progress of a calibration; None before the arm was heard."""
     if len(led.tool.poses) < 4:
         return None
@@ -306,7 +306,7 @@ def progress(led: Led, settings: Settings, corners: Vector, side: str | None) ->
         advice = f"{LEAD_APART.partition(',')[0]} along ({x:.1f}, {y:.1f}, {z:.1f})"
     elif cover.turned_rad[1] < LEAST_TURNED_RAD:
         advice = TURN_WRIST
-    return Progress(cover, std_m, advice or "continue")
+    return LedProgress(cover, std_m, advice or "continue")
 
 
 def lead(

@@ -20,7 +20,7 @@ from scipy.linalg import solve_triangular
 
 from service.core.frame import Vector
 
-SHARES = (0.4, 0.7, 0.85, 0.93, 0.97, 0.99)  # candidates, besides 0
+WANDERING_SHARES = (0.4, 0.7, 0.85, 0.93, 0.97, 0.99)  # candidates, besides 0
 WANDERING_TIMES_S = tuple(np.geomspace(0.2, 12.0, 8).tolist())  # candidates
 
 
@@ -59,7 +59,7 @@ def estimated(times_s: Vector, off: Vector, jacobian: Vector) -> WanderingNoise:
         determinants += np.log(np.maximum(np.abs(np.diag(triangle)), 1e-300)).sum()
         return float((count - parameters) * math.log(max(square, 1e-300)) + 2.0 * determinants)
 
-    middle = SHARES[len(SHARES) // 2]
+    middle = WANDERING_SHARES[len(WANDERING_SHARES) // 2]
     wandering = min((candidate(times_s, middle, time_s) for time_s in WANDERING_TIMES_S), key=cost)
-    shares = (share for share in (0.0, *SHARES) if share != middle)
+    shares = (share for share in (0.0, *WANDERING_SHARES) if share != middle)
     return min((wandering, *(candidate(times_s, share, wandering.time_s) for share in shares)), key=cost)

@@ -41,7 +41,7 @@ MIN_SAMPLES, MAX_FIT_SAMPLES = 100, 400  # of a hand that holds the tool
 MIN_POINTS = 4
 MIN_EXTENT_M = 0.05  # the positions must extend this far in their narrowest direction
 EXTENT_DEVIATIONS = 4.0  # extent of positions or orientations / their standard deviation
-UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
+TRACKER_UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
 MAX_SCALE_ERROR = 1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
 MIRRORED_RATIO = 0.5  # the axes are mirrored if reversing one reduces the residual to less than this share
 MAX_UNEXPLAINED = 0.5  # the residual of a hand at the tool is at most this share of the tool's motion
@@ -325,8 +325,8 @@ def _check_scale(matrix: Vector) -> None:
     scale = max(float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9)  # the widest direction has the least error
     if 1 / MAX_SCALE_ERROR < scale < MAX_SCALE_ERROR:
         return
-    unit = min(UNITS_M, key=lambda name: abs(math.log(UNITS_M[name] / scale)))
-    if not 1 / MAX_SCALE_ERROR < UNITS_M[unit] / scale < MAX_SCALE_ERROR:
+    unit = min(TRACKER_UNITS_M, key=lambda name: abs(math.log(TRACKER_UNITS_M[name] / scale)))
+    if not 1 / MAX_SCALE_ERROR < TRACKER_UNITS_M[unit] / scale < MAX_SCALE_ERROR:
         unit = ""
     found = f"the hand moves {1 / scale:.3g} times as far as the tool"
     if unit in ("mm", "cm"):
