@@ -50,7 +50,7 @@ def hand_model(given: Path | None, say: Callable[[str], object]) -> Path:
     if given is not None:
         return _made(model, given)
     if not model.exists():
-        say(f"taking the model of hands out of the package {PACKAGE} (36 MB, once)")
+        say(f"extracting the model of hands from the package {PACKAGE} (36 MB, once)")
         with tempfile.TemporaryDirectory() as folder:
             _made(model, _downloaded(Path(folder)))
     return model
