@@ -19,8 +19,10 @@ from service.contract.explain import ExplainedError, in_words
 from service.process.progress import say
 from service.settings.network import is_local
 from service.trackers.cell_view import Latest
+from service.trackers.hands_page import HandsPage
 from service.trackers.headset_page import HeadsetPage
 from service.trackers.mouse_page import MousePage
+from service.trackers.pinch import Pinches
 from service.trackers.web_server import Address, ServerCertificate, server_certificate
 
 ORDER_TIMEOUT_S = 5.0  # a page waits for the answer to its order for this long
@@ -61,9 +63,13 @@ def _web(args: argparse.Namespace) -> int:
         )
     with reached(args, None) as session, Tracker(session, args.cell, timeout_s=None) as tracker:
         client = Client(session, args.cell, timeout_s=ORDER_TIMEOUT_S)
-        kind = MousePage if args.mouse else HeadsetPage
-        latest = Latest(session, args.cell)
-        page = kind(tracker, client, latest, cell=args.cell, certificate=certificate, token=_token())
+        served = {"cell": args.cell, "certificate": certificate, "token": _token()}
+        page: HandsPage
+        if args.mouse:
+            page = MousePage(tracker, client, Latest(session, args.cell), **served)
+        else:
+            pinches = Pinches(session, args.cell, clutch=args.pinch_clutch, gripper=args.pinch_gripper)
+            page = HeadsetPage(tracker, client, Latest(session, args.cell), pinches=pinches, **served)
 
         def listening(address: Address) -> None:
             shown = Address(_name_for_browsers(address.host, certificate), address.port)

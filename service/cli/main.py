@@ -90,6 +90,10 @@ def parser() -> argparse.ArgumentParser:
         "port of this machine)"
     )
     option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
+    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
+    c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
+    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
+    c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
     c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
@@ -171,6 +175,10 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--view", "DEG", view, 60.0, type=within(float, 20, 150, " degrees"))
     model = "of --camera: hand_landmarker.task, or the wheel of mediapipe 0.10.21 (default: it is downloaded once)"
     option(c, "--model", "FILE", model)
+    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
+    c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
+    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
+    c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
     c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     _reach(c)
 

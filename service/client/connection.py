@@ -88,12 +88,19 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Publish the measured closure of the gripper, 0 (open) to 1 (closed), for
         demonstrations.
         """
-        (value,) = _numbers("closure", [closure], 1)
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"closure: {closure} given; {FORMS[1]} needed")
-        self._publish(
-            {"gripper/state": lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))}, stamp_ns
-        )
+        self._publish_closure("gripper/state", closure, stamp_ns)
+
+    def clutch(self, pressed: bool) -> None:
+        """Publish that the clutch is pressed, or released; while it is pressed, again at 10 Hz or
+        more.
+        """
+        if not isinstance(pressed, bool):
+            raise ValueError(f"clutch: {pressed!r} given; True or False needed")
+        self._publish({"clutch": lambda _: cdr.encode_bool(pressed)}, None)
+
+    def wish_gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
+        """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
+        self._publish_closure("gripper/wish", closure, stamp_ns)
 
     def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
         """Publish all objects on the bench, for viewers and recordings."""
@@ -130,6 +137,12 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _publish_closure(self, suffix: str, closure: float, stamp_ns: int | None) -> None:
+        (value,) = _numbers("closure", [closure], 1)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"closure: {closure} given; {FORMS[1]} needed")
+        self._publish({suffix: lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))}, stamp_ns)
 
     def _publish(self, messages: dict[str, Callable[[int], bytes]], stamp_ns: int | None) -> None:
         """Publish messages that are encoded for a stamp [ns]; None: the time when all of them are

@@ -153,7 +153,7 @@ class Watch(_Received, Iterator[Any]):
 
     Poses have `stamp_ns`, `frame_id`, `position` [m] and `orientation`, and `tool/target` also its
     `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
-    of SceneObject, and `status` a `service.contract.requests.Status`.
+    of SceneObject, `clutch` a bool, `gripper/wish` a closure from 0 to 1, and `status` a Status.
 
     It waits for the next message. After `timeout_s` [s] without one it yields None; None: never.
     A slow loop gets the newest 256 messages. Messages that cannot be decoded are skipped:

@@ -23,6 +23,7 @@ from service.contract.messages import WireError
 from service.trackers import web_server
 from service.trackers.cell_view import Latest, carried_out
 from service.trackers.hand_message import PageHands, decode_hands, is_ping, pong
+from service.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
 MAX_PAGE_MESSAGE_BYTES = 256
@@ -44,10 +45,17 @@ class BrowserHands:
     """
 
     def __init__(
-        self, tracker: Tracker, client: Client, latest: Latest, *, frame: str, has_token: Callable[[str], bool]
+        self,
+        tracker: Tracker,
+        client: Client,
+        latest: Latest,
+        *,
+        frame: str,
+        has_token: Callable[[str], bool],
+        pinches: Pinches | None = None,
     ) -> None:
         self._tracker, self._client, self._latest, self._frame = tracker, client, latest, frame
-        self._has_token = has_token
+        self._has_token, self._pinches = has_token, pinches
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
         self._owned_s = 0.0
@@ -122,6 +130,8 @@ class BrowserHands:
             self._tracker.publish(
                 hand.side, hand.position, hand.orientation, stamp_ns=hands.stamp_ns, frame_id=frame_id
             )
+        if self._pinches is not None:
+            self._pinches.publish({hand.side: hand.pinch_m for hand in hands.hands}, hands.stamp_ns)
         self.published += 1
         return True
 

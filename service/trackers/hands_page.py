@@ -11,6 +11,7 @@ from aiohttp import web
 from service.client import Client, Tracker
 from service.trackers.browser_hands import NO_TOKEN, BrowserHands
 from service.trackers.cell_view import Latest
+from service.trackers.pinch import Pinches
 from service.trackers.web_server import HTML, INLINE, ServerCertificate, WebServer, answer, filled
 
 PAGE_FOLDER = Path(__file__).parent
@@ -36,11 +37,12 @@ class HandsPage:
         certificate: ServerCertificate | None = None,
         token: str = "",
         more: Iterable[web.AbstractRouteDef] = (),
+        pinches: Pinches | None = None,
         **fields: str,
     ) -> None:
         self._page, self._scripts = PAGE_FOLDER / page, tuple(scripts)
         self._fields = {"cell": html.escape(cell), "frame": frame} | fields
-        self.hands = BrowserHands(tracker, client, latest, frame=frame, has_token=self.has_token)
+        self.hands = BrowserHands(tracker, client, latest, frame=frame, has_token=self.has_token, pinches=pinches)
         routes = [web.get("/", self._front), web.get("/hands", self.hands.socket), *more]
         self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 

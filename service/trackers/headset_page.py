@@ -7,6 +7,7 @@ from __future__ import annotations
 from service.client import Client, Tracker
 from service.trackers.cell_view import Latest
 from service.trackers.hands_page import HandsPage
+from service.trackers.pinch import Pinches
 from service.trackers.web_server import ServerCertificate
 
 FRAME = "webxr"  # x to the right, y up, -z ahead of where the headset was when its floor was set, metres
@@ -24,6 +25,7 @@ class HeadsetPage(HandsPage):
         cell: str,
         certificate: ServerCertificate | None = None,
         token: str = "",
+        pinches: Pinches | None = None,
     ) -> None:
         super().__init__(
             *(tracker, client, latest),
@@ -33,4 +35,5 @@ class HeadsetPage(HandsPage):
             frame=FRAME,
             certificate=certificate,
             token=token,
+            pinches=pinches,
         )

@@ -136,6 +136,11 @@ PUBLISHED: dict[str, tuple[Callable[[Connection], None], dict[str, Any]]] = {
         lambda cell: cell.gripper(0.25, stamp_ns=8),
         {"gripper/state": JointState(8, ("gripper",), (0.25,), ())},
     ),
+    "a pressed clutch": (lambda cell: cell.clutch(True), {"clutch": True}),
+    "the gripper that a person wants": (
+        lambda cell: cell.wish_gripper(1.0, stamp_ns=8),
+        {"gripper/wish": 1.0},
+    ),
     "objects": (
         lambda cell: cell.objects([BOX], stamp_ns=9),
         {"objects": (BOX,)},
@@ -162,6 +167,7 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "a text": (lambda cell: cell.hands(left="abc"), "left: 'abc' given; x y z"),  # type: ignore[arg-type]
     "one number": (lambda cell: cell.hands(left=5), "left: 5 given; x y z"),  # type: ignore[arg-type]
     "no rotation": (lambda cell: cell.tool((0, 0, 0, 0, 0, 0, 2)), r"tool: quaternion .* has norm 2; 1 needed"),
+    "no clutch": (lambda cell: cell.clutch(1), "clutch: 1 given; True or False needed"),  # type: ignore[arg-type]
     "too far closed": (lambda cell: cell.gripper(1.5), r"closure: 1.5 given; 0 \(open\) to 1 \(closed\) needed"),
     "no closure": (lambda cell: cell.gripper(None), r"closure: \[None\] given; 0 \(open\)"),  # type: ignore[arg-type]
     "a shape": (lambda cell: cell.objects([BOX._replace(shape="cone")]), "shape 'cone' given; one of box, ball, cyl"),

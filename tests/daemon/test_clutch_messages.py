@@ -19,15 +19,14 @@ from support.paths import ROOT
 CLUTCHED = f'{LISTENING}\n[hands]\nclutch = "key"\n'
 SWITCH = """
 import sys, threading, time
-from service.client import open_session
-from service.contract import cdr
+from service.client import connect
 
 released = threading.Event()
 threading.Thread(target=lambda: (sys.stdin.readline(), released.set()), daemon=True).start()
-with open_session(connect=[sys.argv[1]]) as session:
+with connect(sys.argv[1]) as cell:
     while not released.wait(0.02):
-        session.put("thirdhand/clutch", cdr.encode_bool(True))
-    session.put("thirdhand/clutch", cdr.encode_bool(False))
+        cell.clutch(True)
+    cell.clutch(False)
 """
 
 
