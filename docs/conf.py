@@ -25,6 +25,7 @@ GROUPS = {
     "How to": (
         "install",
         "mouse",
+        "headset",
         "record-takes",
         "other-recordings",
         "arrays",
