@@ -76,9 +76,12 @@ class Tab:
         self._call("Emulation.setDeviceMetricsOverride", screen, self._session)
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`."""
+        """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`.
+
+        Its answer is not waited for: it comes with the next picture, which may be late.
+        """
         button = {"button": "none" if kind == "Wheel" else "left", "buttons": int(kind in ("Pressed", "Moved"))}
-        self._call(
+        self._post(
             "Input.dispatchMouseEvent",
             {"type": f"mouse{kind}", "x": x, "y": y, "clickCount": 1} | button | more,
             self._session,
