@@ -163,7 +163,7 @@ def main(arguments: list[str] | None = None) -> int:
             noise_std=args.noise_mm / 1000,
         )
         if args.tracked_hands is not None:
-            script = TrackedHands(scene, timeout_s=args.tracked_hands)
+            script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
         own = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None

@@ -359,7 +359,7 @@ def _play(
             waited = now_s - ready_s
             if tracked and not asked and (tracked.foreign or not tracked.ready):
                 asked = True
-                say(f"waiting for both hands in frame {messages.BASE}{tracked.refusal}")
+                say(f"waiting for both hands{tracked.refusal}")
             if not bench.script.ready and waited > live.wait_s:
                 raise BenchError(f"no hands arrived within {live.wait_s:g} s{tracked.refusal if tracked else ''}")
             if bench.script.ready and bench.settled(waited):

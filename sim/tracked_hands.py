@@ -9,7 +9,9 @@ import numpy as np
 
 from service.contract.messages import BASE, PoseStamped, SceneObject
 from service.contract.records import SIDES
+from service.files.demonstration_reader import from_tracker, is_by_tracker
 from service.settings import palette
+from service.settings.config import Settings
 from sim.scene import ARRIVED_M, HAND_ORIENTATION, Point, Scene
 from sim.script import Array, HandMotions, PointMotion, TaskProgress
 from sim.world import LEVEL
@@ -49,20 +51,25 @@ class TrackedHands:
 
     seed = 0
 
-    def __init__(self, scene: Scene, *, timeout_s: float = math.inf) -> None:
-        """The task ends `timeout_s` [s] after its begin, reached or not."""
+    def __init__(self, scene: Scene, settings: Settings, *, timeout_s: float = math.inf) -> None:
+        """The settings map the hands to frame `base`. The task ends `timeout_s` [s] after its
+        begin, reached or not.
+        """
         self.scene = scene
-        self._timeout_s, self._places = timeout_s, hand_places(scene)
-        self._newest: dict[str, PoseStamped] = {}
-        self.foreign = ""  # a frame other than `base` in which hands arrived; they are ignored
+        self._settings, self._timeout_s, self._places = settings, timeout_s, hand_places(scene)
+        self._newest: dict[str, Point] = {}  # [m] frame `base`
+        self.foreign = ""  # a frame that the settings do not know, in which hands arrived; they are ignored
         self.begin()
 
     def receive(self, side: str, pose: PoseStamped) -> None:
         """Store a sample of one hand. For any thread."""
-        if pose.frame_id in ("", BASE):
-            self._newest[side] = pose
-        else:
+        if pose.frame_id not in self._settings.tracker_frames:
             self.foreign = pose.frame_id
+            return
+        hands, x, y, z = self._settings.hands_in(pose.frame_id), *pose.position
+        if is_by_tracker(f"hands/{side}", pose.frame_id, hands):
+            x, y, z = from_tracker(np.array([pose.position]), hands)[0].tolist()
+        self._newest[side] = x, y, z
 
     @property
     def refusal(self) -> str:
@@ -87,7 +94,7 @@ class TrackedHands:
         """The newest positions of both hands; before the first sample, the scene's start."""
         scene = self.scene
         left, right = (
-            PointMotion(np.array(self._newest[side].position if side in self._newest else start), AT_REST, AT_REST)
+            PointMotion(np.array(self._newest.get(side, start)), AT_REST, AT_REST)
             for side, start in zip(SIDES, (scene.left_start, scene.right_start), strict=True)
         )
         return HandMotions(left, right)

@@ -11,7 +11,7 @@ import pytest
 
 from service.contract.messages import BASE, PoseStamped
 from service.core.controller import Controller
-from service.settings.config import Settings, robot_description
+from service.settings.config import Settings, parse, robot_description
 from sim.bench import Bench, TaskEvents
 from sim.closed_loop import ClosedLoop, begin_when_settled
 from sim.scene import HAND_ORIENTATION, Point
@@ -48,7 +48,7 @@ def played(*, stages: int) -> tuple[TaskEvents, list[str], TrackedHands]:
     """The events when a person goes to the first places only, what was shown, and the hands."""
     settings = msgspec.structs.replace(Settings(), rate_hz=100)
     controller = Controller(settings, taught(), urdf=robot_description(settings))
-    hands = TrackedHands(SCENE, timeout_s=TIMEOUT_S)
+    hands = TrackedHands(SCENE, settings, timeout_s=TIMEOUT_S)
     player = Player(hands, stages=stages)
     with Bench(hands, settings=settings) as bench:
         loop = ClosedLoop(bench, direct=player.direct)
@@ -74,14 +74,33 @@ def test_a_person_who_stops_after_the_handover_misses_the_rest_at_the_time_out()
     assert msgspec.json.decode(msgspec.json.encode(events))["grasp"]["error_mm"] is None
 
 
-@pytest.mark.parametrize("frame", ["webxr", "webxr1"])
-def test_hands_in_another_frame_are_ignored_with_a_remark(frame: str) -> None:
-    hands = TrackedHands(SCENE)
+HEADSET = """
+[hands]
+frame = "webxr"
+base_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, 0.5]
+[trackers.unity]
+unit = "cm"
+axes = "left-handed"
+base_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, 0.5]
+"""
+
+
+@pytest.mark.parametrize(
+    ("frame", "position"),
+    [(BASE, (0.9, 0.1, 0.05)), ("webxr", (0.1, 0.8, -0.55)), ("unity", (10.0, 80.0, 55.0))],
+)
+def test_hands_are_mapped_as_the_daemon_maps_them(frame: str, position: Point) -> None:
+    hands = TrackedHands(SCENE, parse(HEADSET, origin="a test"))
     for side in ("left", "right"):
-        hands.receive(side, PoseStamped(1, frame, (0.1, 0.2, 0.3), HAND_ORIENTATION))
-    assert not hands.ready
-    assert frame in hands.refusal
-    assert tuple(hands.truth(0.0).left.position) == SCENE.left_start
-    for side in ("left", "right"):
-        hands.receive(side, PoseStamped(1, BASE, (0.1, 0.2, 0.3), HAND_ORIENTATION))
+        hands.receive(side, PoseStamped(1, frame, position, HAND_ORIENTATION))
     assert hands.ready
+    assert tuple(hands.truth(0.0).left.position) == pytest.approx((0.9, 0.1, 0.05))
+
+
+def test_hands_in_an_unknown_frame_are_ignored_with_a_remark() -> None:
+    hands = TrackedHands(SCENE, parse(HEADSET, origin="a test"))
+    for side in ("left", "right"):
+        hands.receive(side, PoseStamped(1, "webxr1", (0.1, 0.2, 0.3), HAND_ORIENTATION))
+    assert not hands.ready
+    assert "webxr1" in hands.refusal
+    assert tuple(hands.truth(0.0).left.position) == SCENE.left_start
