@@ -17,10 +17,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from support import chromium
 from support.paths import ROOT
 
+Array = NDArray[np.float64]
 IWER = "2.5.0"
+KNUCKLES = ("wrist", "index-finger-phalanx-proximal", "pinky-finger-phalanx-proximal")
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "thirdhand-tests"
 # Runs ahead of the page: a headset with two hands. In each frame `path(seconds)`, if it is set,
 # moves them, and `truth` gets a row: time [ms since 1970], side, position [m], quaternion x y z w.
@@ -147,3 +152,15 @@ def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> 
         finally:
             watchdog.cancel()
             process.kill()
+
+
+def palm_in_hand(joints: dict[str, list[float]], side: str) -> tuple[Array, Array]:
+    """Position (3,) [m] and axes (3, 3) of the palm in the emulated hand, from the offsets of its
+    joints, as docs/headset.md defines it.
+    """
+    wrist, index, little = (np.array(joints[name])[12:15] for name in KNUCKLES)
+    back = wrist - (index + little) / 2
+    across = index - little if side == "left" else little - index
+    axes = np.column_stack([across, np.cross(back, across), back])
+    turn, triangle = np.linalg.qr(axes[:, ::-1])  # z first, then y
+    return (wrist + index + little) / 3, (turn * np.sign(np.diag(triangle)))[:, ::-1]

@@ -44,7 +44,6 @@ STILL = """path = () => ({left: {position: [-.25, 1, -.4], quaternion: [0, 0, 0,
                           right: {position: [.25, 1, -.4], quaternion: [0, 0, 0, 1]}})"""
 # In front of a bench of 0.75 m; the browser of a busy machine draws few pictures.
 CELL = '[hands]\nframe = "webxr"\nbase_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, 0.5]\nstale_ms = 1000.0\n'
-KNUCKLES = ("wrist", "index-finger-phalanx-proximal", "pinky-finger-phalanx-proximal")
 
 
 @pytest.fixture
@@ -54,18 +53,6 @@ def hearing() -> Iterator[tuple[zenoh.Session, str]]:
         yield session, endpoints(session)[0]
 
 
-def palm_in_hand(joints: dict[str, list[float]], side: str) -> tuple[Array, Array]:
-    """Position (3,) [m] and axes (3, 3) of the palm in the emulated hand, from the offsets of its
-    joints, as docs/headset.md defines it.
-    """
-    wrist, index, little = (np.array(joints[name])[12:15] for name in KNUCKLES)
-    back = wrist - (index + little) / 2
-    across = index - little if side == "left" else little - index
-    axes = np.column_stack([across, np.cross(back, across), back])
-    turn, triangle = np.linalg.qr(axes[:, ::-1])  # z first, then y
-    return (wrist + index + little) / 3, (turn * np.sign(np.diag(triangle)))[:, ::-1]
-
-
 def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Array, Array]:
     """Errors of the poses that were received against the nearest in the truth: [m], [rad], and of
     their stamps [s].
@@ -73,7 +60,7 @@ def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Arra
     rows = np.array(
         [[row[0], *row[2:]] for row in json.loads(tab.ask("JSON.stringify(truth)")) if row[1] == side], dtype=float
     )
-    at, axes = palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
+    at, axes = headset.palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
     turns = Rotation.from_quat(rows[:, 4:8])
     places, palms = rows[:, 1:4] + turns.apply(at), turns * Rotation.from_matrix(axes)
     found = []
