@@ -23,10 +23,10 @@ PALM = (WRIST, INDEX, MIDDLE, RING, LITTLE)
 AVERAGE_PALM = np.array(
     [[0.0, 0.0, 0.0], [0.505, 0.125, 0.0], [0.515, 0.0, 0.0], [0.475, -0.115, 0.0], [0.41, -0.215, 0.0]]
 )
-CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # their mean is the palm's position
-_AHEAD = AVERAGE_PALM[CORNERS].sum(axis=0) / np.linalg.norm(AVERAGE_PALM[CORNERS].sum(axis=0))
+PALM_CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # their mean is the palm's position
+_AHEAD = AVERAGE_PALM[PALM_CORNERS].sum(axis=0) / np.linalg.norm(AVERAGE_PALM[PALM_CORNERS].sum(axis=0))
 MAX_ERROR = 0.02  # root mean square of x / z and y / z; a larger one is that of no palm
-STEPS = 10  # of Gauss and Newton; the pose changes by less than 0.1 mm in the last
+NEWTON_STEPS = 10  # of Gauss and Newton; the pose changes by less than 0.1 mm in the last
 MAX_TURN_RAD = 0.3  # of one step
 RANK_SHARE = 1e-3  # directions that the picture hardly tells remain as they began
 
@@ -76,7 +76,7 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
     roughly = shape[list(PALM)] - shape[list(PALM)].mean(axis=0)
     turn = Rotation.align_vectors(roughly, palm)[0]
     at = where_seen(turn.apply(palm), u)
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         turned = turn.apply(palm)
         x, y, z = (turned + at).T
         if z.min() < hand_length / 2:
@@ -93,7 +93,7 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
         return None
     back = np.array([0.0, 0.0, 1.0 if side == "right" else -1.0])
     axes = np.stack([np.cross(back, -_AHEAD), back, -_AHEAD], axis=1)
-    return PalmPose((turn.apply(palm) + at)[CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
+    return PalmPose((turn.apply(palm) + at)[PALM_CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
 
 
 def _crossed(vectors: Array) -> Array:

@@ -37,7 +37,7 @@ class Pinches:
             apart_m = distances_m.get(self._clutch, PARTED_M)
             self._is_pressed = apart_m < (PARTED_M if self._is_pressed else PINCHED_M)
             self._publishers["clutch"].put(cdr.encode_bool(self._is_pressed))
-        if self._gripper in distances_m:
+        if self._gripper is not None and self._gripper in distances_m:
             open_share = (distances_m[self._gripper] - PINCHED_M) / (OPEN_M - PINCHED_M)
             closure = 1.0 - min(max(open_share, 0.0), 1.0)
             self._publishers["gripper/wish"].put(cdr.encode_joints(JointState(stamp_ns, (GRIPPER,), (closure,), ())))

@@ -34,10 +34,10 @@ from sim.experiments.results import Array, ExperimentError, Options, Results, br
 PACKAGES = {"three": "three@0.187.0", "hands": "@webxr-input-profiles/assets@1.0.20"}
 HANDS_IN_PACKAGE = "package/dist/profiles/generic-hand/"
 HAND_LENGTH_M = 0.178  # of these hands, from the wrist to the tip of the middle finger
-VIEW_DEG, WIDTH, HEIGHT = 56.0, 640, 480
+VIEW_DEG, WIDTH_PX, HEIGHT_PX = 56.0, 640, 480
 PICTURES, RATE_HZ = 40, 15.0  # of each sequence
 DISTANCES_M = (0.4, 0.55, 0.75)
-LENS = Lens.of_view(VIEW_DEG, WIDTH, HEIGHT)
+LENS = Lens.of_view(VIEW_DEG, WIDTH_PX, HEIGHT_PX)
 SCALES = {"rigid palm, true hand length": 1.0, "5 % too short": 0.95, "5 % too long": 1.05}
 BROWSER_OPTIONS = (
     "--headless=new",
@@ -198,7 +198,7 @@ async def _drawn(folder: Path, chromium: str, frames: list[dict[str, list[float]
         return web.FileResponse(Path(__file__).with_name("rendered_hands.html"))
 
     async def poses(_: web.Request) -> web.Response:
-        return web.json_response({"width": WIDTH, "height": HEIGHT, "focal": LENS.focal, "frames": frames})
+        return web.json_response({"width": WIDTH_PX, "height": HEIGHT_PX, "focal": LENS.focal, "frames": frames})
 
     async def picture(request: web.Request) -> web.Response:
         got.append(await request.json())

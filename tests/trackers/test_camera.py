@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from service.trackers import hand_model
 from service.trackers.camera import CameraError, HandCamera, pictures
 from service.trackers.hand_model import HandModelError
-from service.trackers.palm import AVERAGE_PALM, CORNERS, PALM, Array, Lens, palm_pose
+from service.trackers.palm import AVERAGE_PALM, PALM, PALM_CORNERS, Array, Lens, palm_pose
 
 LENS, LENGTH_M = Lens(600.0, 640, 480), 0.18
 HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None
@@ -26,7 +26,7 @@ def seen(turn: Rotation, centre: Array, length: float = LENGTH_M) -> tuple[Array
     shape[list(PALM)] = turn.apply(length * AVERAGE_PALM)
     at = shape + centre
     picture = LENS.focal * at[:, :2] / at[:, 2:] / [LENS.width, LENS.height] + 0.5
-    return picture, shape, at[list(PALM)][CORNERS].mean(axis=0)
+    return picture, shape, at[list(PALM)][PALM_CORNERS].mean(axis=0)
 
 
 def drawn(seed: int) -> tuple[Rotation, Array]:
