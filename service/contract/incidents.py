@@ -218,7 +218,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "a hand where the other hand was, and the other where it was; accepted after {hands.swapped_s s}",
             "let the tracker see both hands apart for a moment: it takes left for right"),
         Incident(Cause.WRONG_FRAME, None, "wrong frame",
-            "a pose in a frame that is neither `base` nor `[hands] frame`",
+            "a pose in a frame that is neither `base` nor one of `[hands] frame` and `[trackers.NAME]`",
             "find `[hands] frame` and `base_from_tracker` by `thirdhand calibrate`, also after the tracker was "
             "recentred, which changes its frame; or publish in `base`"),
         Incident(Condition.MALFORMED, None, "malformed",

@@ -214,7 +214,7 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
         cell.tell(("left", pose(k + 1, frame="camera")))
         cell.status(100 + k / 10)
     assert [line.split(":")[0] for line in cell.log] == ["left hand"]
-    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: set [hands] f" in cell.log[0]
+    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: find [hands]" in cell.log[0]
     cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse("a header of another kind")
     cell.status(103.0)
     assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
