@@ -24,6 +24,11 @@ GROUPS = {
     "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm"),
     "How to": (
         "install",
+        "mouse",
+        "headset",
+        "camera",
+        "calibrate",
+        "clutch",
         "record-takes",
         "other-recordings",
         "arrays",

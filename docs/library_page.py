@@ -36,8 +36,16 @@ CLIENT = """# The Python client
 <!-- Written by `python docs/library_page.py` from the docstrings in service/client: change it there. -->
 
 This page lists what a program in Python needs to talk to a running daemon. All names are those of
-`import service.client`. The programs in [examples](../examples) use them, and the
-[wire](wire.md) describes the messages behind them.
+`import thirdhand`; inside the project the same names are those of `import service.client`. The
+programs in [examples](../examples) use them, and the [wire](wire.md) describes the messages behind
+them.
+
+A program on another machine needs only the client: `pip install ./service/client` in a clone
+installs the distribution `thirdhand-client`, for Python 3.10 or later on Linux, macOS and Windows,
+with `eclipse-zenoh` and `msgspec`. `pip wheel --no-deps ./service/client` builds its wheel. It may
+be installed beside `thirdhand`: the two share no file, and the service's own client is then
+imported. The package `service` is found only after `import thirdhand` there, and a package of your
+own with that name must be renamed.
 
 Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
 radians, or in metres if they slide.
@@ -51,11 +59,12 @@ KMP_GROUPS = {
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
 }
 CLIENT_GROUPS = {
-    "Connect": ("client_settings", "ClientSettings", "open_session", "endpoints"),
+    "Connect": ("connect", "Connection", "Watch", "SceneObject"),
     "Requests": ("Client",),
     "Hands and joints": ("Tracker", "Follower", "Command"),
+    "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
-    "Errors": ("UnreachableError", "StartingError", "RefusedError"),
+    "Errors": ("UnreachableError", "StartingError", "RefusedError", "SettingsError"),
 }
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of service.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
@@ -109,10 +118,15 @@ def _described(name: str, value: Any) -> Iterator[str]:
     for part, member in inspect.getmembers(value):
         module = getattr(inspect.unwrap(getattr(member, "fget", getattr(member, "func", member))), "__module__", "")
         ours = (module or "").startswith(("kmp.", "service."))
-        if part.startswith("_") or not ours or part in INSIDE or not member.__doc__:
+        if part.startswith("_") or not ours or part in INSIDE or not member.__doc__ or _is_inherited(value, part):
             continue
         yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
         yield inspect.cleandoc(member.__doc__)
+
+
+def _is_inherited(value: type, part: str) -> bool:
+    """True if a class of the client has a member from another one, which is listed there."""
+    return any(part in vars(base) for base in value.__mro__[1:] if base.__module__.startswith("service."))
 
 
 def _signature(name: str, value: Any) -> str:

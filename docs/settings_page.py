@@ -60,10 +60,18 @@ def page() -> str:
         + "".join(
             part
             for field in types.type_info(config.Settings).fields  # type: ignore[attr-defined]
-            if isinstance(field.type, types.StructType)
-            for part in _section(field.type.cls, field.name)
+            for kind, name in _tables(field)
+            for part in _section(kind, name)
         )
     )
+
+
+def _tables(field: types.Field) -> Iterator[tuple[Any, str]]:
+    """The class of a table of the file, and its heading; none for a single setting."""
+    if isinstance(field.type, types.StructType):
+        yield field.type.cls, field.name
+    if isinstance(field.type, types.DictType):
+        yield field.type.value_type.cls, f"{field.name}.NAME"  # type: ignore[attr-defined]
 
 
 def _section(kind: Any, name: str) -> Iterator[str]:
@@ -73,7 +81,7 @@ def _section(kind: Any, name: str) -> Iterator[str]:
         yield f"\n## [{name}]\n\n{_paragraphs(kind)}\n"
     yield "\n| setting | default | accepted | meaning |\n|---|---|---|---|\n"
     for field in types.type_info(kind).fields:  # type: ignore[attr-defined]
-        if not isinstance(field.type, types.StructType):
+        if not isinstance(field.type, types.StructType | types.DictType):
             cells = (f"`{field.name}`", _value(_default(field)), _accepted(field.type), comments.get(field.name, ""))
             yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
 

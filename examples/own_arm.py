@@ -23,6 +23,7 @@ class FakeArm:
 
     period_s: float = 0.002  # at which the drive takes what is written
     takes_velocity: bool = False  # it is led by positions, and keeps to them by itself
+    lag_s: float = 0.0  # of its servo, which `thirdhand doctor` measures: what is written leads by it
     speed_limits: SpeedLimits | None = None  # less than in `limits` at some positions, where the drive has such
 
     def __init__(self, settings: Settings) -> None:
@@ -45,6 +46,9 @@ class FakeArm:
         return Measured(self.position, self.velocity, self._read_s - before)
 
     def write(self, position: np.ndarray, velocity: np.ndarray) -> None:  # where to be when the next one does
+        self.move(np.clip(position + self.lag_s * velocity, self.limits.lower, self.limits.upper), velocity)
+
+    def move(self, position: np.ndarray, velocity: np.ndarray) -> None:  # a servo is late; this one is not
         self.position, self.velocity = position, velocity
 
 

@@ -6,6 +6,7 @@ from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import argparse
+import math
 import signal
 import sys
 import threading
@@ -22,7 +23,7 @@ from service.contract.printable import printable_lines
 from service.daemon.launch import ENGINES, LaunchError, engine_of
 from service.files.shipped import ARMS, cell_of
 from service.process import interrupt
-from service.settings.arm_description import SettingsError, UnreadableError
+from service.settings.file_content import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, ScriptPause
 
@@ -53,6 +54,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)")
     hands_only = "publish hands and things only, and evaluate a real or other arm by its joint states"
     p.add_argument("--hands-only", action="store_true", help=hands_only)
+    tracked = (
+        "receive the hands that a tracker or `thirdhand hands` publishes, instead of playing a script; the scene shows "
+        "where they belong next. The run ends after S seconds (default: once all events are reached)"
+    )
+    p.add_argument("--tracked-hands", metavar="S", nargs="?", type=float, const=math.inf, help=tracked)
     option(p, "--seed", None, "the seed for scatter, tremor and noise of the hands (default: the scene's)", type=int)
     once = "end after one run; its report goes to standard output unless --output says otherwise"
     p.add_argument("--once", action="store_true", help=once)
@@ -61,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # an option of earlier versions, like --duration
     p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
     p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    option(p, "--wait", "S", "wait this long for the first command", 60.0)
+    option(p, "--wait", "S", "wait this long for the first command, and again for tracked hands", 60.0)
     option(p, "--hands-rate", "HZ", "the rate of the hand poses, 30 to 500", 100, type=int)
     option(p, "--speed", "X", "the speed of the hands; 1 is as demonstrated", 1.0, type=float)
     for name, about in (
@@ -102,10 +108,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except SettingsError as error:
         p.error(str(error))
-    from sim.bench import Bench
+    from sim.bench import Bench, BenchHands
     from sim.engines import world_of
     from sim.network import BenchError, Dropout, Live, RunReport, run
     from sim.observed_world import ObservedWorld
+    from sim.tracked_hands import TrackedHands
 
     world = ObservedWorld if args.hands_only else world_of(args.engine)
     stop, came = threading.Event(), list[int]()
@@ -143,7 +150,7 @@ def main(arguments: list[str] | None = None) -> int:
                 file.write(line)
 
     try:
-        script = HandScript(
+        script: BenchHands = HandScript(
             scene,
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
@@ -155,6 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
             tremor_rms=args.tremor_mm / 1000,
             noise_std=args.noise_mm / 1000,
         )
+        if args.tracked_hands is not None:
+            script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
         own = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None

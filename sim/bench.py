@@ -10,9 +10,10 @@ while not bench.finished:
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -23,8 +24,8 @@ from service.client import BRAKE_AFTER_S
 from service.contract.messages import BASE, SceneObject
 from service.settings.config import Settings
 from sim.engines import world_of
-from sim.scene import GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND
-from sim.script import GRIP_S, HandMotions, HandScript
+from sim.scene import ARRIVED_M, GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND, Scene
+from sim.script import GRIP_S, Array, HandMotions, TaskProgress
 from sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_RANGE_S = (0.5, 2.5)  # shortest and longest time for the arm to settle before the script begins
@@ -38,7 +39,8 @@ STILL_WITHIN = 0.005  # [m] a resting tool moves by up to this, because the hand
 
 class TaskEvent(msgspec.Struct, frozen=True):
     """The result of one event: True if the tool reached it, the smallest distance [mm], and the
-    time of the script [s] at which the tool first reached it or was nearest.
+    time of the script [s] at which the tool first reached it or was nearest. The distance is
+    infinite (null in JSON) if the hands were never at the event's places.
     """
 
     reached: bool
@@ -96,6 +98,29 @@ class _Watch:
         )
 
 
+class BenchHands(Protocol):
+    """The hands at the bench: a `HandScript`, or the `TrackedHands` of a person."""
+
+    scene: Scene
+    seed: int
+
+    @property
+    def ready(self) -> bool: ...
+
+    @property
+    def duration_s(self) -> float: ...
+
+    def begin(self) -> None: ...
+
+    def truth(self, t: float) -> HandMotions: ...
+
+    def sample(self, t: float) -> tuple[Array, Array]: ...
+
+    def progress(self, t: float, reached: int) -> TaskProgress: ...
+
+    def places(self) -> tuple[SceneObject, ...]: ...
+
+
 class Bench:
     """The bench, which waits for `begin` with the arm at its posture, the board in the tool, and
     the hands at the script's start.
@@ -103,7 +128,7 @@ class Bench:
 
     def __init__(
         self,
-        script: HandScript,
+        script: BenchHands,
         *,
         settings: Settings | None = None,
         posture: Floats | None = None,
@@ -157,6 +182,7 @@ class Bench:
     def begin(self) -> None:
         """Begin the script: hands move from the next step on."""
         self._lay_out()
+        self.script.begin()
         self._ticks_since_begin, self._direction = 0, 1
 
     def turn_back(self) -> None:
@@ -295,28 +321,28 @@ class Bench:
     def _watch(self, seen: Observation) -> None:
         """Detect the events, by the distances in the rests after the motions."""
         world, scene = self.world, self.scene
-        script_s = self.script.clock.at(seen.time_s)[0]
+        reached = itertools.takewhile(bool, (event.reached for event in msgspec.structs.astuple(self.events())))
+        observed, over = self.script.progress(seen.time_s, sum(reached))
         tool = np.array(seen.tool.position)
-        first, second, third = scene.dwells
         handover, grasp, carry = self._watches
         offered = _distance(tool, np.add(seen.hands.left.position, TOOL_FROM_HAND))
         by_itself = self._gripper is None
-        if first[0] <= script_s <= first[1] and handover.see(offered, seen.time_s, counts=by_itself):
+        if observed == 0 and handover.see(offered, seen.time_s, counts=by_itself):
             self._take(world.board, world.left)
         if self._closing < 0:
             self._let_go(seen, offered)
         if self._closing > 0 and not self._held_by_arm() and grasp.see(_distance(tool, scene.glass), seen.time_s):
             self._take(world.glass, world.arm)
-        if second[0] <= script_s <= second[1]:
+        if observed == 1:
             if grasp.see(_distance(tool, scene.glass), seen.time_s, counts=by_itself):
                 self._take(world.glass, world.arm)
-            if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= GRASP_DISTANCE:
+            if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= ARRIVED_M:
                 self._take(world.iron, world.right)
             if self._held.get(world.board, ("",))[0] == world.left:
                 del self._held[world.board]
-        if third[0] <= script_s:
+        if observed == 2:
             carry.see(_distance(tool, scene.carry), seen.time_s, counts=world.glass in self._held)
-        self.closed = (script_s > first[1]) + (script_s > second[1]) + self.finished
+        self.closed = len(self._watches) if self.finished else over
 
     def things(self) -> tuple[SceneObject, ...]:
         """The things on the bench as viewers draw them: those that the arm holds in the frame of
@@ -330,7 +356,7 @@ class Bench:
             if held and grip:
                 frame, pose = self._plate, carried_by(self.world.plate_from_tool, grip)
             found.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
-        return tuple(found)
+        return (*found, *self.script.places())
 
     def _held_by_arm(self) -> list[str]:
         return [thing for thing, (holder, _) in self._held.items() if holder == self.world.arm]

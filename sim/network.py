@@ -20,11 +20,13 @@ import zenoh
 from service.arms.playback import Playback
 from service.client import Command
 from service.contract import cdr, channels, messages, requests
+from service.contract.records import SIDES
 from service.daemon.clock import Deadlines
 from sim.bench import Bench, Observation, TaskEvent, TaskEvents
 from sim.observed_world import ObservedWorld
 from sim.scene import Scene
 from sim.script import Array
+from sim.tracked_hands import TrackedHands
 
 THINGS_HZ = 10
 FINAL_STOP_S = 0.5  # the bench runs for this time after the last hands, so that the service can stop the arm
@@ -77,7 +79,7 @@ class Live:
     hands_hz: int = 100
     once: bool = False
     duration_s: float = math.inf
-    wait_s: float = 60.0  # timeout of the first command
+    wait_s: float = 60.0  # timeout of the first command, and of the first tracked hands
     dropout: Dropout | None = None
 
 
@@ -181,16 +183,24 @@ class Bridge:
     """The bench's channels on a session.
 
     It receives the joint states of an `observed` arm, or else publishes those of the simulated arm.
+    It receives the hands if they are `tracked`, or else publishes them.
     """
 
     def __init__(
-        self, session: zenoh.Session, live: Live, names: tuple[str, ...], observed: ObservedWorld | None = None
+        self,
+        session: zenoh.Session,
+        live: Live,
+        names: tuple[str, ...],
+        *,
+        observed: ObservedWorld | None = None,
+        tracked: TrackedHands | None = None,
     ) -> None:
         self.commands = Commands(names)
         self.gripper = Gripper()
-        self._names, self._observed = names, observed
-        self.hands_sent = 0
-        own = ("hands/left", "hands/right", "objects", *(() if observed else ("joints/state", "gripper/state")))
+        self._names, self._observed, self._tracked = names, observed, tracked
+        self.hands_sent = 0  # samples of both hands, published or received
+        hands, arm = tuple(f"hands/{side}" for side in SIDES), ("joints/state", "gripper/state")
+        own = ("objects", *(() if tracked else hands), *(() if observed else arm))
         self._publishers = {
             suffix: session.declare_publisher(
                 channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
@@ -204,8 +214,21 @@ class Bridge:
                 ("joints/command", self.commands.receive),
                 ("gripper/command", self.gripper.receive),
                 *([("joints/state", observed.receive)] if observed else ()),
+                *([(suffix, self._receive_hand) for suffix in hands] if tracked else ()),
             )
         ]
+
+    def _receive_hand(self, sample: zenoh.Sample) -> None:
+        """Store the pose of a tracked hand. The service reports unreadable ones."""
+        assert self._tracked is not None
+        try:
+            pose = cdr.decode_pose(sample.payload.to_bytes())
+        except messages.WireError:
+            return
+        side = str(sample.key_expr).rpartition("/")[2]
+        if messages.finite(pose.position):
+            self._tracked.receive(side, pose)
+            self.hands_sent += side == SIDES[-1]
 
     def publish_joints(self, seen: Observation) -> None:
         """Publish the arm's joints and gripper, unless the arm is observed."""
@@ -218,9 +241,11 @@ class Bridge:
             self._publishers["gripper/state"].put(cdr.encode_joints(fingers))
 
     def publish_hands(self, poses: Sequence[Array], *, hidden: str | None = None) -> None:
-        """Publish both hands with one stamp, except a hidden one."""
+        """Publish both hands with one stamp, except a hidden one, unless they are tracked."""
+        if self._tracked:
+            return
         stamp_ns = time.time_ns()
-        for hand, pose in zip(("left", "right"), poses, strict=True):
+        for hand, pose in zip(SIDES, poses, strict=True):
             if hand == hidden:
                 continue
             values = pose.tolist()
@@ -253,9 +278,10 @@ def run(
     until the first report. Raises BenchError.
     """
     observed = bench.world if isinstance(bench.world, ObservedWorld) else None
-    bridge = Bridge(session, live, bench.joint_names, observed)
+    tracked = bench.script if isinstance(bench.script, TrackedHands) else None
+    bridge = Bridge(session, live, bench.joint_names, observed=observed, tracked=tracked)
     try:
-        _play(bench, bridge, live, stop=stop, report=report, say=say)
+        _play(bench, bridge, live, tracked, stop=stop, report=report, say=say)
     finally:
         bridge.close()
 
@@ -264,6 +290,7 @@ def _play(
     bench: Bench,
     bridge: Bridge,
     live: Live,
+    tracked: TrackedHands | None,
     *,
     stop: threading.Event,
     report: Callable[[RunReport], None],
@@ -276,8 +303,22 @@ def _play(
     led = Led(bench, commands, bridge.gripper)
     deadlines, before = Deadlines(rate_hz), -1
     ready_s: float | None = None  # time from which commands arrive and the hands wait at their start
-    running, spoke_s, quiet = False, 0.0, False
-    said = missed_before = sent_before = begun_ns = begun_index = longest = 0
+    running, spoke_s, quiet, asked = False, 0.0, False, False
+    said = missed_before = sent_before = begun_ns = begun_index = index = longest = 0
+
+    def report_now() -> None:
+        report(
+            _report(
+                bench,
+                commands,
+                hands=bridge.hands_sent - sent_before,
+                periods=index - begun_index,
+                skipped=deadlines.missed - missed_before,
+                longest_pause_ms=1000 * longest * bench.period_s,
+                begun_ns=begun_ns,
+            )
+        )
+
     say(f"waiting for {key} (the service sends none without an arm, or in a fault: see thirdhand status)")
     while not stop.is_set():
         index = deadlines.wait()[0]
@@ -316,7 +357,12 @@ def _play(
                 )
         elif not running:
             waited = now_s - ready_s
-            if bench.settled(waited):
+            if tracked and not asked and (tracked.foreign or not tracked.ready):
+                asked = True
+                say(f"waiting for both hands{tracked.refusal}")
+            if not bench.script.ready and waited > live.wait_s:
+                raise BenchError(f"no hands arrived within {live.wait_s:g} s{tracked.refusal if tracked else ''}")
+            if bench.script.ready and bench.settled(waited):
                 bench.begin()
                 commands.restart()
                 running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent
@@ -327,17 +373,7 @@ def _play(
                 say(_line(name, getattr(bench.events(), name)))
             said = bench.closed
             if bench.finished:
-                report(
-                    _report(
-                        bench,
-                        commands,
-                        hands=bridge.hands_sent - sent_before,
-                        periods=index - begun_index,
-                        skipped=deadlines.missed - missed_before,
-                        longest_pause_ms=1000 * longest * bench.period_s,
-                        begun_ns=begun_ns,
-                    )
-                )
+                report_now()
                 if live.once:
                     _let_stop(bench, bridge, led, deadlines)
                     return
@@ -346,6 +382,9 @@ def _play(
                 running, ready_s = False, math.inf
         if ready_s == math.inf and bench.back:
             ready_s = now_s
+    if tracked and running:  # the person has ended the task
+        report_now()
+        _let_stop(bench, bridge, led, deadlines)
 
 
 def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> None:
@@ -382,4 +421,6 @@ def _report(
 
 
 def _line(name: str, event: TaskEvent) -> str:
+    if math.isinf(event.error_mm):
+        return f"{name}: the hands were never at its places"
     return f"{name}: {event.error_mm:.1f} mm at {event.time_s:.1f} s{'' if event.reached else ', missed'}"

@@ -22,8 +22,8 @@ import msgspec
 from service.contract import requests
 from service.contract.explain import InvalidError, in_words, validated
 from service.files.shipped import ARMS, cell_of
-from service.settings.arm_description import SettingsError
 from service.settings.config import Reach
+from service.settings.file_content import SettingsError
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -34,6 +34,7 @@ TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] position of the tool with th
 TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
 RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] position of the hand with the iron, relative to the soldering place
 GRASP_DISTANCE = 0.03  # [m] within this distance a thing is taken over, or is at its target
+ARRIVED_M = 0.04  # a hand within this distance of a place has arrived there
 # The tool's +z points 45° forward and down, and its y axis is level: a turn of 135° about y.
 TOOL_ORIENTATION = (0.0, math.sin(math.radians(67.5)), 0.0, math.cos(math.radians(67.5)))
 # Both hands point at the robot, palms down: half a turn about z.

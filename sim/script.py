@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from service.contract.messages import SceneObject
 from sim.scene import HAND_ORIENTATION, TOOL_ORIENTATION, Scene
 
 Array = npt.NDArray[np.float64]
@@ -41,6 +42,15 @@ class HandMotions(NamedTuple):
 
     left: PointMotion
     right: PointMotion
+
+
+class TaskProgress(NamedTuple):
+    """The progress of the task: the index of the event that is observed, 0 to 2 (None: none is),
+    and the number of events that are over.
+    """
+
+    observed: int | None
+    over: int
 
 
 class ScriptPause(NamedTuple):
@@ -132,6 +142,8 @@ class HandScript:
     once from the seed. A tracker adds tremor and its own noise.
     """
 
+    ready = True  # a script can begin at any time
+
     def __init__(
         self,
         scene: Scene,
@@ -165,6 +177,23 @@ class HandScript:
         self._tremor_hz = tremor.uniform(*TREMOR_HZ, (TREMOR_WAVES, 6))
         self._tremor_phase = tremor.uniform(0.0, 2 * math.pi, (TREMOR_WAVES, 6))
         self._tremor_size = tremor_rms * math.sqrt(2.0 / TREMOR_WAVES)
+
+    def begin(self) -> None:
+        """Do nothing: a script depends on time alone."""
+
+    def progress(self, t: float, reached: int) -> TaskProgress:
+        """The progress at a time `t` [s]: each event is observed in the rest after its motion, the
+        last one until the end, however many have been `reached`.
+        """
+        script_s = self.clock.at(t)[0]
+        first, second, third = self.scene.dwells
+        rests = (first, second, (third[0], math.inf))
+        observed = (i for i, (begin, end) in enumerate(rests) if begin <= script_s <= end)
+        return TaskProgress(next(observed, None), (script_s > first[1]) + (script_s > second[1]))
+
+    def places(self) -> tuple[SceneObject, ...]:
+        """No places are drawn: nobody has to find them."""
+        return ()
 
     def truth(self, t: float) -> HandMotions:
         """The motions of both hands at a time `t` [s] after the script's begin; at rest before and

@@ -26,7 +26,7 @@ from service.contract.messages import BASE, PoseStamped
 from service.contract.requests import ViaPoint
 from service.files.demonstration_reader import write_demonstration
 from service.learning.demonstration import Demonstration
-from service.settings.arm_description import SettingsError
+from service.settings.file_content import SettingsError
 from sim import made_tasks, sessions
 from sim.people import Places
 from sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from service.core.arm.stage import Arm
 from service.core.frame import Vector
 from service.core.separation.stage import Separation
-from service.settings.arm_description import SettingsError
 from service.settings.config import Point, Settings
+from service.settings.file_content import SettingsError
 from service.settings.reachable import Shell, Workspace
 from service.settings.urdf import Urdf, UrdfJoint
 

@@ -12,8 +12,9 @@ from service.arms.first_cell import DEMO_TOOL_M, Proposal, proposed, written
 from service.arms.rates import JERK_RATE, RISE_S, TORQUE_SHARE
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
-from service.settings.arm_description import SettingsError, description
+from service.settings.arm_description import description
 from service.settings.config import load
+from service.settings.file_content import SettingsError
 from service.settings.mesh_cover import unfound
 
 DEGREES = 7.0  # [rad] larger limits of a revolute joint are probably in degrees

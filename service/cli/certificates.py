@@ -110,7 +110,7 @@ def _write(
     """Write a certificate, its key and the authority's certificate to a private folder with the
     name of its holder, and return the end of its validity.
 
-    A certificate of a daemon or router is valid for `hosts`.
+    A certificate of a daemon, router or headset's page is valid for `hosts`.
     """
     record = os.open(folder.parent / GIVEN, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     with open(record, "a", encoding="utf-8") as given:

@@ -7,12 +7,19 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import re
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from service.client import Client, no_room_to_brake, open_session
+import zenoh
+
+from service.cli.hands import invite
+from service.cli.usage import UsageError
+from service.cli.web_address import page_served, web_address
+from service.client import Client, Tracker, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
@@ -20,8 +27,18 @@ from service.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
 from service.files.shipped import cell_of
 from service.process.child import python
 from service.process.progress import say
+from service.trackers.cell_view import Latest
+from service.trackers.mouse_page import MousePage, PlayedTask
+from service.trackers.web_server import Address
 
+DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
+PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
+PAGE_WAIT_S = 600.0  # the page is opened within this time
+PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
+OUTCOME_S = 1.0  # the page shows the outcome before its server ends
+NEVER_THERE = "the hands were never at its places"
+REACHED_LINE = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
 CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
 VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
@@ -37,7 +54,19 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Run the demo, print its report and return its exit code."""
-    report = run(args.output, scene=args.scene, arm=args.arm, engine=args.engine, rate_hz=args.rate, say=say)
+    if args.open and args.mouse is None:
+        raise UsageError("--open opens the page of --mouse; --mouse needed with it")
+    page = web_address("--mouse", args.mouse) if args.mouse is not None else None
+    report = run(
+        args.output,
+        scene=args.scene,
+        arm=args.arm,
+        engine=args.engine,
+        rate_hz=args.rate,
+        page=page,
+        browser=args.open,
+        say=say,
+    )
     print(json.dumps(report, indent=2) if args.json else text(report))
     return exit_code(report)
 
@@ -48,9 +77,19 @@ def exit_code(report: dict[str, Any]) -> int:
 
 
 def run(
-    out: Path, *, scene: Path | None, arm: str, engine: str | None, rate_hz: int | None, say: Callable[[str], None]
+    out: Path,
+    *,
+    scene: Path | None,
+    arm: str,
+    engine: str | None,
+    rate_hz: int | None,
+    page: Address | None,
+    browser: bool,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run the scenario once and return its report. Raises DemoError, SettingsError."""
+    """Run the scenario once and return its report. With the address of a `page`, a person plays the
+    hands there; it is opened if `browser`. Raises DemoError, SettingsError.
+    """
     engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
     if reason := no_room_to_brake(settings.period_s):
         raise DemoError(reason)
@@ -68,12 +107,66 @@ def run(
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
             bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
-            report = json.loads(played(service.endpoint, *bench, say=say))
+            if page:
+                report = _played_on_page(session, client, service.endpoint, bench, page, browser=browser, say=say)
+            else:
+                report = json.loads(played(service.endpoint, *bench, say=say))
             status = client.status()
         code, missing = service.stop(), service.missing()
         if code != 0 and not missing:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
     return _report(report, status) | {"missing": missing}
+
+
+def _played_on_page(
+    session: zenoh.Session,
+    client: Client,
+    endpoint: str,
+    bench: list[str],
+    listen: Address,
+    *,
+    browser: bool,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """The report of the bench, whose hands a person plays on a page. Raises LaunchError,
+    UsageError.
+    """
+    running: list[subprocess.Popen[str]] = []
+
+    def end() -> None:
+        for process in running:
+            process.terminate()
+
+    task = PlayedTask(end)
+
+    def heard(line: str) -> None:
+        say(line)
+        if found := REACHED_LINE.fullmatch(line):
+            task.lines.append(f"{EVENT_TITLES[found[1]]}, the tool was {found[2]} off")
+
+    with Tracker(session) as tracker:
+        shown = MousePage(tracker, client, Latest(session, DEMO_CELL), cell=DEMO_CELL, task=task)
+        with page_served(shown.server, "--mouse", listen) as address:
+            url = f"http://{address}/?token={shown.server.token}"
+            say(f"  {url}")
+            invite(url, address, browser=browser)
+            report: dict[str, Any] = json.loads(
+                played(
+                    endpoint,
+                    *("--tracked-hands", str(PLAY_S), "--wait", str(PAGE_WAIT_S), *bench),
+                    say=heard,
+                    begun=running.append,
+                    timeout_s=PLAY_TIMEOUT_S,
+                )
+                or "null"
+            )
+            if report is None:
+                raise DemoError("the task was ended before both hands were seen on the page")
+            reached = sum(event["reached"] for event in report["events"].values())
+            task.is_done = report["success"]
+            task.outcome = f"the task has ended: {reached} of {len(EVENT_TITLES)} events reached"
+            time.sleep(OUTCOME_S)
+    return report
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
@@ -85,9 +178,12 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     found = reported(recording)
     timing = found.columns.timing
     bench = too_busy(report)
+    begun_s = (report["begun_ns"] - found.columns.start_ns) / 1e9
     for name, event in report["events"].items():
-        if not event["reached"]:
-            event["why"] = _why(found, (report["begun_ns"] - found.columns.start_ns) / 1e9, report["events"], name)
+        if event["error_mm"] is None:
+            event["why"] = NEVER_THERE
+        elif not event["reached"]:
+            event["why"] = _why(found, begun_s, report["events"], name)
     return {
         "success": report["success"],
         "events": report["events"],
@@ -136,6 +232,10 @@ def text(report: dict[str, Any]) -> str:
     lines, causes = list[str](), list[str]()
     for name, what in EVENT_TITLES.items():
         event = report["events"][name]
+        if event["error_mm"] is None:
+            lines.append(f"  {what:<26} {'MISSED':>27}")
+            lines.append(f"      because {event['why']}")
+            continue
         outcome = "reached" if event["reached"] else "MISSED"
         lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
         if why := event.get("why"):

@@ -27,8 +27,10 @@ FREE_MB = 2000.0  # least free space
 DISK_LASTS_H = 1.0  # least time until the disk is full
 MISSED_SHARE = 0.01  # largest share of missed deadlines
 LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
+MAX_BELOW_TABLE_M = 0.03  # a hand that is farther below the table top shows that the calibration is off
 OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
 COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
+LATE_ARM_MS = 30.0  # largest lag of an arm, with the delay of its driver's playback
 MOVED_SHARE = 0.1  # a joint that moved less than this share of it has not moved
 OFF_TARGET_M, OFF_TARGET_S = 0.05, 1.5  # a tool that is farther away for longer does not only lag
 LEVEL_M, RAISED_M = 0.03, 0.10  # if z spans less than the first and y more than the second, y is the height
@@ -70,14 +72,16 @@ def findings(
     own_version: str,
     published: Sequence[str] = (),
     travels: Mapping[str, tuple[float, float]] | None = None,
+    lag_ms: float | None = None,
 ) -> list[Finding]:
     """The findings on a cell, from its statuses: wrong ones first, causes before their effects.
 
     `own_ns` and `own_version` are time and version of this machine, `published` the keys of any
-    cell on which hands and joints were received, and `travels` the commanded and the measured
-    travel of each joint since the first status [rad].
+    cell on which hands and joints were received, `travels` the commanded and the measured travel of
+    each joint since the first status [rad], and `lag_ms` the measured lag of the arm; None: it was
+    not measured.
     """
-    found = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}))
+    found = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}, lag_ms))
     if any(finding.level == "wrong" for finding in found):  # a busy machine may be the cause
         found = [wrong(*msgspec.structs.astuple(one)[1:]) if one.what == MACHINE else one for one in found]
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
@@ -89,6 +93,7 @@ def _in_order_of_cause(
     own_version: str,
     published: Sequence[str],
     travels: Mapping[str, tuple[float, float]],
+    lag_ms: float | None,
 ) -> Iterator[Finding]:
     before, now = seen[0], seen[-1]
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
@@ -102,6 +107,8 @@ def _in_order_of_cause(
         yield from _source(before, now, name, published)
     yield _driver(before, now)
     yield from _drives(travels)
+    if "arm" in now.sources and now.command_heard:
+        yield _lag(lag_ms)
     yield from _hands_and_skill(seen)
     yield _mode(now)
     yield from _tool(seen)
@@ -131,6 +138,17 @@ def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
         name = max(still, key=lambda joint: still[joint])
         found = f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since commands began"
         yield wrong("arm's drives", found, "joints that follow their commands", what_to_do(Condition.DRIVES_OFF))
+
+
+def _lag(lag_ms: float | None) -> Finding:
+    what = "arm's lag"
+    if lag_ms is None:
+        return Finding(
+            "ok", what, "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"
+        )
+    found, wanted = f"the arm follows its commands {lag_ms:.0f} ms late", f"up to {LATE_ARM_MS:.0f} ms"
+    level = "ok" if lag_ms <= LATE_ARM_MS else "note"
+    return Finding(level, what, found, wanted, what_to_do(Condition.ARM_LATE))
 
 
 def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
@@ -226,6 +244,17 @@ def _driver(before: Status, now: Status) -> Finding:
 
 def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     now, boxes = seen[-1], seen[-1].demonstrated_m
+    below = {side: min(one.below_table_m.get(side, 0.0) for one in seen) for side in SIDES}
+    if max(below.values()) > MAX_BELOW_TABLE_M:
+        depths = " and ".join(
+            f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm" for side, depth in below.items() if depth > MAX_BELOW_TABLE_M
+        )
+        yield wrong(
+            "calibration",
+            f"below the table top: {depths}",
+            "hands above the table",
+            what_to_do(Condition.CALIBRATION_OFF),
+        )
     positions = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
     off = {side: _outside(at, boxes[side]) for side, at in positions.items()}
     crossed = [

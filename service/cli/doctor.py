@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import math
 import re
 import socket
 import time
+from collections import deque
 from collections.abc import Iterator
 from importlib.metadata import version
+from typing import TypeAlias
 
 import msgspec
 import zenoh
@@ -26,7 +29,10 @@ from service.contract.messages import WireError
 from service.contract.printable import printable_lines
 
 PROBE_S = 1.0
+MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
 PUBLISHED = ("**/hands/*", "**/joints/state")  # in any cell, because a name may be wrong
+
+Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad] of a joint
 
 
 def doctor(args: argparse.Namespace) -> int:
@@ -84,15 +90,16 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
         own_version=version("thirdhand"),
         published=published.keys,
         travels=travel.of_joints(),
+        lag_ms=travel.lag_ms(),
     )
 
 
 class Travel:
-    """Commanded and measured travel of an arm's joints while they are watched."""
+    """Commanded and measured positions of an arm's joints while they are watched."""
 
     def __init__(self) -> None:
-        self._commanded: dict[str, tuple[float, float]] = {}  # lowest and highest position of each joint [rad]
-        self._measured: dict[str, tuple[float, float]] = {}
+        self._commanded: dict[str, Series] = {}  # of each joint
+        self._measured: dict[str, Series] = {}
 
     @contextlib.contextmanager
     def watching(self, session: zenoh.Session, cell: str) -> Iterator[None]:
@@ -108,18 +115,35 @@ class Travel:
     def of_joints(self) -> dict[str, tuple[float, float]]:
         """Commanded and measured travel of each joint [rad]."""
         return {
-            name: (commanded[1] - commanded[0], measured[1] - measured[0])
+            name: (_span(commanded), _span(measured))
             for name, commanded in self._commanded.copy().items()
             if (measured := self._measured.get(name)) is not None
         }
 
+    def lag_ms(self) -> float | None:
+        """The measured lag of the arm behind its commands; None if it followed no motion."""
+        from service.cli.arm_lag import lag  # numpy is slow to import, and most findings need none
+
+        commanded, measured = (
+            {name: list(series) for name, series in joints.copy().items()}
+            for joints in (self._commanded, self._measured)
+        )
+        found = lag(commanded, measured)
+        return None if found is None else 1000 * found.lag_s
+
     @staticmethod
-    def _take(spans: dict[str, tuple[float, float]], sample: zenoh.Sample) -> None:
+    def _take(joints: dict[str, Series], sample: zenoh.Sample) -> None:
+        at_s = time.monotonic()
         with contextlib.suppress(WireError):
             message = cdr.decode_joints(sample.payload.to_bytes())
-            for name, at in zip(message.names, message.position, strict=False):
-                low, high = spans.get(name, (at, at))
-                spans[name] = min(low, at), max(high, at)
+            for name, position in zip(message.names, message.position, strict=False):
+                if math.isfinite(position):
+                    joints.setdefault(name, deque(maxlen=MAX_SERIES)).append((at_s, position))
+
+
+def _span(series: Series) -> float:
+    positions = [position for _, position in series.copy()]
+    return max(positions) - min(positions)
 
 
 def unreachable(endpoint: str, error_text: str) -> Finding:

@@ -11,8 +11,8 @@ from service.client import Client
 from service.client.session import tried
 from service.files.shipped import cell_of
 from service.process.progress import say
-from service.settings.arm_description import UnreadableError
 from service.settings.config import Settings
+from service.settings.file_content import UnreadableError
 
 DRIVES = ("franka", "simulated")
 

@@ -1,7 +1,7 @@
 """The page of `thirdhand view live --web`: mode and reason, buttons for hold, resume and reset, and
 Rerun's web viewer, on a phone a plain view from above, all at one address.
 
-The page's server passes on the viewer's files and the daemon's stream from this machine, without
+The server passes on the viewer's files and the daemon's stream from this machine, without
 the samples that a browser does not draw. A request that changes something needs the token in the
 page, which no other site can read. Nothing is fetched from elsewhere.
 """
@@ -10,98 +10,41 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
-import hmac
 import html
 import http.client
-import ipaddress
 import json
 import re
 import secrets
-import signal
 import subprocess
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
-from urllib.parse import urlsplit
 
 import aiohttp
-import zenoh
 from aiohttp import web
 from yarl import URL
 
-from service.client import Client, RefusedError, decoded
-from service.contract import channels
-from service.contract.explain import ExplainedError, in_words
-from service.contract.incidents import ORDERS, in_brief, title
-from service.contract.requests import Status
+from service.client import Client
+from service.contract.explain import in_words
+from service.contract.incidents import ORDERS
+from service.trackers.cell_view import Latest, carried_out
+from service.trackers.web_server import HTML, INLINE, JSON, Address, WebServer, answer, filled, write
 
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
 PIECE = 64 * 1024  # bytes of a file that are passed on at once
-MOST_BODY = 4096  # bytes of a request
 TIMEOUT_S = 10.0  # the viewer's server and the stream answer within this time
 START_S = 15.0  # the viewer's server starts within this time
-HTML = "text/html; charset=utf-8"
-INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-FROZEN_S = 30.0  # a browser that sends no request, or reads no answer, for this long is disconnected
 A_PICTURE = 130  # messages that are sent ahead of a picture: 0.6 s, in which everything frequent is repeated
 BEHIND_MS = 1000.0  # a picture older than this, compared with the newest message sent, makes no room for more
 PATIENCE_S = 15.0  # a viewer that does not report a picture for this time is sent messages again
 HISTORY_S = 2.0  # the samples of the past, which arrive first, are left out for this time
 # A message of gRPC-Web after its header of 5 bytes: rows of a recording that are not static.
 SAMPLES = re.compile(rb"\n[\x80-\xff]*.\x12[\x80-\xff]*.\n.\x08\x01.*8\0", re.DOTALL)
-FOREIGN = "This page answers at this machine's own address only, and only to itself."
+FOLDER = Path(__file__).parent
 UNKNOWN = "There is no such page. The page of this cell is at /."
-_COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 _OF_A_CONNECTION = {"connection", "keep-alive", "transfer-encoding", "content-length"}  # headers that are not passed on
 _DROPPED_OF_REQUEST = {*_OF_A_CONNECTION, "host", "origin"}
 _DROPPED_OF_ANSWER = {*_OF_A_CONNECTION, "date", "server"}
-
-
-class Address(NamedTuple):
-    """Host and port of a server."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
-
-
-class Latest:
-    """The newest status of the daemon, and its age."""
-
-    def __init__(self, session: zenoh.Session, cell: str, first: Status) -> None:
-        self._status, self._at = first, time.monotonic()
-        self._subscriber = session.declare_subscriber(channels.key(cell, "status"), self._take)
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        with contextlib.suppress(RefusedError):
-            self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
-
-    @property
-    def stream(self) -> Address:
-        """The server of the live view; it changes when the scribe is started again."""
-        parts = urlsplit(str(self._status.scribe.get("live") or "").removeprefix("rerun+"))
-        return Address(parts.hostname or "127.0.0.1", parts.port or 0)
-
-    def summary(self) -> dict[str, Any]:
-        """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
-        [s], the daemon's time [ms], the live view that it serves, and further facts in one line.
-        """
-        now, age_s = self._status, time.monotonic() - self._at
-        hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
-        near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
-        facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
-        names = ("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m")
-        shown = {name: getattr(now, name) for name in names} | {"title": title(now.reason)}
-        remedy = _COMMAND.sub(
-            lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
-            now.remedy,
-        )
-        now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
-        return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
 class Room:
@@ -129,96 +72,29 @@ class Room:
 
 
 class LivePage:
-    """The page's server."""
+    """The page and its server."""
 
     def __init__(self, *, client: Client, latest: Latest, cell: str, viewer: Address) -> None:
         self._client, self._latest, self._cell, self._viewer = client, latest, cell, viewer
-        self._token, self._page = secrets.token_urlsafe(24), secrets.token_hex(4)
+        self._page = secrets.token_hex(4)
         self._rooms: dict[str, Room] = {}  # by the viewer's address, which has a number
-        self._idle: set[web.RequestHandler] = set()  # connections on which no request has arrived yet
-        self._application = web.Application(client_max_size=MOST_BODY, middlewares=[self._guarded])
-        self._application.add_routes(
-            [
-                web.get("/", self._front),
-                web.get("/status", self._status),
-                web.get("/viewer/", self._viewer_page),
-                web.get("/viewer/{file:.+}", self._viewer_file),
-                web.post("/viewer/shown", self._shown),
-                web.post(STREAM, self._stream),
-                web.post(f"/{{order:{'|'.join(ORDERS)}}}", self._order),
-            ]
-        )
+        routes = [
+            web.get("/", self._front),
+            web.get("/status", self._status),
+            web.get("/viewer/", self._viewer_page),
+            web.get("/viewer/{file:.+}", self._viewer_file),
+            web.post("/viewer/shown", self._shown),
+            web.post(STREAM, self._stream),
+            web.post(f"/{{order:{'|'.join(ORDERS)}}}", self._order),
+        ]
+        self.server = WebServer(routes, unknown=UNKNOWN, around=[self._streams])
 
-    async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
-        """Serve until SIGTERM or SIGHUP; call `listening` with the address taken. Raises OSError if
-        the address is not available.
-        """
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(ended.set))
-        runner = web.AppRunner(
-            self._application,
-            access_log=None,
-            handler_cancellation=True,
-            keepalive_timeout=FROZEN_S,
-            shutdown_timeout=0.1,
-        )
-        await runner.setup()
-        self._host, server = listen.host, None
+    async def _streams(self, _: web.Application) -> AsyncIterator[None]:
+        """The context of connections to other servers of this machine."""
         # each browser's stream has a connection of its own, without end
         connector = aiohttp.TCPConnector(limit=0, force_close=True)
         async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as self._session:
-            try:
-                server = await loop.create_server(functools.partial(self._connection, runner), *listen)
-                listening(Address(listen.host, server.sockets[0].getsockname()[1]))
-                await ended.wait()
-            finally:
-                if server is not None:
-                    server.close()
-                await runner.cleanup()
-
-    def _connection(self, runner: web.AppRunner) -> web.RequestHandler:
-        """A new connection; it is closed if no request arrives in time."""
-        assert runner.server is not None
-        connection = runner.server()
-        self._idle.add(connection)
-        asyncio.get_running_loop().call_later(FROZEN_S, self._close_idle, connection)
-        return connection
-
-    def _close_idle(self, connection: web.RequestHandler) -> None:
-        if connection in self._idle:
-            self._idle.remove(connection)
-            connection.force_close()
-
-    @web.middleware
-    async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
-        self._idle.discard(request.protocol)
-        if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
-            return _answer(403, FOREIGN)
-        try:
-            async with asyncio.timeout(FROZEN_S):
-                await request.read()
-        except TimeoutError:
-            return _answer(408, f"The request was not complete within {FROZEN_S:g} s.")
-        except web.HTTPRequestEntityTooLarge:
-            return _answer(413, f"A body of at most {MOST_BODY} bytes is accepted.")
-        try:
-            response: web.StreamResponse = await handler(request)
-        except web.HTTPException as error:
-            return _answer(error.status, UNKNOWN)
-        return response
-
-    def _is_foreign(self, host: str, origin: str | None) -> bool:
-        """True for a request from another site, or to the name of another host."""
-        try:
-            if origin is not None and urlsplit(origin).netloc != host:
-                return True
-            name = urlsplit(f"//{host}").hostname or ""
-            if not re.fullmatch(r"[\w.:\[\]-]+", host):
-                return True
-            return name not in ("localhost", self._host) and not ipaddress.ip_address(name)
-        except ValueError:
-            return True
+            yield
 
     async def _front(self, request: web.Request) -> web.Response:
         """The page, for a browser that reaches it by this host and port.
@@ -226,51 +102,42 @@ class LivePage:
         The viewer is loaded under this machine's other name if it has one. For the browser that is
         another site, which runs in a process of its own, so that the buttons always respond.
         """
-        fields = {"__TOKEN__": self._token, "__PAGE__": self._page}
-        fields["__VIEWER__"] = f"http://{_other_name(request.host)}/viewer/"
-        fields["__CELL__"] = html.escape(self._cell)
-        text = _text("live.html")
-        for name, value in fields.items():
-            text = text.replace(name, value)
-        policy = f"connect-src 'self'; frame-src {fields['__VIEWER__']}; {INLINE}; frame-ancestors 'none'"
-        return _answer(200, text, kind=HTML, policy=policy)
+        viewer = f"http://{_other_name(request.host)}/viewer/"
+        cell = html.escape(self._cell)
+        text = filled(FOLDER / "live.html", token=self.server.token, page=self._page, viewer=viewer, cell=cell)
+        policy = f"connect-src 'self'; frame-src {viewer}; {INLINE}; frame-ancestors 'none'"
+        return answer(200, text, kind=HTML, policy=policy)
 
     async def _status(self, _: web.Request) -> web.Response:
         shown = self._latest.summary() | {"page": self._page}
-        return _answer(200, json.dumps(shown), kind="application/json")
+        return answer(200, json.dumps(shown), kind=JSON)
 
     async def _viewer_page(self, request: web.Request) -> web.Response:
         sources = f"connect-src 'self'; worker-src 'self' blob:; {INLINE} 'self' 'wasm-unsafe-eval'"
         policy = f"{sources}; frame-ancestors http://{_other_name(request.host)}"
-        return _answer(200, _text("live_viewer.html"), kind=HTML, policy=policy)
+        return answer(200, filled(FOLDER / "live_viewer.html"), kind=HTML, policy=policy)
 
     async def _viewer_file(self, request: web.Request) -> web.StreamResponse:
         path = request.rel_url.raw_path_qs.removeprefix("/viewer")
-        return await self._pass_on(request, self._viewer, path, lambda answer: answer.content.iter_chunked(PIECE))
+        return await self._pass_on(request, self._viewer, path, lambda reply: reply.content.iter_chunked(PIECE))
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         page = request.headers.get("Referer", "")
-        return await self._pass_on(request, self._latest.stream, STREAM, lambda answer: self._drawn(answer, page))
+        return await self._pass_on(request, self._latest.stream, STREAM, lambda reply: self._drawn(reply, page))
 
     async def _shown(self, request: web.Request) -> web.Response:
         """Note the time [ms] of the newest picture that a viewer has drawn."""
         with contextlib.suppress(KeyError, ValueError):
             self._rooms[request.headers.get("Referer", "")].shown(float(await request.read()))
-        return _answer(200, "")
+        return answer(200, "")
 
     async def _order(self, request: web.Request) -> web.Response:
         """Carry out hold, resume or reset, even if the browser disconnects meanwhile."""
-        given = request.headers.get("X-Thirdhand-Token", "")
-        if not hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode()):
-            return _answer(403, "The token of the page is needed: reload it.")
-        name = request.match_info["order"]
-        try:
-            reply = await asyncio.shield(asyncio.to_thread(self._client.ask, name))
-        except ExplainedError as error:
-            return _answer(502, f"{name} was NOT carried out: {error}")
-        now = in_brief(reply.get("mode", ""), reply.get("reason", "")).replace("_", " ")
-        note = f"; {reply['note']}" if reply.get("note") else ""
-        return _answer(200, f"{name} carried out at tick {reply['tick']}; mode then: {now}{note}")
+        if not self.server.has_token(request.headers.get("X-Thirdhand-Token", "")):
+            return answer(403, "The token of the page is needed: reload it.")
+        order = asyncio.to_thread(carried_out, self._client, request.match_info["order"])
+        is_done, text = await asyncio.shield(order)
+        return answer(200 if is_done else 502, text)
 
     async def _pass_on(
         self,
@@ -292,29 +159,28 @@ class LivePage:
                 headers=headers,
                 skip_auto_headers=("Accept", "Accept-Encoding", "Content-Type", "User-Agent"),
                 timeout=timeout,
-            ) as answer:
-                begun.set_status(answer.status)
-                for name, value in answer.headers.items():
+            ) as reply:
+                begun.set_status(reply.status)
+                for name, value in reply.headers.items():
                     if name.lower() not in _DROPPED_OF_ANSWER:
                         begun.headers[name] = value
                 await begun.prepare(request)
-                async for piece in pieces(answer):
-                    async with asyncio.timeout(FROZEN_S):
-                        await begun.write(piece)
+                async for piece in pieces(reply):
+                    await write(begun, piece)
         except (aiohttp.ClientError, OSError) as error:  # a TimeoutError too
             if not begun.prepared:
-                return _answer(502, f"{to} does not answer: {in_words(error, named=False)}")
+                return answer(502, f"{to} does not answer: {in_words(error, named=False)}")
             if request.transport is not None:
                 request.transport.abort()  # so that the browser does not take the part for the whole
         return begun
 
-    async def _drawn(self, answer: aiohttp.ClientResponse, page: str) -> AsyncIterator[bytes]:
+    async def _drawn(self, reply: aiohttp.ClientResponse, page: str) -> AsyncIterator[bytes]:
         """The messages of a stream, without the samples that the page's viewer has no room for."""
         room = self._rooms[page] = Room()
         try:
             while True:
-                header = await answer.content.readexactly(5)
-                message = header + await answer.content.readexactly(int.from_bytes(header[1:], "big"))
+                header = await reply.content.readexactly(5)
+                message = header + await reply.content.readexactly(int.from_bytes(header[1:], "big"))
                 if not SAMPLES.fullmatch(message, 5) or room.take():
                     yield message
         except asyncio.IncompleteReadError:
@@ -322,23 +188,6 @@ class LivePage:
         finally:
             if self._rooms.get(page) is room:
                 del self._rooms[page]
-
-
-def _answer(
-    code: int, text: str, *, kind: str = "text/plain; charset=utf-8", policy: str = "frame-ancestors 'none'"
-) -> web.Response:
-    headers = {
-        "Content-Type": kind,
-        "Server": "thirdhand",
-        "Cache-Control": "no-store",
-        "X-Content-Type-Options": "nosniff",
-        "Content-Security-Policy": f"default-src 'none'; {policy}",
-    }
-    return web.Response(status=code, body=text.encode(errors="replace"), headers=headers)
-
-
-def _text(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _other_name(host: str) -> str:

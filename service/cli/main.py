@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from service.cli import record_options
+from service.cli import calibrate_options, record_options
 from service.cli.usage import ARM_HELP, Parser, UsageError, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
@@ -23,7 +23,7 @@ from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
 from service.process import interrupt
 from service.process.progress import say
-from service.settings.arm_description import SettingsError, UnreadableError
+from service.settings.file_content import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
@@ -35,14 +35,14 @@ SIM = "Runs the simulated bench: it publishes hands and joint states, and follow
 RATE = "the rate of the control loop (default: the rate in the cell's settings)"
 ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
-    "run": ("demo", "serve", "follow", "sim", "play"),
+    "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
-    "set up": ("arm", "certificates", "completion"),
+    "set up": ("arm", "calibrate", "certificates", "completion"),
 }
-CLEAN_UP_FIRST = ("demo", "bench", "view", "record")  # on Ctrl-C these commands first end their processes
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
         "demo",
         "Runs the soldering scenario once, without a window: simulated bench, service and recording. Then reports how "
         "the task went.",
-        "thirdhand demo --scene my-scene.toml",
+        "thirdhand demo --scene my-scene.toml\n  thirdhand demo --mouse --open",
     )
     output = "write the recording, the drawing and the service's log to this folder"
     option(c, "--output", "DIR", output, Path("thirdhand-demo"))
@@ -85,6 +85,16 @@ def parser() -> argparse.ArgumentParser:
     engine = "the physics engine of the bench (default: the first that is installed)"
     c.add_argument("--engine", choices=("pybullet", "mujoco"), help=engine)
     option(c, "--rate", "HZ", RATE)
+    mouse = (
+        "play the hands yourself, with a mouse or a finger, on a page that is served at this address (default: any "
+        "port of this machine)"
+    )
+    option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
+    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
+    c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
+    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
+    c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
+    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
     c = command(
@@ -140,6 +150,36 @@ def parser() -> argparse.ArgumentParser:
     option(c, "file", "FILE", "the recording or demonstration: an MCAP file with hands/left and hands/right")
     option(c, "--speed", "X", "play this many times as fast as recorded", 1.0, type=within(float, 0.01, 100))
     c.add_argument("--loop", action="store_true", help="start again at the end, until Ctrl-C")
+    _reach(c)
+
+    c = command(
+        "hands",
+        "Publishes your hands, as a headset's browser or a camera of this machine tracks them, or as you drag them "
+        "with a mouse or a finger. Open the address that it prints.",
+        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n"
+        "  thirdhand hands --camera --hand-length 0.19",
+    )
+    kinds = c.add_mutually_exclusive_group(required=True)
+    kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")
+    mouse = "serve a page on which both hands are dragged over the bench, seen from above"
+    kinds.add_argument("--mouse", action="store_true", help=mouse)
+    camera = "the hands that this camera sees (default: camera 0), or a video file; needs thirdhand[camera]"
+    option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
+    address = "serve the page at this address; port 0: any free one; for other machines with --https"
+    option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
+    https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
+    option(c, "--https", "DIR", https)
+    length = "of --camera: length of your hand, from the crease of the wrist to the tip of the middle finger"
+    option(c, "--hand-length", "M", length, 0.18, type=within(float, 0.1, 0.3, " m"))
+    view = "of --camera: horizontal angle of view of its lens, in degrees"
+    option(c, "--view", "DEG", view, 60.0, type=within(float, 20, 150, " degrees"))
+    model = "of --camera: hand_landmarker.task, or the wheel of mediapipe 0.10.21 (default: it is downloaded once)"
+    option(c, "--model", "FILE", model)
+    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
+    c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
+    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
+    c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
+    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     _reach(c)
 
     c = command(
@@ -278,6 +318,10 @@ def parser() -> argparse.ArgumentParser:
     output = "write the cell's settings to this file, and the picture to a .png beside it"
     option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)
 
+    c = command("calibrate", calibrate_options.ABOUT_CALIBRATE, calibrate_options.CALIBRATE_EXAMPLE)
+    calibrate_options.add_options(c)
+    _reach(c)
+
     c = command(
         "certificates",
         "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
@@ -285,7 +329,13 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand certificates secrets --host bench.local",
     )
     option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
-    option(c, "--host", "NAME", "a name or address at which clients reach the daemon; may be repeated", action="append")
+    option(
+        c,
+        "--host",
+        "NAME",
+        "a name or address at which the daemon and pages are reached; may be repeated",
+        action="append",
+    )
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
     option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)

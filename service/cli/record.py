@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
-import select
 import sys
 from pathlib import Path
 
-from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, places_in, reaching
-from service.client import UnreachableError, open_session
-from service.contract.channels import ENDPOINT
+from service.cli.keys import EnterPressed
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, inputs_session, places_in
 from service.contract.printable import printable, printable_lines
 from service.files.demonstration_files import (
     DemonstrationNameError,
@@ -105,21 +102,8 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
     places = places_in(args.places) if args.places else ()
-    cell, ended = args.cell or settings.cell, _Ended()
-    listen, reach = [args.listen] if args.listen else [], reaching(args)
-    try:
-        session = open_session(
-            connect=args.connect or () if listen else reach.connect,
-            otherwise=[ENDPOINT],
-            listen=listen,
-            timeout_s=CONNECT_TIMEOUT_S,
-            certificate=reach.certificate,
-            zenoh_config=reach.zenoh_config,
-            more={} if listen else {"mode": "client"},  # a daemon forwards others' messages only to clients
-        )
-    except UnreachableError as error:
-        hint = "" if listen else f" Without a daemon, use --listen {ENDPOINT}"
-        raise UnreachableError(f"{error}{hint}") from None
+    cell, ended = args.cell or settings.cell, EnterPressed()
+    session = inputs_session(args, CONNECT_TIMEOUT_S)
     with session:
         if args.until == "key":
             say("Enter or Ctrl-C ends it")
@@ -151,25 +135,3 @@ def _say_over_progress(line: str) -> None:
 
 def _progress(line: str) -> None:
     print(f"\r{line}", end="", file=sys.stderr, flush=True)
-
-
-class _Ended:
-    """A function that is True once Enter was pressed. Standard input is ignored if it has ended or
-    belongs to another process group.
-    """
-
-    def __init__(self) -> None:
-        self._listens = True
-
-    def __call__(self) -> bool:
-        try:
-            if not self._listens or not select.select([sys.stdin], [], [], 0)[0]:
-                return False
-            if sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
-                return False
-            if sys.stdin.readline():
-                return True
-        except (OSError, ValueError):
-            pass
-        self._listens = False
-        return False

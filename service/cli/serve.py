@@ -19,8 +19,8 @@ from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process import child
-from service.settings.arm_description import SettingsError
 from service.settings.config import Settings, converted
+from service.settings.file_content import SettingsError
 
 
 def serve(args: argparse.Namespace) -> int:

@@ -14,8 +14,8 @@ from typing import Any, NoReturn
 
 import zenoh
 
-from service.client import ClientSettings, client_settings
-from service.contract.channels import LARGEST_REQUEST, lacking
+from service.client import ClientSettings, UnreachableError, client_settings, open_session
+from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from service.contract.explain import in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
 from service.settings.config import RATES_HZ
@@ -131,6 +131,26 @@ def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_
     UnreachableError, immediately if the system reports that nothing listens.
     """
     return reaching(args).session(timeout_s=timeout_s, at_once=timeout_s is not None)
+
+
+def inputs_session(args: argparse.Namespace, timeout_s: float) -> zenoh.Session:
+    """A session that receives what trackers and arm publish: a client of the daemon or router, or
+    with --listen one to which they connect. Raises UnreachableError.
+    """
+    listen, reach = [args.listen] if args.listen else [], reaching(args)
+    try:
+        return open_session(
+            connect=args.connect or () if listen else reach.connect,
+            otherwise=[ENDPOINT],
+            listen=listen,
+            timeout_s=timeout_s,
+            certificate=reach.certificate,
+            zenoh_config=reach.zenoh_config,
+            more={} if listen else {"mode": "client"},  # a daemon forwards others' messages only to clients
+        )
+    except UnreachableError as error:
+        hint = "" if listen else f" Without a daemon, use --listen {ENDPOINT}"
+        raise UnreachableError(f"{error}{hint}") from None
 
 
 def added_in(path: Path) -> Add:

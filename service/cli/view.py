@@ -5,7 +5,6 @@ daemon, in a window or a browser; or take a picture without a screen.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import io
 import math
 import os
@@ -23,8 +22,9 @@ from mcap.writer import MCAP0_MAGIC
 from PIL import Image, ImageDraw, ImageFont
 
 from service.cli.clients import ask
-from service.cli.live_page import Address, Latest, LivePage, web_viewer
+from service.cli.live_page import LivePage, web_viewer
 from service.cli.usage import UsageError, check_writable, reached
+from service.cli.web_address import serve_page, web_address
 from service.client import Client
 from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
@@ -35,6 +35,8 @@ from service.files.steps import Gap
 from service.process.progress import progress, say
 from service.settings import palette
 from service.settings.network import is_local
+from service.trackers.cell_view import Latest
+from service.trackers.web_server import Address
 from service.viewer import vulkan
 from service.viewer.blueprint import TABS, TIMELINE
 from service.viewer.stream import Viewer, ViewerError, rerun_program
@@ -109,7 +111,7 @@ def check_usage(args: argparse.Namespace) -> None:
 
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serve the page until Ctrl-C."""
-    listen = _address(args.web)
+    listen = web_address("--web", args.web)
     with reached(args) as session, web_viewer(rerun_program(), url, free_port()) as viewer:
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.status())
@@ -120,20 +122,8 @@ def _serve(args: argparse.Namespace, url: str) -> int:
             if not is_local(f"tcp/{address}"):
                 say("everyone who can reach this address can hold, resume and reset the arm")
 
-        try:
-            asyncio.run(page.serve(listen, listening))
-        except OSError as error:
-            why = os.strerror(error.errno) if error.errno else error
-            raise UsageError(f"--web {listen}: {why}; another port, or 0 for any, needed") from None
+        serve_page(page.server, "--web", listen, listening)
     return 0
-
-
-def _address(given: str) -> Address:
-    """Host and port of `PORT` or `HOST:PORT`. Raises UsageError."""
-    host, _, port = given.rpartition(":")
-    if not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"--web {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0")
-    return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
 def _show(sources: list[str], args: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,11 +13,14 @@ import msgspec
 import zenoh
 
 from service.client.session import open_session
-from service.contract.channels import ENDPOINT, lacking
+from service.contract.channels import ENDPOINT, CellName, lacking
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.arm_description import SettingsError, UnreadableError
-from service.settings.config import Cell
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
+
+if sys.version_info >= (3, 11):  # noqa: UP036, as the client alone runs on 3.10 too
+    import tomllib
+else:
+    import tomli as tomllib
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
 
@@ -28,7 +31,7 @@ class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """The settings by which a client reaches its cell."""
 
     connect: Endpoints = ()  # the first that answers is used; none: those of `zenoh_config`, else ENDPOINT
-    cell: Cell = "thirdhand"  # prefix of all keys
+    cell: CellName = "thirdhand"  # prefix of all keys
     certificate: str = ""  # the folder of the client's role; empty: none
     zenoh_config: str = ""  # a file with Zenoh's own settings; empty: none
 

@@ -204,15 +204,20 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
 
 
 def _check_dates(path: Path) -> None:
-    """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason."""
-    from cryptography import x509  # most sessions need no certificate
+    """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason.
+    Without the package cryptography, which the client alone does not need, nothing is checked.
+    """
+    try:
+        from cryptography import x509  # most sessions need no certificate
+    except ModuleNotFoundError:
+        return
 
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as error:
         raise UnreachableError(f"{path} does not hold a certificate: {error}") from None
     begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    now = datetime.datetime.now(datetime.UTC)
+    now = datetime.datetime.now(datetime.timezone.utc)  # noqa: UP017, as the client runs on Python 3.10 too
     if now > end:
         raise UnreachableError(
             f"{path} expired on {end:%Y-%m-%d %H:%M} UTC: a new certificate needed, by `thirdhand certificates`"

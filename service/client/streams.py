@@ -1,25 +1,32 @@
-"""A cell's streams for clients: a Tracker publishes hands, a Follower receives joint commands."""
+"""A cell's streams for clients: a Tracker publishes hands, a Follower receives joint commands, and
+a Watch yields the messages of any channel.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import zenoh
 
+from service.client.replies import decoded
 from service.client.session import UnreachableError, tried
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from service.contract.records import SIDES
+from service.contract.requests import Status
 
 BRAKE_AFTER_S = 0.02  # a follower brakes after this time without a command
 LATE_COMMAND_S = 0.005  # at the lowest accepted rate, a command may be this late before the follower brakes
-MAX_COMMANDS = 256  # a follower queues this many, half a second of them at 500 Hz
+MAX_QUEUED = 256  # received messages, half a second of commands at 500 Hz
+CTRL_C_S = 0.5  # a wait is interrupted this often, since on Windows Ctrl-C does not end one
+WATCHABLE = tuple(channel.key for channel in channels.CHANNELS if channel.direction in ("in", "out"))
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
@@ -44,6 +51,25 @@ def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> ze
     )
 
 
+def wait_until_heard(*publishers: zenoh.Publisher, timeout_s: float | None) -> None:
+    """Wait up to `timeout_s` [s] until each publisher has a subscriber; None: until Ctrl-C. Raises
+    UnreachableError.
+    """
+
+    def check() -> None:
+        if unheard := _unheard(publishers):
+            raise UnreachableError(
+                f"nobody listens to {unheard[0]}: is a daemon or `thirdhand record` running in this cell?"
+            )
+
+    tried(check, timeout_s)
+
+
+def _unheard(publishers: Iterable[zenoh.Publisher]) -> list[str]:
+    """The keys of the publishers without a subscriber."""
+    return [str(one.key_expr) for one in publishers if not one.matching_status.matching]  # type: ignore[attr-defined]
+
+
 class Tracker(AbstractContextManager["Tracker"]):
     """A publisher of a cell's hand poses; a context.
 
@@ -52,10 +78,9 @@ class Tracker(AbstractContextManager["Tracker"]):
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
-        self._cell = cell
         self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
         try:
-            tried(self._check_heard, timeout_s)
+            wait_until_heard(*self._publishers.values(), timeout_s=timeout_s)
         except BaseException:
             self.close()
             raise
@@ -81,17 +106,7 @@ class Tracker(AbstractContextManager["Tracker"]):
 
     def heard(self) -> bool:
         """True if both hands have a subscriber."""
-        return all(
-            publisher.matching_status.matching  # type: ignore[attr-defined]
-            for publisher in self._publishers.values()
-        )
-
-    def _check_heard(self) -> None:
-        if not self.heard():
-            raise UnreachableError(
-                f"nobody listens to {channels.key(self._cell, 'hands/left')}: is a daemon or `thirdhand record` "
-                "running in this cell?"
-            )
+        return not _unheard(self._publishers.values())
 
     def close(self) -> None:
         """End the publishers."""
@@ -100,6 +115,71 @@ class Tracker(AbstractContextManager["Tracker"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Received(AbstractContextManager[Any]):
+    """A queue of the newest messages on one channel."""
+
+    def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
+        self.rejected, self.reason = 0, ""
+        self._came = threading.Condition()
+        self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
+        self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
+
+    def close(self) -> None:
+        """End the subscription."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _decoded(self, sample: zenoh.Sample) -> Any:
+        """The value of a message. Raises ValueError."""
+        raise NotImplementedError
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        try:
+            value = self._decoded(sample)
+        except ValueError as error:
+            self.rejected, self.reason = self.rejected + 1, str(error)
+            return
+        with self._came:
+            self._queue.append(value)
+            self._came.notify()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Watch(_Received, Iterator[Any]):
+    """An iterator over the messages of one channel, in the order of arrival; a context.
+
+    Poses have `stamp_ns`, `frame_id`, `position` [m] and `orientation`, and `tool/target` also its
+    `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
+    of SceneObject, `clutch` a bool, `gripper/wish` a closure from 0 to 1, and `status` a Status.
+
+    It waits for the next message. After `timeout_s` [s] without one it yields None; None: never.
+    A slow loop gets the newest 256 messages. Messages that cannot be decoded are skipped:
+    `rejected` counts them, and `reason` is the cause of the last one. Raises ValueError for a
+    channel that carries no messages.
+    """
+
+    def __init__(self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None) -> None:
+        if suffix not in WATCHABLE:
+            raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
+        decode = channels.BY_KEY[suffix].codec.decode
+        self._decode = functools.partial(decoded, kind=Status) if suffix == "status" else decode
+        self._timeout_s = timeout_s
+        super().__init__(session, cell, suffix)
+
+    def __next__(self) -> Any:
+        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        with self._came:
+            while not self._queue:
+                if (left_s := end_s - time.monotonic()) <= 0:
+                    return None
+                self._came.wait(min(left_s, CTRL_C_S))
+            return self._queue.popleft()
+
+    def _decoded(self, sample: zenoh.Sample) -> Any:
+        return self._decode(sample.payload.to_bytes())
 
 
 class Command(NamedTuple):
@@ -118,7 +198,7 @@ class Command(NamedTuple):
     hand_stamp_ns: int
 
 
-class Follower(AbstractContextManager["Follower"]):
+class Follower(_Received):
     """A receiver of a cell's joint commands and publisher of its joint states; a context.
 
     `names` are the arm's joints, in the order of all values here. Commands for other joints are
@@ -126,12 +206,9 @@ class Follower(AbstractContextManager["Follower"]):
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
-        self.rejected, self.reason = 0, ""
         self._names = tuple(names)
-        self._came = threading.Condition()
-        self._queue: deque[Command] = deque(maxlen=MAX_COMMANDS)
         self._state = publisher(session, cell, "joints/state", express=True)
-        self._subscriber = session.declare_subscriber(channels.key(cell, "joints/command"), self._take)
+        super().__init__(session, cell, "joints/command")
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
         """The newest command that was not returned before; None after `timeout_s` [s] without a
@@ -156,22 +233,13 @@ class Follower(AbstractContextManager["Follower"]):
 
     def close(self) -> None:
         """End the subscription and the publisher."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        super().close()
         self._state.undeclare()  # type: ignore[no-untyped-call]
 
-    def _take(self, sample: zenoh.Sample) -> None:
-        try:
-            message = cdr.decode_joints(sample.payload.to_bytes())
-            position, velocity = in_order(message, self._names)
-            if not finite(position + velocity):
-                raise WireError("a joint that is not finite")
-            attached = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
-        except WireError as error:
-            self.rejected, self.reason = self.rejected + 1, str(error)
-            return
-        with self._came:
-            self._queue.append(Command(message.stamp_ns, position, velocity, *attached))
-            self._came.notify()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _decoded(self, sample: zenoh.Sample) -> Command:
+        message = cdr.decode_joints(sample.payload.to_bytes())
+        position, velocity = in_order(message, self._names)
+        if not finite(position + velocity):
+            raise WireError("a joint that is not finite")
+        attached = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
+        return Command(message.stamp_ns, position, velocity, *attached)

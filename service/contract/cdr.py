@@ -12,18 +12,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from service.contract.messages import (
+    GRIPPER,
     Attachment,
     JointState,
     PoseStamped,
     PoseWithCovarianceStamped,
     Transform,
     WireError,
+    in_order,
 )
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
 _STAMP = struct.Struct("<II")  # seconds are signed in ROS 2; unsigned ones last until 2106
 _LENGTH = struct.Struct("<I")
+_BOOL = struct.Struct("<B")
 _POSE = struct.Struct("<7d")
 _COVARIANCE = struct.Struct("<36d")
 _TICK = struct.Struct("<qII")
@@ -171,6 +174,11 @@ def encode_string(text: str) -> bytes:
     out = Writer()
     out.string(text)
     return bytes(out)
+
+
+def encode_bool(value: bool) -> bytes:
+    """CDR bytes of a `std_msgs/msg/Bool`."""
+    return CDR_HEADER + bytes([value])
 
 
 def encode_transforms(stamp_ns: int, transforms: Sequence[Transform]) -> bytes:
@@ -331,6 +339,26 @@ def _learn_layout(message: JointState, data: bytes) -> None:
 def decode_string(data: bytes) -> str:
     """The text of a `std_msgs/msg/String`. Raises WireError."""
     return Reader(data).string()
+
+
+def decode_bool(data: bytes) -> bool:
+    """The value of a `std_msgs/msg/Bool`. Raises WireError."""
+    reader = Reader(data)
+    (value,) = reader.unpack(_BOOL, 1)
+    reader.end()
+    if value > 1:
+        raise WireError(f"a bool of {value}; 0 or 1 needed")
+    return bool(value)
+
+
+def decode_closure(data: bytes) -> float:
+    """The position, 0 (open) to 1 (closed), of the joint `gripper` in the CDR bytes of a
+    JointState. Raises WireError.
+    """
+    (closure,), _ = in_order(decode_joints(data), (GRIPPER,))
+    if not 0.0 <= closure <= 1.0:
+        raise WireError(f"{GRIPPER} at {closure:g}; 0 (open) to 1 (closed) needed")
+    return closure
 
 
 def decode_transforms(data: bytes) -> tuple[int, list[Transform]]:

@@ -13,12 +13,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
 
 from service.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # default endpoint of daemons and their clients
 LARGEST_REQUEST = 256 * 1024  # bytes
+_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
+CellName = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
+        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
+    ),
+]
 _ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
 _ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
 PRESENCE = "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions
@@ -46,6 +56,8 @@ POSE_WITH_COVARIANCE = Codec(
     cdr.decode_pose_with_covariance,
 )
 JOINTS = Codec("sensor_msgs/msg/JointState", "cdr", cdr.encode_joints, cdr.decode_joints)
+CLOSURE = Codec(JOINTS.type, "cdr", cdr.encode_joints, cdr.decode_closure)
+BOOL = Codec("std_msgs/msg/Bool", "cdr", cdr.encode_bool, cdr.decode_bool)
 STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_string)
 TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
 OBJECTS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects)
@@ -93,14 +105,19 @@ CHANNELS = (
     Channel("hands/right", POSE, "in", "the user's right hand", event=EventKind(1, POSE), **_HAND),
     Channel("joints/state", JOINTS, "in", "the arm's joints as measured",
             rate="100 - 1000 Hz", event=EventKind(2, JOINTS), stale_after=("arm", "silent_ms")),
+    Channel("clutch", BOOL, "in", "true while the clutch is pressed; heard with `[hands] clutch = \"key\"`",
+            rate="10 - 100 Hz", event=EventKind(10, BOOL), stale_after=("hands", "clutch_stale_ms")),
     Channel("joints/command", JOINTS, "out", "position [rad] and velocity [rad/s]; silent until the arm is ready",
             rate="every tick", every=1),
     Channel("tool/target", POSE_WITH_COVARIANCE, "out", "what the skill predicts from both hands, and how sure it is",
             rate="every 5th tick", every=5),
     Channel("tool/setpoint", POSE, "out", "the target after smoothing", rate="every 5th tick", every=5),
     Channel("gripper/command", JOINTS, "out",
-            "its joint `gripper`: 0 is open, 1 closed; silent where the skill knows of none",
+            "its joint `gripper`: 0 is open, 1 closed; silent where neither the skill nor a wish decides it",
             rate="every 5th tick", every=5),
+    Channel("gripper/wish", CLOSURE, "in",
+            "its joint `gripper`: how far to close where the skill does not decide it, 0 to 1; heard with "
+            "`[hands] gripper = \"key\"`", rate="1 - 100 Hz", event=EventKind(11, CLOSURE)),
     Channel("gripper/state", JOINTS, "in", "how far the gripper is closed, 0 to 1, in demonstrations",
             rate="teaching", recorded=False),
     Channel("tool/pose", POSE, "in", "the tool as measured, in demonstrations", rate="teaching", recorded=False),

@@ -86,6 +86,7 @@ class Evidence(NamedTuple):
     measured_speed: Exceeded | None = None  # of the tool [m/s]
     commanded_speed: Exceeded | None = None
     failure: str = ""  # of the service
+    clutch: str = ""  # the problem with the clutch's messages; empty: it was released
     busy: str = ""  # signs of a busy machine when the incident began
     # About a rejected sample:
     sample: PoseStamped | JointState | None = None
@@ -149,6 +150,8 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
             found = "a command reached {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
         case Reason.SERVICE:
             found = seen.failure
+        case Reason.CLUTCH:
+            found = seen.clutch
     return found, closer
 
 

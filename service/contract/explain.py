@@ -65,7 +65,9 @@ def _named(path: str) -> str:
         name or (f"entry {int(index) + 1}" if index.isdigit() else "an entry")
         for name, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", path)
     ]
-    if re.match(r"\.\w+\.", path):
+    if re.match(r"\.\w+\.\w+\.", path):
+        parts[:3] = [f"[{parts[0]}.{parts[1]}] {parts[2]}"]
+    elif re.match(r"\.\w+\.", path):
         parts[:2] = [f"[{parts[0]}] {parts[1]}"]
     return ", ".join(parts)
 
@@ -126,6 +128,7 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
     if message.startswith("$"):
         return message  # from a check of our own, which names the path itself
     try:
+        path = _with_name(path, given, kind)
         value, node, accepted = _at(path, given, inspect.type_info(kind))
     except (LookupError, TypeError, AttributeError):  # a name in the given value looks like a path
         return f"$: {error}"
@@ -147,6 +150,20 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
             return f"{path}: {len(value) or 'none'} {counted}, {needed}"
         return f"{path}: {_short(value)} given; {needed}"
     return f"{path}: {message[:MAX_MESSAGE]}"
+
+
+def _with_name(path: str, given: Any, kind: Any) -> str:
+    """The path of an error with the name of the table for which msgspec writes `[...]`."""
+    before, dots, after = path.partition("[...]")
+    tables, node, _ = _at(before, given, inspect.type_info(kind)) if dots else (None, None, "")
+    kind_of_tables = node.value_type if isinstance(node, inspect.DictType) else None
+    if isinstance(tables, dict) and isinstance(kind_of_tables, inspect.StructType):
+        for name, table in tables.items():
+            try:
+                msgspec.convert(table, kind_of_tables.cls)
+            except msgspec.ValidationError:
+                return f"{before}.{name}{after}"
+    return path
 
 
 def _known(node: inspect.StructType) -> list[str]:
@@ -171,6 +188,8 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
             inner = node.item_types[int(index)]
         elif isinstance(node, inspect.VarTupleType | inspect.ListType):
             inner = node.item_type
+        elif isinstance(node, inspect.DictType) and field:
+            inner = node.value_type
         else:
             return None, None, ""
         value = value[field] if field else value[int(index)]

@@ -29,9 +29,9 @@ Condition = enum.StrEnum(
     "Condition",
     "MALFORMED CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
-    "HAND_ELSEWHERE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED TICKS_LOST "
-    "DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM",
+    "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
+    "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF",
 )
 
 
@@ -67,6 +67,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "start the tracker; `hand_age_ms` in the status names the hands that have been seen"),
         Incident(Reason.OPERATOR, Mode.HOLD, "operator request",
             "an operator requested a hold, or the daemon was stopped", "`thirdhand resume`"),
+        Incident(Reason.CLUTCH, Mode.HOLD, "clutch released",
+            "the clutch of `[hands] clutch` is not pressed, or was not heard for {hands.clutch_stale_ms ms}",
+            "press the clutch and hold it; it must be published again and again, at 10 Hz or more"),
         Incident(Reason.ARM_NOT_READY, Mode.HOLD, "arm not ready",
             "the arm does not report its joints, does not rest within its limits, or is inside of something",
             "start the arm's driver; `joints/state` must use the joint names of `joints/command`"),
@@ -88,6 +91,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.DRIVES_OFF, None, "drives off",
             "a joint has not moved since commands began",
             "are the drives on? Check their power, brakes and emergency stop; then `thirdhand reset`"),
+        Incident(Condition.ARM_LATE, None, "arm late",
+            "the arm follows its commands late",
+            "let the arm's driver lead by the lag: write position + lag * velocity, as examples/own_arm.py does "
+            "by its lag_s; then measure again"),
         Incident(Condition.NO_ARM, None, "arm assumed",
             "the daemon assumes the arm's posture, and measures nothing",
             "with an arm, start the daemon with `--joints state`"),
@@ -143,6 +150,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Flag.TARGET_CLAMPED, Mode.FOLLOW, "target out of reach",
             "the target lies outside the workspace or the arm's reach; the tool moves to the nearest point inside",
             "move the hands nearer to the arm, or teach the via-point elsewhere"),
+        Incident(Flag.ENGAGING, Mode.FOLLOW, "engaging",
+            "following has just begun: the tool moves at {tool.engage_speed m/s} at most until it is within 2 cm of "
+            "its target",
+            "wait; if the tool does not catch up with the hands, hold them still for a moment"),
         Incident(Flag.SPEED_LIMITED, Mode.FOLLOW, "at a speed limit",
             "the hands require more than the limits of the tool or a joint", "nothing: the tool arrives later"),
         Incident(Flag.NEAR_JOINT_LIMIT, Mode.FOLLOW, "near a joint limit",
@@ -164,12 +175,17 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.Y_UP, None, "tracker's axes",
             "y of the tracker seems to point up; in frame `base`, z does",
             "turn the tracker's frame by `base_from_tracker` under [hands]"),
+        Incident(Condition.CALIBRATION_OFF, None, "calibration off",
+            "a hand is measured where no hand can be, below the table top",
+            "the tracker has moved, or its pose is wrong: `thirdhand calibrate --check` measures by how much, "
+            "`thirdhand calibrate` finds the pose; check the height of `[table]` too"),
         Incident(Condition.HANDS_EXCHANGED, None, "hands exchanged",
             "each hand is where the skill knows the other one",
             "left and right look swapped: publish each hand under the other's key"),
         Incident(Condition.HAND_ELSEWHERE, None, "hand elsewhere",
             "a hand is far from where the task was demonstrated",
-            "move the hand there, or demonstrate this too; check `[hands] unit` and `base_from_tracker`"),
+            "move the hand there, or demonstrate this too; check `[hands] unit` and `base_from_tracker`, "
+            "by `thirdhand calibrate --check`"),
     ),
     "A hand or the arm's joint states are rejected": (
         Incident(Cause.NOT_FINITE, None, "not finite",
@@ -202,8 +218,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "a hand where the other hand was, and the other where it was; accepted after {hands.swapped_s s}",
             "let the tracker see both hands apart for a moment: it takes left for right"),
         Incident(Cause.WRONG_FRAME, None, "wrong frame",
-            "a pose in a frame that is neither `base` nor `[hands] frame`",
-            "set `[hands] frame` and `base_from_tracker`, or publish in `base`"),
+            "a pose in a frame that is neither `base` nor one of `[hands] frame` and `[trackers.NAME]`",
+            "find `[hands] frame` and `base_from_tracker` by `thirdhand calibrate`, also after the tracker was "
+            "recentred, which changes its frame; or publish in `base`"),
         Incident(Condition.MALFORMED, None, "malformed",
             "bytes that are not the message of their key; they are counted by key",
             "publish the type and encoding that docs/wire.md lists for the key"),

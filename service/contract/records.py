@@ -40,6 +40,7 @@ class Reason(enum.IntEnum):
     SERVICE = 11
     BLOCKED = 12
     AMBIGUOUS = 13
+    CLUTCH = 14
 
 
 class Flag(enum.IntFlag):
@@ -51,6 +52,7 @@ class Flag(enum.IntFlag):
     SEPARATION = 8
     STUCK = 16
     UNSURE = 32
+    ENGAGING = 64
 
 
 class Cause(enum.IntEnum):

@@ -203,9 +203,12 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     time_ns: int = 0  # time of the status by the daemon's clock
     sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
     frames: tuple[str, ...] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
+    trackers: dict[str, tuple[float, ...]] = {}  # pose of each known tracker frame in `base`, by the frame's name
     joints: tuple[str, ...] = ()  # their names, in order
     hands_m: dict[str, Vector3] = {}  # estimated positions of the hands that were seen, frame `base`
+    below_table_m: dict[str, float] = {}  # depth of hands below the table top: an error of the tracker's calibration
     demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of the demonstrated box
+    hands_at_m: dict[str, tuple[Vector3, Vector3]] = {}  # left and right hand at each learned via-point
     tool_m: Vector3 | None = None  # commanded position; None before the first tick
     tool_measured_m: Vector3 | None = None  # by the newest joint state; None: not recent
     target_m: Vector3 | None = None  # None if a needed hand is not seen

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 from service.contract import channels, ros2
 
-DAEMON, ROUTER = "daemon", "router"
-SERVERS = (DAEMON, ROUTER)  # others connect to them
+DAEMON, ROUTER, HEADSET = "daemon", "router", "headset"
+SERVERS = (DAEMON, ROUTER, HEADSET)  # others connect to them; browsers to the last one
 HANDS = ("hands/left", "hands/right")
+WISHES = ("clutch", "gripper/wish")
 ARM = ("joints/state", "gripper/state")
 TOOL, OBJECTS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
@@ -29,15 +30,28 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "tracker": Role("may publish hands, objects, and the tool in demonstrations", (*HANDS, *TOOL, *OBJECTS)),
+    "tracker": Role(
+        "may publish hands, clutch, gripper, objects, and the tool in demonstrations",
+        (*HANDS, *WISHES, *TOOL, *OBJECTS),
+    ),
+    HEADSET: Role(
+        "may publish hands, clutch and gripper, send requests and hear all, and serves a page to browsers",
+        (*HANDS, *WISHES),
+        hears=True,
+        asks=True,
+    ),
     "arm": Role("may publish joint states and the tool, and hears commands", (*ARM, *TOOL), hears=True),
-    "bench": Role("is tracker and arm in one, as the simulated bench is", (*HANDS, *ARM, *TOOL, *OBJECTS), hears=True),
+    "bench": Role(
+        "is tracker and arm in one, as the simulated bench is",
+        (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
+        hears=True,
+    ),
     "operator": Role("may send requests, and hears all", hears=True, asks=True),
     "observer": Role("hears all that the daemon publishes", hears=True),
     "recorder": Role("hears what trackers and the arm publish, for demonstrations", hears_inputs=True),
     ROUTER: Role(
         "passes on what all others may do, and has to keep them apart",
-        (*HANDS, *ARM, *TOOL, *OBJECTS),
+        (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
         hears=True,
         asks=True,
         hears_inputs=True,

@@ -20,6 +20,7 @@ class Condition(enum.IntFlag):
     ONE_HAND = 128  # the leading hand is seen; the second hand was never seen, or has disappeared
     STAGE_AMBIGUOUS = 256  # the stage of the task is not known
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
+    CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
 
 
 class Alternation(enum.IntEnum):
@@ -87,6 +88,7 @@ HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Condition.HANDS), int(Condition.ARM_HEAR
 CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
 ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
 STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.STAGE_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
+CLUTCH_RELEASED = int(Condition.CLUTCH_RELEASED)
 SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
 ALTERNATIONS = tuple(int(order) for order in Alternation)
 STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
@@ -101,5 +103,5 @@ HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
 NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
-AMBIGUOUS, TOOL_SPEED = int(Reason.AMBIGUOUS), int(Reason.TOOL_SPEED)
+AMBIGUOUS, TOOL_SPEED, CLUTCH = int(Reason.AMBIGUOUS), int(Reason.TOOL_SPEED), int(Reason.CLUTCH)
 ARM_ERROR, ARM_SILENT = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT)

@@ -59,7 +59,8 @@ from service.settings.config import Settings
 # Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
-SAMPLES = ("hands/left", "hands/right", "joints/state")
+ENGAGING = int(Flag.ENGAGING)
+SAMPLES = ("hands/left", "hands/right", "joints/state", "clutch", "gripper/wish")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
@@ -74,7 +75,7 @@ def start_state(settings: Settings, skill: Skill) -> Record:
     Intake(settings).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
-    state["orientation"], state["closure"] = skill.orientation, NO_GRIPPER
+    state["orientation"], state["closure"], state["gripper_wish"] = skill.orientation, NO_GRIPPER, NO_GRIPPER
     state["skill"], state["trail_tick"] = np.frombuffer(skill.digest, np.uint8), NEVER
     return state
 
@@ -218,6 +219,7 @@ class Controller:
             frame["commanded"] = moved.moving
         flags = STUCK * (state["stuck"] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
         flags |= UNSURE * (state["unsure"] > 0) | LIMITED * (met > 0 or solution.speed_limited or moved.limited)
+        flags |= ENGAGING * (state["engaging"] > 0)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
         lap("limiter")
 

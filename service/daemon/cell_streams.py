@@ -24,6 +24,11 @@ CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock 
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
 MAX_SAMPLE_BYTES = 4096  # limit of a message of a hand or of joints
 ARM_STATE = "joints/state"
+CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
+    ARM_STATE: lambda settings: settings.arm.source == "state",
+    "clutch": lambda settings: settings.hands.clutch == "key",
+    "gripper/wish": lambda settings: settings.hands.gripper == "key",
+}
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
 MAX_JOINT_STATES = 16  # messages of the arm's topic, on which grippers and other parts may publish too
@@ -40,10 +45,13 @@ class Arrivals:
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
 
-    def take(self, message: PoseStamped | JointState, at_ns: int) -> None:
-        """Note a message and its arrival by the system clock [ns]."""
-        self.newest, self.at_ns = message, at_ns
-        self._delays.append((message.stamp_ns, at_ns - message.stamp_ns))
+    def take(self, message: PoseStamped | JointState | bool | float, at_ns: int) -> None:
+        """Note a message and its arrival by the system clock [ns]; of a clutch or a wish, which has
+        no stamp, only that it arrived.
+        """
+        if isinstance(message, PoseStamped | JointState):
+            self.newest, self.at_ns = message, at_ns
+            self._delays.append((message.stamp_ns, at_ns - message.stamp_ns))
         self.count += 1
 
     def held_up_s(self, accepted_ns: int, stamp_ns: int) -> float | None:
@@ -90,7 +98,7 @@ class CellStreams:
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
-        inputs = [c for c in ros2.HEARD if c.key != ARM_STATE or settings.arm.source == "state"]
+        inputs = heard(settings)
         keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
         if domain is not None:
             topics = [ros2.of_channel(cell, channel) for channel in (*inputs, *ros2.SAID)]
@@ -165,6 +173,11 @@ class CellStreams:
         """End the threads beside the loop."""
         if self._ros2 is not None:
             self._ros2.close()
+
+
+def heard(settings: Settings) -> list[channels.Channel]:
+    """The input channels of the loop that a cell with these settings subscribes to."""
+    return [c for c in ros2.HEARD if c.key not in CONFIGURED or CONFIGURED[c.key](settings)]
 
 
 def _most(channel: channels.Channel) -> int:

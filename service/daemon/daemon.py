@@ -355,7 +355,7 @@ class Daemon:
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
         machine = self._machine
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
-        known = self._failure, inside, machine.at_stop
+        known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),

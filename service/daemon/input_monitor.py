@@ -13,7 +13,7 @@ from statistics import median
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, word
 from service.contract.joint_states import measured
-from service.contract.messages import BASE, PoseStamped, WireError
+from service.contract.messages import PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
@@ -22,7 +22,7 @@ from service.core.intake.far_away import too_far
 from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
 from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
-from service.daemon.cell_streams import Arrivals
+from service.daemon.cell_streams import Arrivals, heard
 from service.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
@@ -47,8 +47,7 @@ class InputMonitor:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        measured = settings.arm.source == "state"
-        self.arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES if measured or source != "arm"}
+        self.arrivals = {channel.key: Arrivals() for channel in heard(settings)}
         self._histories = {source: _History() for source in SOURCES if KEY_OF_SOURCE[source] in self.arrivals}
         self._counted_s = 0.0
 
@@ -101,6 +100,18 @@ class InputMonitor:
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
         )
 
+    def clutch(self, state: Record) -> str:
+        """The problem with the clutch's messages; empty if there is none, or no clutch."""
+        arrivals = self.arrivals.get("clutch")
+        if arrivals is None:
+            return ""
+        if arrivals.count == arrivals.malformed:
+            why = f"; what arrived is malformed: {arrivals.why}" if arrivals.why else ""
+            return f"the clutch has not been heard yet{why}"
+        silent_ms = self._settings.hands.clutch_stale_ms
+        is_silent = 0 < state["clutch_until_tick"] <= state["tick"]
+        return f"the clutch was last heard as pressed, and then not for {silent_ms:g} ms" if is_silent else ""
+
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:
         """Lines for the log: the first rejection of each cause at once, then counts."""
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
@@ -118,19 +129,21 @@ class InputMonitor:
             self._counted_s = now_s
 
 
-def frames(settings: Settings) -> tuple[str, ...]:
-    """The names of frames that a hand's pose may have; the empty name stands for the tracker's."""
-    own = settings.hands.frame
-    return (BASE, "") if own in ("", BASE) else (BASE, own, "")
+def _too_far(sample: PoseStamped, settings: Settings) -> str:
+    """Message about a position that is too far away, with the setting of its unit."""
+    unit = settings.hands_in(sample.frame_id).unit
+    return too_far(sample.position, unit, f"{settings.tracker_section(sample.frame_id)} unit is {unit!r}")
 
 
 def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
     """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
-    seen = Evidence(settings=settings, sample=sample, newest_ns=newest_ns, frames=frames(settings), held_up_s=held_up_s)
+    seen = Evidence(
+        settings=settings, sample=sample, newest_ns=newest_ns, frames=settings.tracker_frames, held_up_s=held_up_s
+    )
     if isinstance(sample, PoseStamped):
-        mistake = too_far(sample.position, settings.hands.unit) if cause is Cause.OUT_OF_RANGE else ""
+        mistake = _too_far(sample, settings) if cause is Cause.OUT_OF_RANGE else ""
         return seen._replace(mistake=mistake)
     try:
         position, velocity = measured(sample, settings.joints.names)

@@ -159,15 +159,22 @@ def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], No
     )
 
 
-def played(endpoint: str, *arguments: str, say: Callable[[str], None] = lambda line: None) -> str:
+def played(
+    endpoint: str,
+    *arguments: str,
+    say: Callable[[str], None] = lambda line: None,
+    begun: Callable[[subprocess.Popen[str]], None] = lambda process: None,
+    timeout_s: float = BENCH_TIMEOUT_S,
+) -> str:
     """The report in JSON of one run of the bench (`python -m sim` with the arguments); `say` is
-    called with its progress. Raises LaunchError.
+    called with its progress, and `begun` with its process. Raises LaunchError.
     """
     at = ("--connect", endpoint, "--cell", "thirdhand")
     command, environment = python("-m", "sim", *at, "--once", "--output", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    clock = threading.Timer(BENCH_TIMEOUT_S, process.kill)
+    clock = threading.Timer(timeout_s, process.kill)
     clock.start()
+    begun(process)
     lines: list[str] = []
     try:
         assert process.stderr is not None

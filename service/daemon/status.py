@@ -22,7 +22,8 @@ from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
-from service.daemon.input_monitor import KEY_OF_SOURCE, frames
+from service.core.skill.skill import Skill
+from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.settings.config import Settings
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
@@ -42,6 +43,7 @@ class CellStatus(NamedTuple):
     failure: str = ""
     inside: Inside | None = None  # what an arm that is not ready is inside of
     busy: str = ""  # signs of a busy machine when the arm stopped
+    clutch: str = ""  # the problem with the clutch's messages
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
@@ -64,15 +66,23 @@ class CellStatus(NamedTuple):
             places=tuple(point.name for point in skill.via_points),
             rejected=_by_cause(sources),
             sources=sources,
-            frames=frames(settings),
+            frames=settings.tracker_frames,
+            trackers={
+                frame: settings.hands_in(frame).base_from_tracker
+                for frame in (settings.hands.frame, *settings.trackers)
+            },
             joints=settings.joints.names,
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
+            below_table_m={
+                side: depth_m for i, side in enumerate(SIDES) if seen[i] and (depth_m := self._below_table_m(i))
+            },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
             },
+            hands_at_m={name: (_point(at[:3]), _point(at[3:])) for name, at in _hands_at(skill)},
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
@@ -87,6 +97,12 @@ class CellStatus(NamedTuple):
             threshold_m=round(skill.threshold, 5),
             **more,
         )
+
+    def _below_table_m(self, side: int) -> float:
+        """Depth of a hand below the table top [m]; 0 above it and beside it."""
+        x, y, z = (self.frame["hands"][side] - np.array(self.settings.table.centre)).tolist()
+        half_x, half_y = self.settings.table.half_size
+        return round(max(0.0, -z), 4) if abs(x) < half_x and abs(y) < half_y else 0.0
 
     def _turned(self) -> float:
         """Angle between the tool and its target, or between their directions [rad]."""
@@ -114,6 +130,7 @@ class CellStatus(NamedTuple):
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
+            clutch=self.clutch,
             busy=self.busy,
         )
 
@@ -185,6 +202,15 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
 
 def _std(covariance: Any) -> float:
     return round(float(standard_deviations(covariance)), 5)
+
+
+def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
+    """Names and hands (6,) [m] of the learned via-points, in the order of the task; for a skill
+    without via-points, one unnamed pair of demonstrated hands.
+    """
+    hands = skill.model.hands
+    found = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    return [(name, at) for name, at in found if np.isfinite(at).all()]
 
 
 def _point(values: Any) -> Vector3:

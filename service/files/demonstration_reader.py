@@ -18,7 +18,7 @@ from service.contract.requests import Hands, encode_json
 from service.core.frame import Vector
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
-from service.core.intake.stage import UNIT_M
+from service.core.intake.stage import UNIT_M, base_from
 from service.core.intake.tuning import MAX_HAND_DISTANCE_M
 from service.files.hands_and_tool import chosen
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing
@@ -106,8 +106,8 @@ def read_demonstration(
         read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
         say(f"{path}: {fault}; {read} were read")
     one_clock = by_one_clock(found.tracks)
-    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings.hands)
-    tracks = [_near(recorded, *both, settings.hands) for both in zip(tracks, one_clock.tracks, strict=True)]
+    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
+    tracks = [_near(recorded, *both, settings) for both in zip(tracks, one_clock.tracks, strict=True)]
     remarks = [*found.guessed, *_invalid_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
@@ -204,7 +204,7 @@ def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArra
     return np.concatenate(pieces) if pieces else stamps[:0], begins
 
 
-def _near(recorded: PoseRecording, track: Track, before: Track, hands: HandSettings) -> Track:
+def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settings) -> Track:
     """The track with NaN for poses that are too far away; `before` is the track as published.
 
     Raises RecordingError if all poses are too far away.
@@ -212,7 +212,7 @@ def _near(recorded: PoseRecording, track: Track, before: Track, hands: HandSetti
     with np.errstate(all="ignore"):
         is_far = np.linalg.norm(track.poses[:, :3], axis=1) > MAX_HAND_DISTANCE_M
     if len(is_far) and is_far.all():
-        why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), hands)
+        why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings)
         if recorded.is_captured:
             rule = "the unit in the file is used, and [hands] unit is ignored"
             why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that the file names"
@@ -252,15 +252,19 @@ def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
 
 
 def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) in frame `base` [m], given those in the tracker's frame and unit."""
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
+    if hands.axes == "left-handed":
+        positions = positions * (1.0, 1.0, -1.0)
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
     return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
 
 
-def far_away(name: str, frame: str, position: Sequence[float], hands: HandSettings) -> str:
+def far_away(name: str, frame: str, position: Sequence[float], settings: Settings) -> str:
     """Message and remedy for a stream's position, as published, that is too far away."""
+    hands, section = settings.hands_in(frame), settings.tracker_section(frame)
     if is_by_tracker(name, frame, hands):
-        return f"{too_far(position, hands.unit)}: set [hands] unit in the cell's settings (--config)"
+        rule = f"{section} unit is {hands.unit!r}"
+        return f"{too_far(position, hands.unit, rule)}: set {section} unit in the cell's settings (--config)"
     rule = f"{name} in frame {BASE!r} is always in metres, and [hands] unit is ignored"
     also = ", or with the tracker's frame of [hands] frame, in which positions are in [hands] unit"
     return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
@@ -273,11 +277,11 @@ def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
     known = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
     return (
         f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) with this [hands] frame "
-        "and its pose, [hands] base_from_tracker"
+        f"and its pose, [hands] base_from_tracker, or with a table [trackers.{frame}]"
     )
 
 
-def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> tuple[list[Track], list[str]]:
+def in_base(path: str | Path, tracks: Sequence[Track], settings: Settings) -> tuple[list[Track], list[str]]:
     """Tracks of left hand, right hand and tool in frame `base`, and a remark on which of them were
     transformed.
 
@@ -286,21 +290,24 @@ def in_base(path: str | Path, tracks: Sequence[Track], hands: HandSettings) -> t
     other frames.
     """
     for track in tracks:
-        if problem := unknown_frame(track.name, track.frame, hands):
+        if problem := unknown_frame(track.name, track.frame, settings.hands_in(track.frame)):
             raise RecordingError(f"{path}: {problem}")
-    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
-    if hands.unit == "m" and not origin.any() and np.array_equal(axes, np.eye(3)):
-        return list(tracks), []
-    turn, out, mapped = Rotation.from_matrix(axes), list(tracks), []
+    out, mapped, sections = list(tracks), [], dict[str, None]()
     for i, track in enumerate(tracks):
-        if is_by_tracker(track.name, track.frame, hands):
+        hands = settings.hands_in(track.frame)
+        is_left_handed = hands.axes == "left-handed"
+        is_changed = is_left_handed or not np.array_equal(base_from(hands), np.eye(3, 4))
+        if is_by_tracker(track.name, track.frame, hands) and is_changed:
+            turn = Rotation.from_matrix(rotation(hands.base_from_tracker[3:]))
             poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
             if some.any():
                 poses[some, :3] = from_tracker(track.poses[some, :3], hands)
-                poses[some, 3:] = (turn * Rotation.from_quat(track.poses[some, 3:])).as_quat()
+                given = track.poses[some, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
+                poses[some, 3:] = (turn * Rotation.from_quat(given)).as_quat()
             out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
-    remark = f"{', '.join(mapped)} transformed to frame {BASE} by [hands] unit and base_from_tracker"
+            sections[settings.tracker_section(track.frame)] = None
+    remark = f"{', '.join(mapped)} transformed to frame {BASE} by {' and '.join(sections)} unit and base_from_tracker"
     return out, [remark] if mapped else []
 
 

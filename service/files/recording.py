@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.messages import SceneObject
-from service.core.frame import Outputs, Record, Tick, encode
+from service.core.frame import DType, Outputs, Record, Tick, encode
 from service.core.transforms import Frames
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.files.mcap_reader import FileFault, Messages
@@ -185,6 +185,7 @@ class Recording:
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
         self.faults: list[FileFault] = []  # complete once all steps are read
+        self.recorded_as: dict[str, DType] = {}  # the layout of its states, once one is read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -239,7 +240,8 @@ class Recording:
                 "--output whole.mcap writes a recording with all frames"
             )
         messages = Messages(self.path)
-        yield from steps(messages, self.settings, outputs=outputs, whole=not self.checksums)
+        whole = not self.checksums
+        yield from steps(messages, self.settings, outputs=outputs, whole=whole, recorded_as=self.recorded_as)
         self.faults = messages.faults
         self.truncated = any(fault.cut for fault in messages.faults)
 

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from service.contract import channels
 from service.contract.messages import WireError
 from service.core.controller import Controller, outgoing, run
-from service.core.frame import Event, Frame, Tick, differences, encode
+from service.core.frame import Event, Frame, Tick, converted, differences, encode
 from service.files.mcap_file import RecordingError, machine
 from service.files.recording import Recorder, Recording
 from service.files.steps import Gap, Step, checksum
@@ -254,7 +254,8 @@ class _Comparison:
         if step.state is not None and state is not None:
             different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
         outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
-        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        then = state if state is None else converted(state, self.recording.recorded_as.get("state", state.dtype))
+        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, then))
         if self.recorder:
             self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
         result.ticks += 1

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from service.settings.arm_description import UnreadableError
 from service.settings.config import WAM, Settings, converted, load
+from service.settings.file_content import UnreadableError
 
 if TYPE_CHECKING:
     from service.learning.skill_file import StoredSkill

@@ -9,14 +9,32 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from mcap.records import Schema
+
 from service.contract import cdr, channels
 from service.contract.messages import WireError
-from service.core.frame import TIMING, Frame, Outputs, Record, decode, encode, frame_layout, state_layout
+from service.contract.records import definition
+from service.core.frame import (
+    STATE,
+    TIMING,
+    DType,
+    Frame,
+    Outputs,
+    Record,
+    converted,
+    decode,
+    dtype_of,
+    encode,
+    frame_layout,
+    state_layout,
+)
 from service.files.mcap_file import RecordingError
 from service.files.mcap_reader import Messages
 from service.settings.config import Settings
 
 _RECORDS = ("frame", "timing", "state")
+# Fields of a State that recordings of earlier versions lack: these versions behaved as with a 0.
+LATER_FIELDS = {"clutch_until_tick", "gripper_wish", "engaging"}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
@@ -67,11 +85,23 @@ def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
     return zlib.crc32(b"".join(parts))
 
 
-def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
+def _layout_in(schema: Schema | None, joints: int) -> DType:
+    """The layout of the states of a recording, by the definition in it: today's, or one of an
+    earlier version, without some of LATER_FIELDS.
+    """
+    text = schema.data.decode(errors="replace") if schema else ""
+    then = tuple(field for field in STATE if field.name not in LATER_FIELDS or f" {field.name}\n" in text)
+    return dtype_of(then, joints) if definition(then, joints) == text else state_layout(joints)
+
+
+def steps(
+    messages: Messages, settings: Settings, *, outputs: bool, whole: bool, recorded_as: dict[str, DType]
+) -> Iterator[Step]:
     """Every complete tick in order, after the initial state if there is one.
 
-    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. Raises
-    RecordingError for messages that cannot be decoded.
+    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. The
+    layout in which states were recorded is put into `recorded_as`; they are converted from it.
+    Raises RecordingError for messages that cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
@@ -94,7 +124,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
         yield Step(**step | {"events": tuple(step["events"])})
 
     try:
-        for _, channel, message in messages:
+        for schema, channel, message in messages:
             if len(messages.faults) > seen:
                 yield from finished()
                 damage = "; ".join(str(fault) for fault in messages.faults[seen:])
@@ -103,6 +133,10 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
             if name is None or (name in _RECORDS and not outputs):
                 continue
             data = message.data
+            if name == "state":
+                then = recorded_as.setdefault("state", _layout_in(schema, joints))
+                if then != layouts["state"]:
+                    data = encode(converted(decode(data, then), layouts["state"]))
             if name == "tick":
                 yield from finished()
                 index, kinds, lost = cdr.decode_tick(data)

@@ -144,7 +144,9 @@ class _Verdict(NamedTuple):
 
 def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdict]:
     """The decisions on each track, as `left` or `right` hand of one intake, in order of stamps."""
-    hands = msgspec.structs.replace(settings.hands, frame=BASE, unit="m", base_from_tracker=(0, 0, 0, 0, 0, 0, 1))
+    hands = HandSettings()
+    mapped = {name: getattr(hands, name) for name in ("frame", "unit", "axes", "base_from_tracker")}
+    hands = msgspec.structs.replace(settings.hands, **mapped)
     settings = msgspec.structs.replace(settings, hands=hands)
     intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
     intake.begin(state)

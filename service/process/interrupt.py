@@ -54,10 +54,11 @@ def too_late() -> None:
 
 
 def _raise_to_clean_up(number: int, frame: FrameType | None) -> None:
-    """Handle SIGINT in Python. `_serve` handles all other cases, without waiting for bytecode."""
-    if _CLEANS_UP.is_set() and not _RAISED.is_set():
-        _RAISED.set()
-        raise KeyboardInterrupt
+    """Handle SIGINT in Python. `_serve` handles it too, without waiting for bytecode."""
+    if not _CLEANS_UP.is_set() or _RAISED.is_set():
+        end_at_once()  # `_serve` does nothing if clean_up_first() begins before its turn
+    _RAISED.set()
+    raise KeyboardInterrupt
 
 
 def _serve(signals: int) -> None:

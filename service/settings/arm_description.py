@@ -6,20 +6,13 @@ import math
 from pathlib import Path
 from typing import Any, Protocol
 
-from service.contract.explain import ExplainedError, in_words
+from service.contract.explain import in_words
+from service.settings.file_content import SettingsError
 from service.settings.robot_xml import readable
 from service.settings.urdf import Shape, Urdf, UrdfError
 
 ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] assumed before the kinematics are known
 MAX_MB = 20  # a humanoid's URDF has 0.1 MB
-
-
-class SettingsError(ExplainedError, ValueError):
-    """A configuration cannot be used; the message has the field, its value, and accepted values."""
-
-
-class UnreadableError(SettingsError):
-    """A file with settings cannot be read."""
 
 
 def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:

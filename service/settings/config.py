@@ -6,6 +6,7 @@ Each number has its unit in its name or in its comment. All defaults are safe.
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +15,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.contract import ros2
+from service.contract.channels import CellName
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.arm_description import SettingsError, UnreadableError, check, completed, description
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.contract.messages import BASE
+from service.settings.arm_description import check, completed, description
+from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
 from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
@@ -26,14 +29,6 @@ MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
 REACHED_SHARE = 0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
 LEAST_REACHED_SHARE = 0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-_LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
-Cell = Annotated[
-    str,
-    msgspec.Meta(
-        pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
-    ),
-]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
 PerJoint = tuple[float, ...]
@@ -57,7 +52,8 @@ class HandSettings(Section, frozen=True):
 
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after unit and axes
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
     unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
@@ -66,6 +62,19 @@ class HandSettings(Section, frozen=True):
     jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
     jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
     swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
+    clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
+    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
+    gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
+
+
+class TrackerSettings(Section, frozen=True):
+    """One more tracker beside that of `[hands]`. NAME is the frame of its poses: hands in that
+    frame, and the tool in demonstrations, are mapped by this table. `[hands]` maps its own `frame`.
+    """
+
+    unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
+    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
 
 
 class ToolSettings(Section, frozen=True):
@@ -73,6 +82,7 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.0  # [m/s] until the tool reaches its target; 0: off
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
@@ -83,6 +93,14 @@ class ToolSettings(Section, frozen=True):
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
     stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
+
+    @property
+    def engaging_speed(self) -> float:
+        """Speed limit of the setpoint [m/s] from the start of following until it is at its target
+        for the first time: `engage_speed`, but at most `max_speed`, which also holds for an
+        `engage_speed` of 0.
+        """
+        return min(self.engage_speed or self.max_speed, self.max_speed)
 
     @property
     def acceleration(self) -> float:
@@ -250,9 +268,10 @@ class Files(Section, frozen=True):
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
-    cell: Cell = "thirdhand"  # prefix of all keys on Zenoh
+    cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
     rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
+    trackers: dict[str, TrackerSettings] = {}
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
     arm: ArmSettings = msgspec.field(default_factory=ArmSettings)
     joints: JointSettings = msgspec.field(default_factory=JointSettings)
@@ -289,8 +308,14 @@ class Settings(Section, frozen=True):
             yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
         if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
             yield f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, in any order"
+        for name in self.trackers:
+            if not re.fullmatch(r"[\w./-]{1,64}", name):
+                yield f"$.trackers: the frame {name!r} given; 1 to 64 letters, digits and _ . / - accepted"
+            elif name in (BASE, self.hands.frame):
+                yield f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and $.hands.frame needed"
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
+            *((f"$.trackers.{name}.base_from_tracker", one.base_from_tracker) for name, one in self.trackers.items()),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
@@ -302,6 +327,11 @@ class Settings(Section, frozen=True):
             yield (
                 f"$.tool.fault_speed: {self.tool.fault_speed} given; "
                 f"at least $.tool.max_speed = {self.tool.max_speed} needed"
+            )
+        if self.tool.engage_speed > max(self.tool.max_speed, ToolSettings().engage_speed):
+            yield (
+                f"$.tool.engage_speed: {self.tool.engage_speed} given; "
+                f"at most $.tool.max_speed = {self.tool.max_speed} accepted"
             )
         if self.reach.inner >= self.reach.outer:
             yield f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
@@ -341,6 +371,27 @@ class Settings(Section, frozen=True):
             return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
         n = len(self.joints.names)
         return {name: (-math.inf if name == "lower" else math.inf,) * n for name in LIMITS}
+
+    @property
+    def tracker_frames(self) -> tuple[str, ...]:
+        """Names of the frames that a hand's pose may have; the empty name stands for the frame of
+        `[hands]`.
+        """
+        own = () if self.hands.frame in ("", BASE) else (self.hands.frame,)
+        return (BASE, *own, "", *self.trackers)
+
+    def tracker_section(self, frame: str) -> str:
+        """The table that maps poses in a frame."""
+        return f"[trackers.{frame}]" if frame in self.trackers else "[hands]"
+
+    def hands_in(self, frame: str) -> HandSettings:
+        """`[hands]` for poses in a frame: with the frame, unit and pose of its tracker, if it has
+        settings of its own.
+        """
+        if (tracker := self.trackers.get(frame)) is None:
+            return self.hands
+        of_tracker = {"unit": tracker.unit, "axes": tracker.axes, "base_from_tracker": tracker.base_from_tracker}
+        return msgspec.structs.replace(self.hands, frame=frame, **of_tracker)
 
     @property
     def period_s(self) -> float:

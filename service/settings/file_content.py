@@ -1,4 +1,6 @@
-"""Bounded reading of files: never more than expected, and no waiting for devices or pipes."""
+"""Bounded reading of files: never more than expected, and no waiting for devices or pipes; and the
+errors of a configuration.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,14 @@ LARGEST_CONFIGURATION = 1_000_000  # [bytes]
 
 class UnusableError(ExplainedError, ValueError):
     """A file cannot be used; the message has the cause."""
+
+
+class SettingsError(ExplainedError, ValueError):
+    """A configuration cannot be used; the message has the field, its value, and accepted values."""
+
+
+class UnreadableError(SettingsError):
+    """A file with settings cannot be read."""
 
 
 def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> bytes:

@@ -123,8 +123,9 @@ class Capture:
         if isinstance(message, PoseStamped):
             if not finite(message.position + message.orientation):
                 raise WireError("a pose that is not finite")
-            is_scaled = is_by_tracker(key, message.frame_id, self.settings.hands)
-            return UNIT_M[self.settings.hands.unit if is_scaled else "m"] * np.array(message.position)
+            hands = self.settings.hands_in(message.frame_id)
+            is_scaled = is_by_tracker(key, message.frame_id, hands)
+            return UNIT_M[hands.unit if is_scaled else "m"] * np.array(message.position)
         return np.array(message.position[:1])
 
     @property
@@ -135,17 +136,17 @@ class Capture:
 
     def check(self) -> None:
         """Raise CaptureError if a hand or the tool is too far away, or in an unknown frame."""
-        hands = self.settings.hands
         for key in (*self.hands, TOOL_KEY):
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
+                hands = self.settings.hands_in(pose.frame_id)
                 at = np.array(pose.position)
                 if problem := unknown_frame(key, pose.frame_id, hands):
                     raise CaptureError(f"{problem}. Nothing was recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
                     at = from_tracker(at, hands)
                 if np.linalg.norm(at) > MAX_HAND_DISTANCE_M:
-                    why = far_away(key, pose.frame_id, pose.position, hands)
+                    why = far_away(key, pose.frame_id, pose.position, self.settings)
                     raise CaptureError(f"{key} is {why}. Nothing was recorded")
 
     @property

@@ -70,7 +70,7 @@ class DynamicScene:
     def restart(self) -> None:
         """Start another file: its time begins at 0, and the mode is sent again."""
         self._followed = False
-        self._shown: tuple[int, int] | None = None
+        self._shown: tuple[int, int, bool] | None = None
         self._mode_sent_ns = 0
         self._last_tick = -1
         self._start_ns: int | None = None
@@ -206,9 +206,10 @@ class DynamicScene:
         return angles
 
     def _modes(self, frames: NDArray[Any], times: NDArray[np.int64], columns: Columns) -> Iterator[rr.chunk.Chunk]:
-        """Mode and reason where they change; to live viewers also every REPEAT_S."""
+        """Mode, reason and engaging where they change; to live viewers also every REPEAT_S."""
         changed, sent = [], []
-        for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), strict=True)):
+        engaging = (frames["flags"] & int(Flag.ENGAGING) > 0).tolist()
+        for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)):
             if now != self._shown:
                 changed.append(i)
                 self._shown = now
@@ -222,7 +223,7 @@ class DynamicScene:
         yield columns("/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
         yield columns("/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
         for i in sent:
-            picture = banner(modes[i], reasons[i])
+            picture = banner(modes[i], reasons[i], engaging[i])
             layout = rr.components.ImageFormat(
                 width=picture.shape[1], height=picture.shape[0], color_model="RGB", channel_datatype="U8"
             )
@@ -230,9 +231,8 @@ class DynamicScene:
             yield columns("/scene/banner", [i], texture)
         for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
-            yield columns(
-                "/log", [i], rr.TextLog.columns(text=[log_line(modes[i], reasons[i], self._settings)], level=[level])
-            )
+            text = log_line(modes[i], reasons[i], engaging[i], self._settings)
+            yield columns("/log", [i], rr.TextLog.columns(text=[text], level=[level]))
 
     def _scene(
         self,

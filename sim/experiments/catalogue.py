@@ -159,4 +159,5 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "demonstrations", ("learning", "kmp"), Seeds(_scenes(40) | _HELD_OUT, tuning=TUNED_SCENES, learned=_ORDERS)
     ),
     "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
+    "camera": Experiment("camera", (), Seeds({"hands": Stream("rendered hands", 0, range(12))})),
 }

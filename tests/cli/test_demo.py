@@ -18,7 +18,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import EVENT_TITLES, exit_code, text
+from service.cli.demo import EVENT_TITLES, NEVER_THERE, exit_code, text
 from service.settings.config import WAM
 from support.cell import thirdhand, told
 from support.paths import ROOT
@@ -140,3 +140,13 @@ def test_each_cause_of_a_failed_demo_is_printed_once() -> None:
         assert shown.count(cause) == 1
     assert shown.count("for the same reason") == 1
     assert f"  machine  too busy: {bench}\n" in shown
+
+
+def test_an_event_whose_places_the_hands_never_reached_has_no_distance() -> None:
+    report = report_of(None, "the arm held", "the arm held")
+    for name in ("grasp", "carry"):
+        report["events"][name] |= {"error_mm": None, "why": NEVER_THERE}
+    shown = text(report)
+    assert shown.count(NEVER_THERE) == 2
+    assert shown.count("MISSED\n") == 2
+    assert "mm  at" in shown.splitlines()[0]

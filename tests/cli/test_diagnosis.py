@@ -79,6 +79,16 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     assert told >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
 
 
+def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
+    """Only if it is there all the time, and deeper than a hand's noise."""
+    before = msgspec.structs.replace(HEALTHY, below_table_m={"right": 0.05, "left": 0.01})
+    now = msgspec.structs.replace(before, tick=2000, time_ns=before.time_ns + 2 * 10**9)
+    (text,) = wrongs(findings(before, now, own_ns=now.time_ns, own_version="0.1.0"))
+    assert "calibration        below the table top: right hand 5 cm" in text
+    assert "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose" in text
+    assert wrongs(findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0")) == []
+
+
 def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
     refused = {"fresh": False, "age_ms": None, "rejected": {"wrong_frame": 200}, "cause": "wrong_frame"}
     (told,) = wrongs(diagnosed(sources=source("right", **refused)))
@@ -269,6 +279,23 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
     assert "are the drives on?" in told[0]
     assert [line.split()[1] for line in told] == ["arm's", "mode"]
     assert "whether its drives are on" in what_to_do("arm_error")
+
+
+@pytest.mark.parametrize(
+    ("lag_ms", "level", "words"),
+    [
+        (None, "ok", "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"),
+        (12.3, "ok", "the arm follows its commands 12 ms late"),
+        (51.7, "note", "the arm follows its commands 52 ms late"),
+    ],
+)
+def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, level: str, words: str) -> None:
+    found = findings(HEALTHY, HEALTHY, own_ns=HEALTHY.time_ns, own_version="0.1.0", lag_ms=lag_ms)
+    (one,) = (finding for finding in found if finding.what == "arm's lag")
+    assert (one.level, one.found) == (level, words)
+    assert ("lead by the lag: write position + lag * velocity" in one.text()) == (level == "note")
+    alone = msgspec.structs.replace(HEALTHY, sources={"left": GOOD, "right": GOOD})
+    assert "arm's lag" not in {finding.what for finding in findings(alone, alone, own_ns=0, own_version="0.1.0")}
 
 
 @pytest.mark.parametrize(

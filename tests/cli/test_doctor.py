@@ -149,7 +149,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
                 return "wrong_frame" in str(status["because"])
 
             told = daemon.until(refused)
-            assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "set [hands] frame a")
+            assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "find [hands] frame ")
             assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
             assert set(told["hands_m"]) == {"left", "right"}
             time.sleep(1.5)  # for a line of the watch

@@ -71,8 +71,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 FROZEN = """
 import sys
 from service.__main__ import main
-from service.cli import live_page
-live_page.FROZEN_S = 2.0
+from service.trackers import web_server
+web_server.FROZEN_S = 2.0
 sys.exit(main())
 """
 

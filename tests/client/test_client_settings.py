@@ -16,8 +16,8 @@ from service.cli.main import main
 from service.client import Client, Tracker, UnreachableError, client_settings, endpoints, open_session
 from service.contract import cdr
 from service.daemon.launch import free_port
-from service.settings.arm_description import SettingsError
 from service.settings.config import Settings
+from service.settings.file_content import SettingsError
 from support.cell import serving, thirdhand
 from support.paths import ROOT
 

@@ -1,16 +1,24 @@
-"""The examples of trackers: what their conversions make of synthetic hands and rigid bodies."""
+"""The examples of trackers: what they make of synthetic rigid bodies, packets and messages."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.contract import cdr
-from service.contract.messages import PoseStamped
+from service.client import Watch, endpoints, open_session
+from service.contract import cdr, ros2
+from service.contract.messages import PoseStamped, Transform
+from support.cell import until
 from support.paths import ROOT
 
 
@@ -24,29 +32,6 @@ def example(name: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_hand_in_a_picture_is_where_it_was_seen(seed: int) -> None:
-    """Landmarks of a hand of 18 cm at a known pose, seen by a pinhole camera."""
-    mediapipe = example("mediapipe_hands")
-    rng = np.random.default_rng(seed)
-    hand = rng.uniform(-0.09, 0.09, (21, 3)) * [1.0, 0.6, 0.3]
-    turn, at = Rotation.random(rng=rng), np.array([0.1, -0.15, 0.8]) + 0.1 * rng.standard_normal(3)
-    shape = turn.apply(hand)
-    seen = shape + at
-    picture = 900.0 * seen[:, :2] / seen[:, 2:] / [1280, 720] + 0.5
-    pose = mediapipe.hand_pose(shape, picture, 900.0, (1280, 720), 5)
-    assert (pose.stamp_ns, pose.frame_id) == (5, "camera")
-    np.testing.assert_allclose(pose.position, (seen[0] + seen[5] + seen[17]) / 3, atol=1e-9)
-    axes = Rotation.from_quat(pose.orientation).as_matrix()
-    along = (seen[9] - seen[0]) / np.linalg.norm(seen[9] - seen[0])
-    np.testing.assert_allclose(axes[:, 0], along, atol=1e-3)
-    assert axes[:, 1] @ (seen[5] - seen[17]) > 0
-    assert np.linalg.norm(pose.orientation) == pytest.approx(1.0)
-    noisy = mediapipe.hand_pose(shape, picture + 0.001 * rng.standard_normal((21, 2)), 900.0, (1280, 720), 5)
-    assert np.abs(np.array(noisy.position) - pose.position).max() < 0.05
-    assert cdr.decode_pose(cdr.encode_pose(pose)) == pose
-
-
 def test_rigid_bodies_that_are_tracked_are_hands() -> None:
     def body(number: int, *, tracked: bool = True) -> SimpleNamespace:
         return SimpleNamespace(id_num=number, pos=(0.1, 1.0, 0.2), rot=(0.0, 0.6, 0.0, 0.8), tracking_valid=tracked)
@@ -56,6 +41,103 @@ def test_rigid_bodies_that_are_tracked_are_hands() -> None:
     assert found == {"hands/right": PoseStamped(9, "optitrack", (0.1, 1.0, 0.2), (0.0, 0.6, 0.0, 0.8))}
 
 
-@pytest.mark.parametrize("name", ["mediapipe_hands", "optitrack_hands"])
+def vicon_packet(*objects: tuple[bytes, tuple[float, ...]]) -> bytes:
+    """A packet of Vicon Tracker's UDP object stream, padded as it comes."""
+    items = b"".join(struct.pack("<BH24s6d", 0, 72, name, *numbers) for name, numbers in objects)
+    return struct.pack("<IB", 7, len(objects)) + items + bytes(40)
+
+
+VICON = vicon_packet((b"iron", (1.0,) * 6), (b"left", (100.0, -200.0, 300.0, 0.4, -0.5, 0.6)), (b"right", (0.0,) * 6))
+HTS = b"""Left wrist | f = 12 | t = 99:, 0.1, 1.2, 0.5, 0.1, -0.5, 0.5, 0.7
+Left landmarks:, 1, 2, 3
+Head pose:, 0, 0, 0, 0, 0, 0, 1
+"""
+TF = cdr.encode_transforms(
+    9,
+    [
+        Transform("world", "iron", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)),
+        Transform("/world", "left", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)),
+    ],
+)
+KEYS = {"left": "hands/left", "right": "hands/right"}
+
+
+def test_an_object_of_vicon_is_a_hand_in_metres_and_one_that_is_not_seen_is_none() -> None:
+    ((key, pose),) = example("vicon_hands").poses(VICON, KEYS, 9)
+    assert (key, pose[:3]) == ("hands/left", (9, "vicon", (0.1, -0.2, 0.3)))
+    np.testing.assert_allclose(pose.orientation, Rotation.from_euler("XYZ", [0.4, -0.5, 0.6]).as_quat(), atol=1e-12)
+
+
+@pytest.mark.parametrize("packet", [b"", b"abc", VICON[:50], b"\0\0\0\0\xff" + bytes(300)])
+def test_other_bytes_are_no_packet_of_vicon(packet: bytes) -> None:
+    with pytest.raises(ValueError, match=f"{len(packet)} bytes are no packet of Vicon Tracker's UDP object stream"):
+        list(example("vicon_hands").poses(packet, KEYS, 9))
+
+
+def test_a_wrist_of_the_streamer_is_a_hand_whose_axes_are_right_handed() -> None:
+    """A mirrored rotation turns mirrored points to where the mirrored turned points are."""
+    ((key, pose),) = example("hts_hands").poses(HTS, 9)
+    assert (key, pose[:3]) == ("hands/left", (9, "hts", (0.1, 1.2, -0.5)))
+    unity, mirror, point = (
+        Rotation.from_quat([0.1, -0.5, 0.5, 0.7]),
+        np.array([1.0, 1.0, -1.0]),
+        np.array([1.0, 2.0, 3.0]),
+    )
+    np.testing.assert_allclose(Rotation.from_quat(pose.orientation).apply(mirror * point), mirror * unity.apply(point))
+
+
+@pytest.mark.parametrize("values", ["1, 2, 3", "0, 0, 0, 0, 0, 0, nan", "a, 0, 0, 0, 0, 0, 1"])
+def test_a_wrist_without_seven_numbers_is_refused(values: str) -> None:
+    with pytest.raises(ValueError, match=r"seven finite numbers after a wrist|could not convert string to float"):
+        list(example("hts_hands").poses(f"Right wrist:, {values}".encode(), 9))
+
+
+def test_a_frame_of_tf_is_a_hand_in_its_parents_frame() -> None:
+    found = list(example("tf_hands").poses(TF, KEYS))
+    assert found == [("hands/left", PoseStamped(9, "world", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)))]
+
+
+@pytest.mark.parametrize(("name", "frame"), [("vicon_hands", "vicon"), ("hts_hands", "hts"), ("tf_hands", "world")])
+def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name: str, frame: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    topic = ros2.key(3, ros2.Topic("/tf", "tf2_msgs/msg/TFMessage", "/tf"))
+    named = ["--left", "left", "--right", "right"] if name != "hts_hands" else []
+    where = ["--domain", "3"] if name == "tf_hands" else ["--port", str(port)]
+    packets = {"vicon_hands": VICON, "hts_hands": HTS, "tf_hands": TF}
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as session,
+        Watch(session, "thirdhand", "hands/left", timeout_s=0.2) as hands,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        command = [
+            sys.executable,
+            str(ROOT / "examples" / f"{name}.py"),
+            *named,
+            *where,
+            "--connect",
+            *endpoints(session),
+        ]
+        running = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
+        try:
+
+            def received() -> PoseStamped | None:
+                for packet in (b"nonsense", packets[name]):
+                    if name == "tf_hands":
+                        session.put(topic, packet)
+                    else:
+                        sender.sendto(packet, ("127.0.0.1", port))
+                pose: PoseStamped | None = next(hands)
+                return pose
+
+            assert until(received, within_s=60).frame_id == frame
+        finally:
+            running.send_signal(signal.SIGINT)
+            _, errors = running.communicate(timeout=30)
+    assert b"Traceback" not in errors
+
+
+@pytest.mark.parametrize("name", ["optitrack_hands", "vicon_hands", "hts_hands", "tf_hands"])
 def test_an_example_is_short(name: str) -> None:
-    assert len((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 80
+    assert len((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 90

@@ -82,6 +82,32 @@ def test_joint_states_are_the_bytes_of_another_implementation(
     assert cdr.decode_joints(encoded) == message
 
 
+@given(st.booleans())
+def test_bools_are_the_bytes_of_another_implementation(value: bool) -> None:
+    data = cdr.encode_bool(value)
+    assert data == _bytes(channels.BOOL.type, value)
+    assert cdr.decode_bool(data) is value
+
+
+@pytest.mark.parametrize(
+    ("names", "position", "words"),
+    [
+        (("gripper",), (0.25,), ""),
+        (("finger", "gripper"), (9.0, 1.0), ""),
+        (("gripper",), (1.01,), "gripper at 1.01; 0 (open) to 1 (closed) needed"),
+        (("gripper",), (math.nan,), "gripper at nan; 0 (open) to 1 (closed) needed"),
+        (("finger",), (0.5,), "joints ['gripper'] missing among 1, finger"),
+    ],
+)
+def test_a_wish_for_the_gripper_is_a_number_from_0_to_1(names: Any, position: Any, words: str) -> None:
+    data = cdr.encode_joints(messages.JointState(1, names, position, ()))
+    if not words:
+        assert channels.CLOSURE.decode(data) == position[names.index("gripper")]
+        return
+    with pytest.raises(messages.WireError, match=re.escape(words)):
+        channels.CLOSURE.decode(data)
+
+
 sizes = st.tuples(*[st.floats(1e-3, 10.0)] * 3)
 shares = st.floats(0.0, 1.0, width=32)
 turns = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda turn: math.hypot(*turn) > 0.1)
@@ -288,6 +314,7 @@ def test_the_error_of_a_request_names_the_place_in_it(data: bytes, kind: Any, er
 
 def test_events_keep_the_numbers_that_recordings_know_them_by() -> None:
     kinds = ["hands/left", "hands/right", "joints/state", "skill", "hold", "resume", "reset", "fault", "way", "stage"]
+    kinds += ["clutch", "gripper/wish"]
     assert dict(enumerate(kinds)) == channels.EVENT_KINDS
 
 

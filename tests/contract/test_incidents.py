@@ -42,7 +42,7 @@ def test_a_new_member_does_not_import_until_it_is_described(tmp_path: Path) -> N
     for kind in (Mode, Reason, Flag, Cause):
         first = f"    {next(iter(kind)).name} = "
         assert text.count(first) == 1
-        text = text.replace(first, f"    PLANTED_{kind.__name__.upper()} = 64\n{first}")
+        text = text.replace(first, f"    PLANTED_{kind.__name__.upper()} = 128\n{first}")
     records.write_text(text, encoding="utf-8")
     command = (sys.executable, "-c", "import service.contract.incidents")
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)

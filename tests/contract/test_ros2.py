@@ -16,7 +16,8 @@ from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
 from service.contract import cdr, channels, ros2
-from service.settings.config import SettingsError, parse
+from service.settings.config import parse
+from service.settings.file_content import SettingsError
 from service.settings.network import Ros2
 
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"

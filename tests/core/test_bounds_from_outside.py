@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.contract.records import Mode, Reason
+from service.contract.records import Flag, Mode, Reason
 from service.core.frame import Vector
 from service.settings.config import robot_description
 from support import bounds
@@ -38,6 +38,15 @@ def test_every_bound_is_kept_whatever_comes_in(arm: str, seed: int) -> None:
     happened = "\n  ".join(played.what_happens)
     passed = "\n  ".join(broken(played.session))
     assert not passed, f"seed {seed}\n  {passed}\nIn this session:\n  {happened}"
+    assert not played.replayed_otherwise, f"seed {seed}: played again, frames differ {played.replayed_otherwise}"
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], 500 + seed) for seed in SEEDS[:9]])
+def test_every_bound_is_kept_while_the_setpoint_engages_and_a_clutch_chatters(arm: str, seed: int) -> None:
+    played = play(seed, arm, **LENGTH, engages=True)
+    passed = "\n  ".join(broken(played.session))
+    assert not passed, f"seed {seed}\n  {passed}\nIn this session:\n  {played.what_happens}"
     assert not played.replayed_otherwise, f"seed {seed}: played again, frames differ {played.replayed_otherwise}"
 
 
@@ -109,6 +118,7 @@ SPOILED: dict[Bound, dict[str, float]] = {  # what is added to fields of a late 
     bounds.joints_jump_only_at_rest_and_to_where_the_arm_is: {"joints": 1e-3},
     bounds.joints_that_move_are_commanded: {"joint_velocities": 0.1, "commanded": 255},
     bounds.setpoint_speed_is_within_its_limit: {"setpoint_velocity": 1.0},
+    bounds.setpoint_is_slow_while_it_engages: {"setpoint_velocity": 1.0, "flags": Flag.ENGAGING},
     bounds.setpoint_acceleration_is_within_its_limit: {"setpoint_acceleration": 20.0},
     bounds.setpoint_jerk_is_within_its_limit: {"setpoint_acceleration": 5.0},
     bounds.setpoint_does_not_jump: {"setpoint": 1e-3},

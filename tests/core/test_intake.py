@@ -13,7 +13,8 @@ from service.contract.messages import PoseStamped
 from service.contract.records import Cause
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
-from service.settings.config import HandSettings
+from service.core.intake.stage import z_reversed
+from service.settings.config import HandSettings, TrackerSettings
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
 
@@ -32,6 +33,19 @@ def test_a_trackers_unit_becomes_metres(unit: str, scale: float) -> None:
 def test_a_turned_tracker_is_scaled_then_turned_then_moved() -> None:
     hands = Hands(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
     np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
+
+
+def test_left_handed_axes_become_right_handed_by_their_z_before_all_else() -> None:
+    mapping = (1.0, 2.0, 3.0, *QUARTER_TURN)
+    hands = Hands(HandSettings(unit="mm", axes="left-handed", base_from_tracker=mapping))
+    np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 - 0.003])
+    mirrored = np.diag([1.0, 1.0, -1.0])
+    for turn in (QUARTER_TURN, (0.1, -0.5, 0.7, 0.5)):
+        sample = z_reversed(PoseStamped(1, "unity", (0.1, 0.2, 0.3), turn))
+        assert sample.position == (0.1, 0.2, -0.3)
+        np.testing.assert_allclose(rotation(sample.orientation), mirrored @ rotation(turn) @ mirrored, atol=1e-15)
+    own = Hands(HandSettings(frame="unity", axes="left-handed"))
+    np.testing.assert_allclose(own.hand(1, (0.5, 0.1, 0.2)), [0.5, 0.1, 0.2])
 
 
 def test_a_rotation_turns_as_its_quaternion_does() -> None:
@@ -109,6 +123,31 @@ def test_a_pose_in_base_is_not_mapped_again_where_the_tracker_has_a_frame_of_its
     hands = Hands(HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT)))
     hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
     np.testing.assert_allclose(hands.state["hands"][LEFT, 0], (0.5004, 0.0002, 0.0001) if mapped else (0.4, 0.2, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("frame", "at"),
+    [
+        ("headset", (0.1 + 0.4, 0.2, 0.1)),
+        ("", (0.1 + 0.4, 0.2, 0.1)),
+        ("base", (0.4, 0.2, 0.1)),
+        ("optitrack", (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)),
+        ("vicon/world", (0.4, 0.2, 0.1)),
+        ("camera", None),
+    ],
+)
+def test_a_tracker_with_a_table_of_its_own_is_mapped_by_it(frame: str, at: tuple[float, ...] | None) -> None:
+    hands = Hands(
+        HandSettings(frame="headset", base_from_tracker=(0.1, 0.0, 0.0, *STRAIGHT)),
+        trackers={
+            "optitrack": TrackerSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)),
+            "vicon/world": TrackerSettings(),
+        },
+    )
+    hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
+    assert hands.rejected() == ({Cause.WRONG_FRAME: 1} if at is None else {})
+    if at is not None:
+        np.testing.assert_allclose(hands.state["hands"][LEFT, 0], at, atol=1e-12)
 
 
 def test_what_is_rejected_is_counted_by_source_too() -> None:

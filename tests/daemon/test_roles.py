@@ -28,7 +28,8 @@ from service.daemon.single_instance import NETWORK_BOUNDS
 from support.cell import LEFT, Tracker, thirdhand, told, until
 
 CELL = "bench"
-INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", "objects")
+NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
+INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", *NOT_DEMONSTRATED)
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2
@@ -152,7 +153,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
     assert guarded.taken == keys(role.publishes)
     assert got == (keys(OUTPUTS) if role.hears else set())
     assert passed_on == (
-        {channels.key(CELL, key) for key in INPUTS if key != "objects"} if role.hears_inputs else set()
+        {channels.key(CELL, key) for key in INPUTS if key not in NOT_DEMONSTRATED} if role.hears_inputs else set()
     )
     assert forged == []
     assert answered == (len(REQUESTS) if role.asks else 1)  # the status is for all
@@ -199,7 +200,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    tracked = {full[key] for key in ("hands/left", "hands/right", "tool/pose", "objects")}
+    tracked = {full[key] for key in ROLES["tracker"].publishes}
     assert {key for key, names in said.items() if b"tracker" in names} == tracked
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()

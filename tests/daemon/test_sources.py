@@ -214,7 +214,7 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
         cell.tell(("left", pose(k + 1, frame="camera")))
         cell.status(100 + k / 10)
     assert [line.split(":")[0] for line in cell.log] == ["left hand"]
-    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: set [hands] f" in cell.log[0]
+    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: find [hands]" in cell.log[0]
     cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse("a header of another kind")
     cell.status(103.0)
     assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
@@ -281,7 +281,7 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
         "the left hand has not been seen yet, as what arrives is rejected as wrong_frame: "
         "frame 'camera'; 'base', 'optitrack' or none accepted"
     )
-    assert told.remedy == "set [hands] frame and base_from_tracker, or publish in base"
+    assert told.remedy.startswith("find [hands] frame and base_from_tracker by thirdhand calibrate, also after the")
     assert told.frames == ("base", "optitrack", "")
     assert told.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
     assert (told.sources["right"].fresh, told.sources["left"].fresh) == (True, False)

@@ -16,6 +16,7 @@ from service.contract.ros2msg import schema
 from service.files.demonstration_reader import iter_hands, read_demonstration, write_demonstration
 from service.files.mcap_file import RecordingError
 from service.learning.demonstration import Demonstration
+from service.settings.config import Settings, TrackerSettings
 from support.recorded import START_NS, at_ns, write
 
 
@@ -39,6 +40,32 @@ def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path:
     for a, b in zip(got[:4], (stamps, *poses), strict=True):
         np.testing.assert_array_equal(a, b)
         assert not a.flags.writeable
+
+
+def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Path) -> None:
+    """Hands of a tracker in millimetres that is turned by 90 degrees, beside a tool in `base`."""
+    stamps, path = START_NS + np.arange(50) * 10_000_000, tmp_path / "a.mcap"
+    left, right, tool = _swaying(50)
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    seen = []
+    for poses in (left, right):
+        turned = quarter.inv() * Rotation.from_quat(poses[:, 3:])
+        seen.append(np.hstack([1000 * quarter.inv().apply(poses[:, :3] - [0.1, 0, 0]), turned.as_quat()]))
+    streams = {"/x/hands/left": seen[0], "/x/hands/right": seen[1], "/x/tool/pose": tool}
+    _streams(path, {name: (stamps, poses) for name, poses in streams.items()}, frame="mocap")
+    mocap = TrackerSettings(unit="mm", base_from_tracker=(0.1, 0.0, 0.0, *quarter.as_quat().tolist()))
+    remarks: list[str] = []
+    read = read_demonstration(path, settings=Settings(trackers={"mocap": mocap}), say=remarks.append)
+    for name, poses in (("left", left), ("right", right), ("tool", tool)):
+        np.testing.assert_allclose(getattr(read, name)[:, :3], poses[:, :3], atol=1e-9)
+    mapped = "hands/left, hands/right transformed to frame base by [trackers.mocap] unit and base_from_tracker"
+    assert mapped in remarks[0]
+    with pytest.raises(RecordingError, match="hands/left is in frame 'mocap'"):
+        read_demonstration(path)
+    far = Settings(trackers={"mocap": TrackerSettings()})
+    why = r"looks like cm; \[trackers.mocap\] unit is 'm'.*set \[trackers.mocap\] unit in"
+    with pytest.raises(RecordingError, match=why):
+        read_demonstration(path, settings=far)
 
 
 def test_a_gripper_comes_back_with_its_demonstration_at_the_tools_stamps(tmp_path: Path) -> None:

@@ -134,6 +134,8 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
     mixed = read_demonstration(bag(tmp_path / "mixed", {**ours, "/arm/tcp": tool}), settings=Settings(hands=hands))
     np.testing.assert_allclose(mixed.left[:, 2], WAY)
     np.testing.assert_allclose(mixed.right[:, 0], np.full(40, 1.3))
+    unity = read_demonstration(path, settings=Settings(hands=msgspec.structs.replace(hands, axes="left-handed")))
+    np.testing.assert_allclose(unity.left[:, 1], wanted[:, 1] - 0.6, atol=1e-12)  # the tracker's z points along -y
     with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
         read_demonstration(path)
     other = msgspec.structs.replace(hands, frame="optitrack")

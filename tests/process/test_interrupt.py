@@ -34,6 +34,17 @@ with interrupt.clean_up_first():
 """
 
 
+INTERRUPTED_JUST_BEFORE = """
+import os, signal, sys, time
+from service.process import interrupt
+interrupt.watch()
+sys.setswitchinterval(60)  # the thread gets its turn only when this one waits
+os.kill(os.getpid(), signal.SIGINT)
+with interrupt.clean_up_first():
+    time.sleep(5)
+"""
+
+
 def wait_for(what: Callable[[], bool], timeout_s: float = 60.0) -> None:
     end = time.monotonic() + timeout_s
     while not what():
@@ -160,6 +171,12 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=10)
     assert (process.returncode, said) == (130, f"{SAID}\n")
+
+
+def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:
+    command = [sys.executable, "-c", INTERRUPTED_JUST_BEFORE]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 
 
 def test_an_interrupt_that_is_ignored_stays_so() -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from service.daemon.launch import described
 from service.files.shipped import cell_of
-from service.settings.config import WAM, Files, Settings, SettingsError, load, parse, robot_description
+from service.settings.config import WAM, Files, Settings, load, parse, robot_description
+from service.settings.file_content import SettingsError
 from service.settings.network import Network, is_local
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
@@ -94,6 +95,16 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[hands]\nbase_from_tracker = [0, 0, 0]", "[hands] base_from_tracker", "7"),
         ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "[hands] base_from_tracker", "1 needed (x y z w)"),
         ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "[hands] base_from_tracker", "1 needed (x y z w)"),
+        ("[trackers.mocap]\nunit = 'inch'", "[trackers.mocap] unit", "'inch' given; cm, m, mm accepted"),
+        (
+            "[trackers.a]\nunit = 'm'\n[trackers.b]\nbase_from_tracker = [1]",
+            "[trackers.b] base_from_tracker",
+            "7 needed",
+        ),
+        ("[trackers.a]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "[trackers.a] base_from_tracker", "norm 1 needed"),
+        ("[trackers.a]\nunits = 'm'", "[trackers] a: unknown field 'units'", "did you mean unit?"),
+        ("[trackers.'a b']\nunit = 'm'", "trackers", "'a b' given; 1 to 64 letters, digits and _ . / -"),
+        ("[hands]\nframe = 'a'\n[trackers.a]\nunit = 'm'", "[trackers] a", "another one than 'base' and [hands] frame"),
         ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "[tool] plate_from_tool", "1 needed (x y z w)"),
         ("[tool]\nmax_speed = -1", "[tool] max_speed", "above 0"),
         ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "1.5"),

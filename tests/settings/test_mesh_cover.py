@@ -22,7 +22,8 @@ from scipy.spatial import ConvexHull
 from service.core.geometry import rotation
 from service.core.separation.body import body_of
 from service.settings.arm_description import description
-from service.settings.config import Settings, SettingsError, converted, parse, robot_description, urdf_path
+from service.settings.config import Settings, converted, parse, robot_description, urdf_path
+from service.settings.file_content import SettingsError
 from service.settings.mesh_cover import capsule_around, covered, unfound
 from service.settings.urdf import Shape, Urdf, UrdfError
 from support import arms

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from service.core.arm.stage import Arm
 from service.core.separation.body import body_of
 from service.settings.arm_description import description
-from service.settings.config import Settings, SettingsError, load, robot_description
+from service.settings.config import Settings, load, robot_description
+from service.settings.file_content import SettingsError
 from service.settings.urdf import Urdf
 from service.viewer.static import ArmModels
 from support.paths import ROOT

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from service.core.arm.stage import Arm
 from service.files.shipped import ARMS, cell_of
-from service.settings.config import Settings, SettingsError, load, parse, robot_description
+from service.settings.config import Settings, load, parse, robot_description
+from service.settings.file_content import SettingsError
 from service.settings.reachable import Shell, workspace_of
 from service.settings.urdf import Urdf
 from support.paths import ROOT

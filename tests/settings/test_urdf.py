@@ -9,7 +9,8 @@ import pinocchio as pin
 import pytest
 
 from service.core.arm.stage import Arm
-from service.settings.config import SettingsError, load, parse, robot_description
+from service.settings.config import load, parse, robot_description
+from service.settings.file_content import SettingsError
 from service.settings.urdf import Urdf, UrdfError, multiply
 from sim.scene import Scene
 from support.arms import MODELS, cell_of, toml_of, urdf_of

@@ -23,8 +23,8 @@ from service.core.separation.body import body_of
 from service.daemon.launch import ENGINES, described
 from service.files.shipped import ARMS, cell_of, shipped_skill
 from service.learning.via_points import adapted
-from service.settings.arm_description import UnreadableError
 from service.settings.config import Box, Obstacles, Reach, Settings, parse, robot_description
+from service.settings.file_content import UnreadableError
 from service.settings.urdf import Urdf
 from sim.bench import Bench
 from sim.engines import world_of

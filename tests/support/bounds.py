@@ -196,6 +196,14 @@ def setpoint_speed_is_within_its_limit(session: Session) -> Vector:
     return _rise(session, "setpoint_velocity", session.settings.tool.max_speed)
 
 
+def setpoint_is_slow_while_it_engages(session: Session) -> Vector:
+    """A setpoint that begins faster than that may only come down."""
+    speed, limit = _norms(session.frames["setpoint_velocity"]), session.settings.tool.engaging_speed
+    excess = speed[1:] - np.maximum(speed[:-1], limit) * (1.0 + ROUNDING) - ROUNDING
+    engages = session.frames["flags"] & Flag.ENGAGING > 0
+    return _with_first(np.where(_pairs(_following(session)) & engages[1:], excess, 0.0))
+
+
 def setpoint_acceleration_is_within_its_limit(session: Session) -> Vector:
     return _rise(session, "setpoint_acceleration", session.settings.tool.acceleration)
 
@@ -523,6 +531,7 @@ def hands_at_rest_and_resets_end_every_fault(session: Session) -> Vector:
 
 
 BOUNDS: tuple[Bound, ...] = (
+    setpoint_is_slow_while_it_engages,
     every_number_is_finite,
     joints_are_within_limits_or_move_inwards,
     joint_speeds_are_within_limits,

@@ -17,20 +17,25 @@ from typing import Any
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser")
 _OPTIONS = (
     "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist --no-first-run --remote-debugging-pipe"
+    "--ignore-gpu-blocklist --no-first-run --remote-debugging-pipe --ignore-certificate-errors"
 )
 
 
 class Tab:
     """A page in a browser."""
 
-    def __init__(self, to: int, source: int, url: str, timeout_s: float) -> None:
+    def __init__(self, to: int, source: int, url: str, timeout_s: float, before: str) -> None:
         self._to, self._source, self._rest, self._number = to, source, b"", 0
         self._until = time.monotonic() + timeout_s
-        target = self._call("Target.createTarget", {"url": url})["targetId"]
+        target = self._call("Target.createTarget", {"url": "about:blank" if before else url})["targetId"]
         self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True})["sessionId"]
+        if before:
+            self._call("Page.enable", {}, self._session)
+            self._call("Page.addScriptToEvaluateOnNewDocument", {"source": before}, self._session)
+            self._call("Page.navigate", {"url": url}, self._session)
 
-    def _call(self, method: str, params: dict[str, Any], session: str = "") -> Any:
+    def _post(self, method: str, params: dict[str, Any], session: str = "") -> None:
+        """Call a method without waiting for its answer."""
         self._number += 1
         message = {
             "id": self._number,
@@ -39,6 +44,9 @@ class Tab:
             **({"sessionId": session} if session else {}),
         }
         os.write(self._to, json.dumps(message).encode() + b"\0")
+
+    def _call(self, method: str, params: dict[str, Any], session: str = "") -> Any:
+        self._post(method, params, session)
         while True:
             while b"\0" not in self._rest:
                 left_s = self._until - time.monotonic()
@@ -67,6 +75,34 @@ class Tab:
         screen = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
         self._call("Emulation.setDeviceMetricsOverride", screen, self._session)
 
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`.
+
+        Its answer is not waited for: it comes with the next picture, which may be late.
+        """
+        button = {"button": "none" if kind == "Wheel" else "left", "buttons": int(kind in ("Pressed", "Moved"))}
+        self._post(
+            "Input.dispatchMouseEvent",
+            {"type": f"mouse{kind}", "x": x, "y": y, "clickCount": 1} | button | more,
+            self._session,
+        )
+
+    def touch(self, kind: str, *points: tuple[float, float]) -> None:
+        """An event of fingers, which are at these pixels: `Start`, `Move` or `End`.
+
+        Its answer is not waited for, because the browser gives none where it merges movements.
+        """
+        fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        self._post("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": fingers}, self._session)
+
+    def cover(self) -> None:
+        """Hide the page behind another one."""
+        self._call("Target.createTarget", {"url": "about:blank"})
+
+    def uncover(self) -> None:
+        """Show the page again."""
+        self._call("Page.bringToFront", {}, self._session)
+
     def picture(self, path: Path) -> None:
         """Saves what the page shows as PNG."""
         found = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
@@ -74,8 +110,12 @@ class Tab:
 
 
 @contextlib.contextmanager
-def opened(url: str, folder: Path, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0) -> Iterator[Tab]:
-    """A page of a browser of its own, whose files are in a folder."""
+def opened(
+    url: str, folder: Path, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0, before: str = ""
+) -> Iterator[Tab]:
+    """A page of a browser of its own, whose files are in a folder; the script `before` runs ahead
+    of the page's own, also when it is loaded again.
+    """
     (told, to), (source, tell) = os.pipe(), os.pipe()
     arguments = [str(PROGRAM), str(folder / "profile")]
     command = f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{told} 4>&{tell}'
@@ -89,7 +129,7 @@ def opened(url: str, folder: Path, *, size: tuple[int, int] = (1600, 1000), time
     os.close(told)
     os.close(tell)
     try:
-        yield Tab(to, source, url, timeout_s)
+        yield Tab(to, source, url, timeout_s, before)
     finally:
         browser.kill()
         browser.wait()

@@ -15,6 +15,7 @@ from service.settings.config import Box, Settings, parse
 from support.arms import MODELS, Model, toml_of
 
 XARM7 = Model("xarm7.urdf", "link7", (0.0, -0.3, 0.0, 1.2, 0.0, 1.5, 0.0))
+ENGAGE_SPEEDS_MPS = (0.01, 0.05, 0.15, 0.15, 0.4)
 ARMS = ("wam", "ur5", "franka", "panda", "wam", "xarm7")  # shipped ones, and two from other URDFs
 RATES_HZ = (100, 125, 250, 333, 500, 500, 500, 1000)
 TOOLS_M = ((0.0, 0.0, 0.12), (0.05, 0.0, 0.1), (0.0, 0.0, 0.25), (0.15, -0.1, 0.05))
@@ -102,4 +103,12 @@ def changes(cell: Settings, arm: str) -> str:
         if isinstance(values, dict)
         for name, value in values.items()
         if value != default[section][name]
+    )
+
+
+def engaging_cell(random: np.random.Generator, cell: Settings) -> Settings:
+    """A drawn cell with a clutch, whose setpoint engages at a speed drawn at random."""
+    speed = min(float(random.choice(ENGAGE_SPEEDS_MPS)), cell.tool.max_speed)
+    return replace(
+        cell, tool=replace(cell.tool, engage_speed=speed), hands=replace(cell.hands, clutch="key", gripper="key")
     )

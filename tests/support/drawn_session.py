@@ -31,9 +31,10 @@ from sim.script import HandScript
 from support.arm_geometry import ArmGeometry
 from support.bounds import Session
 from support.drawn_arms import KINDS, ODD_STAMPS_NS, WELL, DrawnArm
-from support.drawn_cells import changes, drawn_cell
+from support.drawn_cells import changes, drawn_cell, engaging_cell
 from support.drawn_hands import MOTIONS, REPORTS, Report, Surroundings, both, come_to_rest
 from support.explained import explained_controller
+from support.in_process import clutch
 from support.paths import RECORDINGS
 from support.starts import free_postures
 
@@ -44,6 +45,7 @@ WRONG_STAMPS_NS = (-(10**9), 10**9, 0, -2_000_000, 10**15)  # beside the right o
 LATEST_S = 0.09
 SEARCH_S, SEARCH_AGAIN_S, SEARCHES = 0.3, 2.0, 4  # of a way out: it takes; until the next; at most
 ELBOW_LINK, ELBOW_EVERY = 4, 10  # ticks
+CLUTCH_S, CLUTCH_SHARE = (0.002, 0.05, 1.0), 0.9  # mean time between press and release; ticks with a message
 STATES, REPLAYED = 2, 150  # from which the session is replayed, and for how many ticks
 
 
@@ -117,10 +119,16 @@ def script_hands() -> Vector:
     return np.array([[hand[:3] for hand in script.sample(t)] for t in np.linspace(0.0, script.duration_s, 25)])
 
 
-def play(seed: int, arm: str, *, wild_ticks: int, quiet_s: float, most_quiet_ticks: int) -> Played:
-    """The session of a seed: ticks in which anything may happen, then hands that come to rest."""
+def play(
+    seed: int, arm: str, *, wild_ticks: int, quiet_s: float, most_quiet_ticks: int, engages: bool = False
+) -> Played:
+    """The session of a seed: ticks in which anything may happen, then hands that come to rest. In a
+    cell that `engages`, the setpoint begins slowly, and a clutch is pressed and released.
+    """
     random = np.random.default_rng(seed)
     settings = drawn_cell(random, arm)
+    if engages:
+        settings = engaging_cell(random, settings)
     urdf, hz = robot_description(settings), settings.rate_hz
     player = _Player(random, settings, urdf, wild_ticks)
     for _ in range(wild_ticks + min(round(quiet_s * hz), most_quiet_ticks)):
@@ -133,6 +141,7 @@ class _Player:
 
     def __init__(self, random: np.random.Generator, settings: Settings, urdf: str, wild_ticks: int) -> None:
         self.random, self.settings, self.urdf, self.quiet_from = random, settings, urdf, wild_ticks
+        self._has_clutch = settings.hands.clutch == "key"
         self.geometry = ArmGeometry(settings, urdf)
         self.name = str(random.choice(list(skills())))
         self.skill = skills()[self.name]
@@ -152,6 +161,7 @@ class _Player:
         self.noise_m = float(random.choice([0.0, 0.0005, 0.002]))
         self.p_miss, self.p_late = random.choice([0.0, 0.0, 0.0005, 0.005]), random.choice([0.0, 0.0, 0.1, 0.5])
         self.p_wrong_stamp, self.p_hold = random.choice([0.0, 0.0, 0.01, 0.1]), random.choice([0.0, 0.003, 0.01])
+        self.clutch_s, self.is_pressed = float(random.choice(CLUTCH_S)) if self._has_clutch else 0.0, False
         self.p_reset, self.skill_every = random.choice([0.001, 0.02]), int(random.choice([0, 0, 0, 0, 50, 500, 7]))
         self.changes_to = [name for name in skills() if random.random() < 0.5 or name.startswith("taught")]
         self.kept_at = set(random.integers(1, wild_ticks, STATES).tolist())
@@ -184,6 +194,7 @@ class _Player:
             self.arm.kind = WELL if is_quiet else self.wild_arm
             inbox += self.arm.events(number, self._stamp_ns())
         inbox += self._requests_at_rest(number) if is_quiet else self._requests(number)
+        inbox += self._clutch(is_quiet) if self._has_clutch else []
         if not is_quiet and random.random() < 0.3:
             random.shuffle(inbox)
         inbox += [event for due, event in self.later if due <= number]
@@ -265,6 +276,15 @@ class _Player:
         if self.skill_every and number % self.skill_every == 0:
             out.append(Event("skill", b"", skills()[str(random.choice(self.changes_to))]))
         return out
+
+    def _clutch(self, is_quiet: bool) -> list[Event]:
+        """Pressed and released for `clutch_s` on average, and repeated in most ticks; pressed while
+        it is quiet.
+        """
+        if self.random.random() < self.settings.period_s / self.clutch_s:
+            self.is_pressed = not self.is_pressed
+        self.is_pressed = self.is_pressed or is_quiet
+        return [clutch(self.is_pressed)] if is_quiet or self.random.random() < CLUTCH_SHARE else []
 
     def _requests_at_rest(self, number: int) -> list[Event]:
         """The first skill again; an operator who resumes and resets."""

@@ -47,6 +47,7 @@ class Explained(SetpointGenerator):
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
         before, tool = state["setpoint"].copy(), self._tool
+        max_speed = float(self.limits(state)["max_speed"][0])
         if self._steps < 0:
             ends = [
                 [farthest(before, i, side, tool.stop_acceleration, tool.stop_jerk, 0.0) for i in range(3)]
@@ -57,9 +58,9 @@ class Explained(SetpointGenerator):
         said = super().step(state, target, box, costs, slow)
         self._last[self._steps % len(self._last)] = [target.position, -target.position]
         self._steps += 1
-        back = RETURN_SHARE * tool.max_speed
-        too_fast = speed_to_come(before[1], before[2], tool.stop_jerk, back) > tool.max_speed
-        share = 0.0 if too_fast else slow / max(1.0, tool.max_speed * np.abs(costs[0]).max())
+        back = RETURN_SHARE * max_speed
+        too_fast = speed_to_come(before[1], before[2], tool.stop_jerk, back) > max_speed
+        share = 0.0 if too_fast else slow / max(1.0, max_speed * np.abs(costs[0]).max())
         self._most = np.maximum(self._last.max(axis=0), self._most - back * share * self._period)
         left = self._most + self._margin - [state["setpoint"][0], -state["setpoint"][0]]
         assert left.min() >= -1e-6, (left, said)

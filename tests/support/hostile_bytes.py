@@ -28,6 +28,7 @@ if __name__ == "__main__":
 
 from service.contract import cdr, requests
 from service.contract.messages import (
+    GRIPPER,
     JointState,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -65,6 +66,8 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "pose_with_covariance": partial(_again, cdr.encode_pose_with_covariance, cdr.decode_pose_with_covariance),
     "joints": partial(_again, cdr.encode_joints, cdr.decode_joints),
     "joints_in_order": _joints,
+    "bool": partial(_again, cdr.encode_bool, cdr.decode_bool),
+    "closure": cdr.decode_closure,
     "string": cdr.decode_string,
     "transforms": cdr.decode_transforms,
     "tick": cdr.decode_tick,
@@ -86,6 +89,8 @@ _SEEDS: dict[str, list[bytes]] = {
         cdr.encode_joints(JointState(1, NAMES, POSITION, (), POSITION)),
         cdr.encode_joints(JointState(1, (), (), ())),
     ],
+    "bool": [cdr.encode_bool(True), cdr.encode_bool(False), cdr.encode_bool(True) + bytes(3)],
+    "closure": [cdr.encode_joints(JointState(1, (GRIPPER,), (0.25,), ()))],
     "string": [cdr.encode_string("{}"), cdr.encode_string("é")],
     "transforms": [cdr.encode_transforms(7, [Transform("a", "b", POSITION, TURN), Transform("", "c", POSITION, TURN)])],
     "tick": [cdr.encode_tick(7, [0, 1, 6], 2)],

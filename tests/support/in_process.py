@@ -10,6 +10,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from service.contract import cdr
+from service.contract.messages import GRIPPER, JointState
 from service.contract.records import SIDES
 from service.core.controller import Controller, run, start_state
 from service.core.frame import Event, Frame, Record, Tick, Vector
@@ -33,6 +35,17 @@ def hand(side: str, position: tuple[float, float, float], stamp_ns: int) -> Even
 def arm(joints: tuple[float, ...], stamp_ns: int, velocities: tuple[float, ...] = (0.0,) * 7) -> Event:
     """The arm's sample as an event."""
     return joints_event(JOINT_NAMES, joints, velocities, stamp_ns)
+
+
+def clutch(is_pressed: bool) -> Event:
+    """A message of the clutch as an event."""
+    return Event("clutch", cdr.encode_bool(is_pressed), is_pressed)
+
+
+def wish(closure: float) -> Event:
+    """A wish for the gripper as an event."""
+    data = cdr.encode_joints(JointState(0, (GRIPPER,), (closure,), ()))
+    return Event("gripper/wish", data, cdr.decode_closure(data))
 
 
 def seen(hands: Vector, k: int) -> tuple[Event, ...]:

@@ -40,6 +40,7 @@ def driven(
     out, said = [state["setpoint"].copy()], []
     for target in targets:
         before = state["setpoint"].copy()
+        generator.engage(state, target[0])
         said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
         assert generator.name_of_broken_bound(state, before, BOX) == ""
         out.append(state["setpoint"].copy())

@@ -43,6 +43,8 @@ UNCOMPILED = (  # what runs while the others wait for what is compiled, the long
     "contract",
 )
 SLOW = (  # the longest first: so they begin first
+    "trackers/test_headset.py",
+    "trackers/test_mouse_page.py",
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "daemon/test_start.py",
@@ -95,6 +97,7 @@ SLOW = (  # the longest first: so they begin first
     "files/test_damage.py",
     "daemon/test_requests.py",
     "test_hand_sample.py",
+    "trackers/test_calibration.py",
     "trackers/test_taking.py::test_a_demonstration_is_recorded_shown_trimmed_and_deleted",
 )
 SMOKE = (

@@ -13,7 +13,7 @@ from service.core.frame import Record, Vector, as_array, blank, copied
 from service.core.intake.hand_estimator import is_fresh
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
-from service.settings.config import HandSettings, Settings
+from service.settings.config import HandSettings, Settings, TrackerSettings
 from support.wam import FRAME, JOINT_NAMES, STATE
 
 PERIOD_S = 0.002
@@ -24,8 +24,14 @@ STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 class Hands:
     """An intake and its state, moved on tick by tick."""
 
-    def __init__(self, hands: HandSettings | None = None, *, rate_hz: int = 500) -> None:
-        self.settings = Settings(hands=hands or HandSettings(), rate_hz=rate_hz)
+    def __init__(
+        self,
+        hands: HandSettings | None = None,
+        *,
+        rate_hz: int = 500,
+        trackers: dict[str, TrackerSettings] | None = None,
+    ) -> None:
+        self.settings = Settings(hands=hands or HandSettings(), rate_hz=rate_hz, trackers=trackers or {})
         self.intake = Intake(self.settings)
         self.state: Record = blank(STATE)
         self.intake.begin(self.state)

@@ -30,7 +30,7 @@ from service.files.mcap_file import RecordingError
 from service.files.recording import OBJECTS_NOTE
 from service.learning.skill_file import with_file
 from service.settings.config import WAM, Settings, parse
-from service.viewer.banner import banner
+from service.viewer.banner import banner, headline
 from service.viewer.blueprint import blueprint
 from service.viewer.sentences import sentence
 from service.viewer.stream import Viewer, ViewerError
@@ -357,6 +357,8 @@ def test_the_log_speaks_in_sentences(note: str, said: str) -> None:
 
 def test_each_mode_has_a_banner_of_its_own_colour_that_holds_its_words() -> None:
     assert banner(Mode.HOLD, Reason.FAR_FROM_DEMONSTRATIONS).shape == banner(Mode.FOLLOW, Reason.NONE).shape
+    assert headline(Mode.FOLLOW, Reason.NONE, True) == "follow: engaging"
+    assert (banner(Mode.FOLLOW, Reason.NONE, True) != banner(Mode.FOLLOW, Reason.NONE)).any()
     corners = {tuple(banner(mode, Reason.NONE)[0, 0].tolist()) for mode in Mode}
     assert len(corners) == len(Mode)
     for reason in Reason:

@@ -119,6 +119,8 @@ class Arm:
             * np.array([limits.velocity, limits.acceleration, limits.jerk])
             / spared,
         )
+        self._engaging = self.parameters.copy()
+        self._engaging["max_tool_speed"] = TOOL_SPEED_SHARE * settings.tool.engaging_speed
         tasks = 6 if settings.tool.orientation == "full" else 5
         self._kinematics = np.dtype(
             [
@@ -172,12 +174,13 @@ class Arm:
         return now, crest
 
     def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
-        """Joint velocities that move the tool to the state's setpoint; see `step`."""
+        """Joint velocities that move the tool to the state's setpoint; see `step`. While the
+        setpoint engages, its lower speed limit holds here too.
+        """
         out = np.empty((2, len(self._jerk)))
         constraints, count = separation.constraints, separation.count
-        return _solution(
-            out, follow(self.parameters, here.record, as_array(state), self._goal, constraints, count, out)
-        )
+        limits = self._engaging if state["engaging"] else self.parameters
+        return _solution(out, follow(limits, here.record, as_array(state), self._goal, constraints, count, out))
 
     def step(
         self,

@@ -33,6 +33,7 @@ class Decision:
             max_error_rad=float(settings.arm.fault_error_rad),
             fault_speed=float(settings.tool.fault_speed),
             max_speed=float(settings.tool.max_speed),
+            engaging_speed=float(settings.tool.engaging_speed),
             per_rad=np.array(limits.per_rad),
         )
         self._return_speed = RETURN_RADPS * np.array(limits.per_rad)

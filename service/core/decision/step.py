@@ -13,6 +13,8 @@ from service.core.codes import (
     ARM_SILENT,
     ARM_STILL,
     BLOCKED,
+    CLUTCH,
+    CLUTCH_RELEASED,
     CONTESTED,
     FAR,
     FAULT,
@@ -67,8 +69,9 @@ def step(
     in this order causes a hold; without one, the arm follows:
 
     * TWO_SOURCES: a hand or the arm is contested.
-    * NOT_READY: the arm is not ready.
+    * NOT_READY: the arm is not ready; if it moves back by itself, not while the clutch is released.
     * OPERATOR: the operator holds it.
+    * CLUTCH: the clutch is released.
     * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
       been seen or is not seen now.
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
@@ -90,10 +93,12 @@ def step(
         return starts, error, speed
     if known & CONTESTED:
         reason = TWO_SOURCES
-    elif state.arm_ready != READY:
+    elif state.arm_ready != READY and not (state.arm_ready == RETURNING and known & CLUTCH_RELEASED):
         reason = NOT_READY
     elif state.operator_hold:
         reason = OPERATOR
+    elif known & CLUTCH_RELEASED:
+        reason = CLUTCH
     elif math.isnan(gate_m):
         unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ONE_HAND
         reason = NO_HANDS if unseen else STALE_HAND
@@ -172,7 +177,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
     and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
     anew. They also are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved
-    by more than that.
+    by more than that. While the setpoint engages, engaging_speed takes the place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
@@ -189,7 +194,8 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     if state.stuck == NOTICED:
         least = FREED_SHARE * state.stuck_gap
     else:
-        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * config.max_speed * STUCK_S)
+        max_speed = config.engaging_speed if state.engaging else config.max_speed
+        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * max_speed * STUCK_S)
     if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_GAP_M:
         state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
         return 0

@@ -19,6 +19,7 @@ STATE = (
     Field("jump_count", "int64", (2,)),  # number of successive samples that jumped
     Field("quickest_stamps_ns", "int64", (2, 2)),  # stamps of minimum delay: this window, the last one
     Field("quickest_ticks", "int64", (2, 2)),  # ticks in which the samples with these stamps arrived
+    Field("clutch_until_tick", "int64"),  # the clutch counts as pressed before this tick, unless a message follows
     Field("clock_tick", "int64", (2,)),  # begin of this window; -1: no sample yet
     Field("kept", "int64", (2,)),  # number of retained samples
     Field("kept_newest", "int64", (2,)),  # index of the newest sample in all rings `kept_*`
@@ -37,6 +38,7 @@ STATE = (
     Field("mode_probabilities", "float64", (2, MODES)),
     Field("noise_variance", "float64", (2,)),  # variance of the samples on each axis [m²]
     Field("sample_interval_s", "float64", (2,)),  # interval between the two newest samples
+    Field("gripper_wish", "float64"),  # newest closure that a tracker wished, 0 to 1; -1: none yet
     Field("response_s", "float64"),  # time in which the hand filter follows a change of motion
     Field("past_samples", "float64", (2, 3, 3)),  # the last three positions, newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),

@@ -1,5 +1,5 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
-at the tick.
+at the tick. The clutch and the wish for the gripper are taken in here too.
 
 `plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
 """
@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.contract.channels import BY_KEY
 from service.contract.joint_states import measured
@@ -22,9 +23,21 @@ from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
 from service.core.intake.tuning import JOINT_JUMP_RADPS, MAX_LATE_S, MAX_OUTSIDE_RAD
-from service.settings.config import Settings
+from service.settings.config import HandSettings, Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
+
+
+def z_reversed(sample: PoseStamped) -> PoseStamped:
+    """A pose in left-handed axes, as it is in right-handed ones whose z points the other way."""
+    (x, y, z), (i, j, k, w) = sample.position, sample.orientation
+    return sample._replace(position=(x, y, -z), orientation=(-i, -j, k, w))
+
+
+def base_from(hands: HandSettings) -> NDArray[np.float64]:
+    """The mapping (3, 4) of positions in a tracker's frame and unit to frame `base` [m]."""
+    origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+    return np.column_stack((UNIT_M[hands.unit] * axes, origin))
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
@@ -61,7 +74,8 @@ class Intake:
         self.stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
-        self._names, self._frames = settings.joints.names, ("", BASE, hands.frame)
+        self._names = settings.joints.names
+        self._clutch_ticks = _stale_ticks("clutch", settings)
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
@@ -79,13 +93,16 @@ class Intake:
             joint_jump_speed=max(JOINT_JUMP_RADPS, float((np.array(joints.velocity) / per_rad).max())),
             plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
+            has_clutch=int(hands.clutch == "key"),
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
-        origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
-        self._tracker = np.column_stack((UNIT_M[hands.unit] * axes, origin))
-        self._in_base = np.eye(3, 4)
-        # If the tracker has a frame of its own, samples in frame base have been mapped already.
-        self._maps_base = hands.frame in ("", BASE)
+        self._mappings = {
+            frame: (base_from(of_frame := settings.hands_in(frame)), of_frame.axes == "left-handed")
+            for frame in settings.tracker_frames
+        }
+        if hands.frame not in ("", BASE):
+            # If the tracker has a frame of its own, samples in frame base have been mapped already.
+            self._mappings[BASE] = np.eye(3, 4), False
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(hands, settings.period_s, self._models)
@@ -102,10 +119,15 @@ class Intake:
         """
         self.advance(state, ticks)
         for event in samples:
-            if event.kind == "joints/state":
-                self.take_arm(state, event.value)
-            else:
-                self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+            match event.kind:
+                case "joints/state":
+                    self.take_arm(state, event.value)
+                case "clutch":
+                    state["clutch_until_tick"] = state["tick"] + self._clutch_ticks if event.value else 0
+                case "gripper/wish":
+                    state["gripper_wish"] = event.value
+                case _:
+                    self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
         return int(report(as_array(state), as_array(frame), self._parameters))
 
     def advance(self, state: Record, ticks: int) -> None:
@@ -115,10 +137,13 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""
-        if sample.frame_id not in self._frames:
+        if sample.frame_id not in self._mappings:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
             return
+        mapping, is_left_handed = self._mappings[sample.frame_id]
+        if is_left_handed:
+            sample = z_reversed(sample)
         cause = take_hand(
             as_array(state),
             self._parameters,
@@ -127,7 +152,7 @@ class Intake:
             sample.stamp_ns,
             sample.position,
             sample.orientation,
-            self._tracker if self._maps_base or sample.frame_id != BASE else self._in_base,
+            mapping,
         )
         if cause >= 0:
             self._note(state, side, cause, sample)

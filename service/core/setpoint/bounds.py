@@ -3,7 +3,7 @@
 docs/bounds.md proves what these bounds guarantee. Its symbols are used here, on each axis:
 
     x, v, a   position [m], velocity [m/s] and acceleration [m/s²] of the setpoint
-    V         max_speed, limit of the norm of the velocity
+    V         limit of the norm of the velocity: max_speed, or engaging_speed while it engages
     Â, Ĵ      max_acceleration and max_jerk, limits of the norms of acceleration and jerk
     A, J      stop_acceleration and stop_jerk, limits of a stop on each axis
     ρ         V / 16, speed at which a setpoint beyond a bound returns (RETURN_SHARE)
@@ -109,10 +109,10 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
         ACCELERATION  |a| > max(Â, |a before|)
         JERK          |a - a before| > Ĵ period
         POSITION      the position is beyond `bounds`, and beyond the position before, by more than
-                      V² / 2A + 1 s V, which is more than any stop from outside takes
+                      `longest_stop`, which is more than any stop from outside takes
     """
     config = parameters[0]
-    max_speed = config.max_speed
+    max_speed, longest_stop = config.max_speed, config.longest_stop
     if not np.isfinite(setpoint).all():
         return FINITE_BOUND
     if norm(setpoint[1]) > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9:
@@ -123,8 +123,6 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
         return JERK_BOUND
     low, high = np.empty(3), np.empty(3)
     bounds(hull, box, config.lowest, low, high)
-    # [m] a stop at full braking, and one second at max_speed: no stop from outside takes more
-    longest_stop = 0.5 * max_speed * max_speed / config.stop_acceleration + 1.0 * max_speed
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - longest_stop:
             return POSITION_BOUND

@@ -20,12 +20,20 @@ class OrientationSetpoint:
 
     def __init__(self, settings: Settings) -> None:
         tool = settings.tool
-        self.parameters = parameters(
+        self._parameters = parameters(
             max_speed=PLANNED_SPEED_SHARE * tool.max_turn_speed,
             max_acceleration=float(tool.max_turn_acceleration),
             about=int(tool.orientation == "full"),
             period_s=settings.period_s,
         )
+        self._engaging = self._parameters.copy()
+        self._engaging["max_speed"] *= tool.engaging_speed / tool.max_speed
+
+    def limits(self, state: Record) -> Records:
+        """Parameters (1,) of a step from this state: while the position engages, the angular speed
+        is limited to the same share of its own limit.
+        """
+        return self._engaging if state["engaging"] else self._parameters
 
     def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
         """Start from the tool's rotation (3, 3) and angular velocity `turning` (3,) [rad/s]."""
@@ -38,7 +46,7 @@ class OrientationSetpoint:
         If the settings say that only a direction is followed, the setpoint turns +z on the shortest
         path.
         """
-        turn_orientation(state["orientation"], state["turning"], orientation, turning, self.parameters)
+        turn_orientation(state["orientation"], state["turning"], orientation, turning, self.limits(state))
 
 
 @compiled

@@ -13,6 +13,8 @@ A step is taken only if the stop after it keeps every limit. Otherwise the setpo
 that the step before has checked. So these limits hold by induction, whatever the target does:
 
 * the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
+* from the start of following until the setpoint is within ENGAGED_GAP_M of its target, the norm of
+  its speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
 * the setpoint stays inside the workspace, and within HULL_MARGIN_M of the box around the targets of
   the last HULL_TIME_S. If that box has moved away, or if following began outside of it, the
   setpoint returns at RETURN_SHARE of max_speed or faster. docs/bounds.md has the proof.
@@ -26,14 +28,14 @@ import numpy as np
 
 from service.core.arm.stage import Arm
 from service.core.codes import SetpointBound
-from service.core.frame import Record, Vector, as_array, parameters
+from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.kinematics import Kinematics
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.bounds import broken_bound, farthest
 from service.core.setpoint.orientation import OrientationSetpoint
 from service.core.setpoint.step import finish, lead, ready, write
 from service.core.setpoint.tracker import gains_for, waiting
-from service.core.setpoint.tuning import GAP_STOPPED_M, GAP_WAITING_M, HULL_TIME_S
+from service.core.setpoint.tuning import ENGAGED_GAP_M, GAP_STOPPED_M, GAP_WAITING_M, HULL_TIME_S
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER, decided
 from service.settings.config import Settings
@@ -44,6 +46,8 @@ class SetpointGenerator:
 
     def __init__(self, settings: Settings) -> None:
         tool, reach = settings.tool, settings.reach
+        # [m] a stop at full braking, and one second at max_speed: no stop from outside takes more
+        longest_stop = 0.5 * tool.max_speed * tool.max_speed / tool.stop_acceleration + 1.0 * tool.max_speed
         self._parameters = parameters(
             period_s=settings.period_s,
             gains=gains_for(settings),
@@ -53,15 +57,28 @@ class SetpointGenerator:
             stop_acceleration=tool.stop_acceleration,
             stop_jerk=tool.stop_jerk,
             stop_room=float(tool.stop_room),
+            longest_stop=longest_stop,
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
             span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),
         )
+        self._engaging = self._parameters.copy()
+        self._engaging["max_speed"] = tool.engaging_speed
+        self._engages = tool.engaging_speed < tool.max_speed
 
     def begin(self, state: Record, setpoint: Vector) -> None:
         """Start from the motion of the tool (3, 3), which becomes the only known target."""
-        state["setpoint"] = setpoint
+        state["setpoint"], state["engaging"] = setpoint, self._engages
         state["hull"] = setpoint[0]
         state["hull_ticks"] = 0
+
+    def limits(self, state: Record) -> Records:
+        """Parameters (1,) of a step from this state, in which `max_speed` is the present limit."""
+        return self._engaging if state["engaging"] else self._parameters
+
+    def engage(self, state: Record, target: Vector) -> None:
+        """End the engaging of a setpoint that is within ENGAGED_GAP_M of its target (3,) [m]."""
+        if state["engaging"] and math.dist(target.tolist(), state["setpoint"][0].tolist()) < ENGAGED_GAP_M:
+            state["engaging"] = 0
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
         """Move the setpoint one period toward a target.
@@ -74,7 +91,7 @@ class SetpointGenerator:
         broken. BROKEN means an error in this program; the setpoint then stays where it is.
         """
         motion = target.position, target.velocity, target.acceleration
-        return int(lead(as_array(state), *motion, self._parameters, box, costs, slow))
+        return int(lead(as_array(state), *motion, self.limits(state), box, costs, slow))
 
     def stretched(self, box: Vector, setpoint: Vector) -> Vector:
         """Workspace (2, 3) [m], extended so that a setpoint (3, 3) can stop inside of it.
@@ -89,7 +106,7 @@ class SetpointGenerator:
 
     def name_of_broken_bound(self, state: Record, before: Vector, box: Vector) -> str:
         """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
-        bound = SetpointBound(broken_bound(state["setpoint"], before, state["hull"], box, self._parameters))
+        bound = SetpointBound(broken_bound(state["setpoint"], before, state["hull"], box, self.limits(state)))
         return bound.name.lower().replace("_", " ") if bound else ""
 
 
@@ -97,7 +114,8 @@ class SetpointStage:
     """Position and orientation setpoints and gripper, in the box (2, 3) [m] of the active skill."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
-        self._arm, self._period_s, self._max_speed = arm, settings.period_s, float(settings.tool.max_speed)
+        self._arm, self._period_s = arm, settings.period_s
+        self._takes_wishes = settings.hands.gripper == "key"
         self._costs = np.empty((3, 3, len(settings.joints.names)))
         self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
 
@@ -114,8 +132,10 @@ class SetpointStage:
         `share`: share of the setpoint's speed at which separation lets the tool follow.
         """
         states, frames = as_array(state), as_array(frame)
-        slow = ready(states, here.record, self._arm.parameters, self._max_speed, share, self._costs)
         target, tool = wanted.target, here.record["position"][0]
+        self._position.engage(state, target.position)
+        max_speed = float(self._position.limits(state)["max_speed"][0])
+        slow = ready(states, here.record, self._arm.parameters, max_speed, share, self._costs)
         gap_m = math.dist(state["setpoint"][0].tolist(), tool.tolist())
         if gap_m > GAP_WAITING_M:
             target = waiting(target, state["setpoint"], tool)
@@ -123,15 +143,19 @@ class SetpointStage:
             box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
         if state["closure"] != NO_GRIPPER:
-            self._grip(state, wanted, here)
-        finish(states, frames, self._orientation.parameters)
+            off = math.dist(wanted.target.position.tolist(), tool.tolist())
+            self._grip(state, float(state["closure"]), off)
+        elif self._takes_wishes:
+            self._grip(state, float(state["gripper_wish"]), 0.0)
+        finish(states, frames, self._orientation.limits(state))
         return met
 
-    def _grip(self, state: Record, wanted: Wanted, here: Kinematics) -> None:
-        """Open or close the gripper as the skill predicts, once the tool is near its target."""
-        before, closure = int(state["gripper"]), float(state["closure"])
+    def _grip(self, state: Record, closure: float, off: float) -> None:
+        """Open or close the gripper for a `closure` that the skill predicts or a person wishes, if
+        the tool is near its target, `off` [m] away.
+        """
+        before = int(state["gripper"])
         since_s = self._period_s * int(state["tick"] - state["gripper_tick"])
-        off = math.dist(wanted.target.position.tolist(), here.record["position"][0].tolist())
         state["gripper"] = decided(before, closure, since_s=since_s, off=off)
         if state["gripper"] != before:
             state["gripper_tick"] = state["tick"]

@@ -8,6 +8,7 @@ line follows from others.
 from __future__ import annotations
 
 from service.core.arm.tuning import PLANNED_LIMIT_SHARES, POSITION_GAIN_PER_S, TURN_GAIN_SHARE
+from service.core.decision.tuning import STUCK_GAP_M
 from service.core.intake.tuning import LEAST_NOISE_M, MODE_INTENSITIES_M2PS5
 
 # The tracker: a linear-quadratic one, whose input is jerk.
@@ -51,6 +52,8 @@ GAP_SLOW_M = 0.012  # share of the speed = 1 / (1 + (gap - GAP_FREE_M) / GAP_SLO
 # 0.05 to 1. More: the setpoint runs ahead. Less: the setpoint waits sooner.
 GAP_STOPPED_M = 0.2  # the setpoint stops at this distance from its tool
 GAP_WAITING_M = 0.5 * GAP_STOPPED_M  # from here on its target is moved closer: a tenth of its speed is left
+
+ENGAGED_GAP_M = STUCK_GAP_M  # a setpoint nearer to its target than this has engaged
 
 # Bounds around the last targets: docs/bounds.md has the proof.
 # 0.1 to 2. More: old targets stay in bounds. Less: the bounds follow closely.

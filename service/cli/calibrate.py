@@ -1,0 +1,288 @@
+"""`thirdhand calibrate`: find the tracker's pose from a hand at the tool, check and write it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from service.cli.keys import EnterPressed
+from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, inputs_session
+from service.contract.explain import in_words
+from service.contract.messages import BASE
+from service.contract.printable import printable_lines
+from service.core.frame import Vector
+from service.files.shipped import ARMS, cell_of
+from service.process.progress import say
+from service.settings.config import Settings
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, lines, recorded, write
+from service.trackers.calibration.collecting import (
+    LedTracks,
+    LiveLed,
+    distances_m,
+    from_recording,
+    held_tool,
+    lead,
+    solved,
+)
+from service.trackers.calibration.solver import (
+    MIN_POINTS,
+    Calibration,
+    CalibrationError,
+    bench_corners,
+    solve_points,
+)
+
+CHECK_S = 10.0
+MAX_TOUCHES = 12  # then the points end
+CALIBRATE_POLL_S = 0.02
+HINT_S = 5.0  # progress without a terminal is shown in this interval
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """Calibrate, check, or both. Exit code 0; 1 if the check finds a hand too far away."""
+    given = points_given(args)
+    file = Path(args.config) if args.config and args.config not in ARMS else None
+    settings = cell_of(args.config) if args.config else None
+    only_check = args.check and not (args.held or args.points)
+    if only_check and file is None:
+        raise UsageError("--check compares with the last calibration of a cell: give its settings by --config FILE")
+    if args.recording is not None:
+        led, settings = from_recording(args.recording, settings)
+        if only_check:
+            assert file is not None
+            return _checked(led, settings, recorded(file, settings), args)
+        found = solved(led, settings, bench_corners(settings), args.hand)
+        record = _record(found.calibration, found.side, found.frame or settings.hands.frame, "held")
+        _show(record, args, found.remarks, lasts_s=float(np.ptp(found.held.hand_s)))
+        _write(file, record, found.frame, args)
+        return _checked(led, settings, record, args) if args.check else 0
+    settings = settings or Settings()
+    with inputs_session(args, CONNECT_TIMEOUT_S) as session:
+        live = LiveLed(session, args.cell or settings.cell, settings)
+        try:
+            return _live(live, settings, file, given, only_check, args)
+        finally:
+            live.close()
+
+
+def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
+    """The points of the command line and of the file. Raises UsageError."""
+    if (args.at or args.at_file) and not args.points:
+        raise UsageError("--at and --at-file give points to touch: give --points too")
+    if args.points and args.recording is not None:
+        raise UsageError("--points are touched in a running cell: --from needs --held")
+    found = [tuple(map(float, point)) for point in args.at or ()]
+    if args.at_file is not None:
+        try:
+            text = content(args.at_file, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
+        except (OSError, UnusableError, UnicodeDecodeError) as error:
+            raise UsageError(f"--at-file {args.at_file}: {in_words(error, named=False)}") from None
+        for number, line in enumerate(text.splitlines(), 1):
+            words = line.partition("#")[0].replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                x, y, z = map(float, words)
+            except ValueError:
+                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; three numbers needed") from None
+            if not all(math.isfinite(value) and abs(value) <= 5 for value in (x, y, z)):
+                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; -5 to 5 m accepted")
+            found.append((x, y, z))
+    if found and len(found) < MIN_POINTS:
+        raise UsageError(f"{len(found)} points given; {MIN_POINTS} or more needed")
+    return [(x, y, z) for x, y, z in found]
+
+
+def _live(
+    live: LiveLed,
+    settings: Settings,
+    file: Path | None,
+    given: list[tuple[float, float, float]],
+    only_check: bool,
+    args: argparse.Namespace,
+) -> int:
+    pressed, corners = EnterPressed(), bench_corners(settings)
+    _await(live, args, needs_joints=not given)
+    if only_check:
+        assert file is not None
+        record = recorded(file, settings)
+    else:
+        begun_s = time.monotonic()
+        if args.points:
+            side = _side(live, args)
+            calibration = _touched(live, side, corners, given, pressed)
+            frame, remarks = live.led(most_states=1).hands[side].frame, list[str]()
+        else:
+            say("hold the tool and lead it: up and down, far apart, and turn the wrist; Enter or Ctrl-C ends it")
+            try:
+                accept_m = args.accept / 1000
+                say(
+                    lead(
+                        live,
+                        settings,
+                        corners,
+                        args.hand,
+                        accept_m=accept_m,
+                        longest_s=args.seconds,
+                        is_ended=pressed,
+                        show=_shower(),
+                    )
+                )
+            except KeyboardInterrupt:
+                say("ended by Ctrl-C")
+            found = solved(live.led(), settings, corners, args.hand)
+            calibration, side, frame, remarks = found.calibration, found.side, found.frame, list(found.remarks)
+        remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
+        record = _record(calibration, side, frame or settings.hands.frame, "points" if args.points else "held")
+        _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
+        _write(file, record, frame, args)
+    if not args.check:
+        return 0
+    say(f"check: {'hold' if record.method == 'held' else 'touch'} the tool as before, for {CHECK_S:g} s")
+    end_s = time.monotonic() + CHECK_S
+    while time.monotonic() < end_s:
+        time.sleep(CALIBRATE_POLL_S)
+        live.collect()
+    return _checked(live.led(since_s=CHECK_S), settings, record, args)
+
+
+def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> None:
+    """Wait until hands and joints arrive. Raises CalibrationError after --wait."""
+    begun_s = time.monotonic()
+    while missing := live.missing(args.hand, needs_joints=needs_joints):
+        if time.monotonic() - begun_s > args.wait:
+            unreadable = "".join(
+                f"; {count} messages on {key} are not readable" for key, count in live.malformed.items()
+            )
+            raise CalibrationError(
+                f"not received: {', '.join(missing)}{unreadable}. Are tracker and arm running, connected to the same "
+                f"endpoint, and in the same cell?"
+            )
+        time.sleep(CALIBRATE_POLL_S)
+        live.collect()
+
+
+def _side(live: LiveLed, args: argparse.Namespace) -> str:
+    """The hand that touches. Raises UsageError if both arrive and none is given."""
+    if args.hand is None and len(live.arriving) > 1:
+        raise UsageError("both hands arrive: give the one that touches the points by --hand")
+    return str(args.hand or live.arriving[0])
+
+
+def _touched(
+    live: LiveLed, side: str, corners: Vector, given: list[tuple[float, float, float]], pressed: EnterPressed
+) -> Calibration:
+    """The calibration from points that are touched one after another. Raises CalibrationError."""
+    hand: list[Vector] = []
+    base: list[Vector] = []
+    count = len(given) or MAX_TOUCHES
+    try:
+        while len(hand) < count:
+            where = "({:g}, {:g}, {:g}) m".format(*given[len(hand)]) if given else "the tool's point, at a new posture"
+            say(f"{len(hand) + 1}: touch {where} with the tracked point of the {side} hand, then press Enter")
+            while not pressed():
+                if not pressed.listens:
+                    raise KeyboardInterrupt
+                time.sleep(CALIBRATE_POLL_S)
+                live.collect()
+            live.collect()
+            try:
+                at = live.touch(side)
+                point = np.array(given[len(hand)]) if given else live.tip()
+            except CalibrationError as error:
+                say(f"not used: {error}")
+                continue
+            hand.append(at)
+            base.append(point)
+            if len(hand) >= MIN_POINTS:
+                try:
+                    found = solve_points(np.array(hand), np.array(base), corners)
+                    say(
+                        f"residual {1e3 * found.rms_m:.1f} mm, accuracy {1e3 * found.std_m:.1f} mm; Ctrl-C ends it here"
+                    )
+                except CalibrationError as error:
+                    say(f"not enough yet: {error}")
+    except KeyboardInterrupt:
+        say(f"ended after {len(hand)} points")
+    return solve_points(np.array(hand).reshape(-1, 3), np.array(base).reshape(-1, 3), corners)
+
+
+def _shower() -> Callable[[str], None]:
+    """A function that shows progress: each line on a terminal, else one every HINT_S."""
+    shown_s = [0.0]
+
+    def show(line: str) -> None:
+        now_s = time.monotonic()
+        if sys.stderr.isatty() or now_s - shown_s[0] >= HINT_S:
+            shown_s[0] = now_s
+            say(line)
+
+    return show
+
+
+def _record(calibration: Calibration, hand: str, frame: str, method: str) -> CalibrationRecord:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return CalibrationRecord(date=now, method=method, hand=hand, frame=frame, calibration=calibration)  # type: ignore[arg-type]
+
+
+def _show(record: CalibrationRecord, args: argparse.Namespace, remarks: Sequence[str], *, lasts_s: float) -> None:
+    """Print the calibration. Raises CalibrationError if it is less accurate than accepted."""
+    found, stds_mm = record.calibration, [1e3 * std for std in record.calibration.corner_std_m]
+    for remark in remarks:
+        say(f"remark: {remark}")
+    what = "samples" if record.method == "held" else "points"
+    print(f"{record.hand} hand     {record.method}, {lasts_s:.0f} s, {found.samples} {what}, {found.outliers} outliers")
+    print(f"residual       {1e3 * found.rms_m:.1f} mm rms, {1e3 * found.residual_95_m:.1f} mm (95 %)")
+    print(
+        f"accuracy       {1e3 * found.std_m:.1f} mm: standard deviation at the corners of the bench, "
+        f"{min(stds_mm):.1f} to {max(stds_mm):.1f} mm"
+    )
+    if record.method == "held":
+        print("hand in tool   ({:.3f}, {:.3f}, {:.3f}) m".format(*found.hand_in_tool))
+        print(f"delay          {round(1e3 * found.delay_s)} ms of the hand's stamps behind the arm's")
+    if found.std_m > args.accept / 1000:
+        raise CalibrationError(
+            f"not accurate enough: {1e3 * found.std_m:.1f} mm at the corners of the bench, at most {args.accept:g} mm "
+            f"accepted (--accept). Nothing was written. To improve it, {found.remedy}"
+        )
+
+
+def _write(file: Path | None, record: CalibrationRecord, frame: str, args: argparse.Namespace) -> None:
+    """Write the calibration into the cell's settings, or print what to write."""
+    values = hand_settings(record.calibration, "" if frame == BASE else frame)
+    if file is None:
+        print(f"\nWrite this into the cell's settings; --config FILE does it:\n{lines(values)}", end="")
+        return
+    kept = write(file, values, record)
+    print(f"\n{lines(values)}", end="")
+    print(f"written into {file}; the earlier file is {kept.name}. Start the daemon again to use it")
+
+
+def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
+    """Print how far the hand is from where the tool has it; 1 if that is more than accepted."""
+    if (track := led.hands.get(record.hand)) is None:
+        raise CalibrationError(f"hands/{record.hand} does not arrive, which was calibrated on {record.date}")
+    held, remarks = held_tool(track, led.tool, settings.hands)
+    if not len(held.hand):
+        raise CalibrationError("no samples of hand and arm at the same time")
+    off_mm = 1e3 * distances_m(held, record.calibration)
+    most_mm = args.accept + 1e3 * record.calibration.rms_m
+    for remark in remarks:
+        say(f"remark: {remark}")
+    if track.frame not in ("", record.frame):
+        say(f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the tracker was recentred")
+    found = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
+    if np.median(off_mm) <= most_mm:
+        print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted"))
+        return 0
+    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted. Does the hand hold the tool as before? Then the"
+                          " tracker has moved: calibrate again"))  # fmt: skip
+    return 1

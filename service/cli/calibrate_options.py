@@ -1,0 +1,51 @@
+"""The options of `thirdhand calibrate`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from service.cli.usage import ARM_HELP, option, within
+from service.contract.records import SIDES
+
+ABOUT_CALIBRATE = (
+    "Finds where the tracker is, from a hand that holds the tool while you lead the arm by hand, or that touches "
+    "points. Shows how accurate the result is, and writes it into the cell's settings."
+)
+CALIBRATE_EXAMPLE = """thirdhand calibrate --config cell.toml
+  thirdhand calibrate --config cell.toml --held --check
+  thirdhand calibrate --config cell.toml --points --hand right
+  thirdhand calibrate --config cell.toml --from led.mcap"""
+MAX_ACCEPTED_MM = 200.0
+
+
+def add_options(c: argparse.ArgumentParser) -> None:
+    """Add the command's own options."""
+    config = f"the settings that the daemon runs with: {ARM_HELP}; a file is changed, and the earlier one is kept"
+    option(c, "--config", "CELL", config)
+    how = c.add_mutually_exclusive_group()
+    held = "the hand holds the tool while you lead the arm (the default)"
+    how.add_argument("--held", action="store_true", help=held)
+    points = "the tracked point of the hand touches the tool at some postures, or points given by --at; Enter each"
+    how.add_argument("--points", action="store_true", help=points)
+    check = (
+        "measure for 10 s how far the hand is from where it should be while it holds the tool; with --held, after "
+        "the calibration, else by the last one"
+    )
+    c.add_argument("--check", action="store_true", help=check)
+    hand = "the hand that holds or touches (default: the one that moves with the tool)"
+    option(c, "--hand", None, hand, choices=SIDES)
+    recording = "use this recording of hands and joint states, instead of a running cell"
+    option(c, "--from", "FILE", recording, dest="recording", type=Path)
+    at = "with --points, a point to touch, in frame base [m]; may be repeated"
+    metres = within(float, -5, 5, " m")
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=metres, action="append", help=at)
+    option(c, "--at-file", "FILE", "with --points, a file with a point X Y Z in each line", type=Path)
+    accept = "accept this standard deviation of a mapped position at the corners of the bench"
+    option(c, "--accept", "MM", accept, 10.0, type=within(float, 0.1, MAX_ACCEPTED_MM, " mm"))
+    option(c, "--seconds", "S", "lead the tool for this time at most", 120.0, type=within(float, 5, 3600, " s"))
+    option(
+        c, "--wait", "S", "wait this long for hands and arm to be published", 30.0, type=within(float, 0, 3600, " s")
+    )
+    listen = "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
+    option(c, "--listen", "EP", listen)

@@ -1,0 +1,201 @@
+"""A connection to a cell: its requests as calls, and its streams, for programs of a few lines."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from service.client.calls import Client
+from service.client.client_settings import client_settings
+from service.client.streams import UNTURNED, Watch, publisher, wait_until_heard
+from service.contract import cdr, markers
+from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
+from service.contract.requests import NORM_TOLERANCE, Reply, ViaPoint
+
+LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
+FORMS = {  # by the largest count of numbers
+    1: "0 (open) to 1 (closed)",
+    3: "x y z [m]",
+    7: "x y z [m], or x y z and a quaternion x y z w,",
+}
+
+
+def connect(
+    endpoint: str | Sequence[str] | None = None,
+    *,
+    cell: str | None = None,
+    certificate: str | Path | None = None,
+    zenoh_config: str | Path | None = None,
+    timeout_s: float | None = 10.0,
+) -> Connection:
+    """A connection to a cell, which is to be closed; a context.
+
+    What is not given is taken from the environment, the client's file or the defaults, as by
+    `client_settings`. Connecting is tried for `timeout_s` [s]; None: until Ctrl-C. Raises
+    UnreachableError, and SettingsError for settings that cannot be used.
+    """
+    endpoints = [endpoint] if isinstance(endpoint, str) else endpoint
+    settings = client_settings(connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config)
+    return Connection(settings.session(timeout_s=timeout_s), settings.cell)
+
+
+class Connection(Client, AbstractContextManager["Connection"]):
+    """A cell's streams, and all requests of a `Client`, over one Zenoh session, which it closes.
+
+    A pose is three numbers, the position x y z [m], or seven, followed by the quaternion x y z w.
+    `stamp_ns` is the time of measurement [ns since 1970]; None: now. Stamps of one channel must
+    increase. The first message on a channel waits up to 5 s until somebody listens to it.
+
+    Each publishing call raises ValueError, before anything is sent, for values that the service
+    would reject, and UnreachableError if nobody listens.
+    """
+
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
+        super().__init__(session, cell, timeout_s=timeout_s)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The Zenoh session, for a `Follower` or for keys of your own."""
+        return self._session
+
+    def hands(
+        self,
+        *,
+        left: Sequence[float] | None = None,
+        right: Sequence[float] | None = None,
+        stamp_ns: int | None = None,
+        frame_id: str = BASE,
+    ) -> None:
+        """Publish the poses of the hands that the tracker sees now, in its frame."""
+        given = {"left": left, "right": right}
+        poses = {f"hands/{side}": _pose(side, pose) for side, pose in given.items() if pose is not None}
+        if not poses:
+            raise ValueError("no hand given; left, right or both needed")
+        self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
+
+    def tool(self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE) -> None:
+        """Publish the measured pose of the tool, for demonstrations."""
+        self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
+
+    def gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
+        """Publish the measured closure of the gripper, 0 (open) to 1 (closed), for
+        demonstrations.
+        """
+        self._publish_closure("gripper/state", closure, stamp_ns)
+
+    def clutch(self, pressed: bool) -> None:
+        """Publish that the clutch is pressed, or released; while it is pressed, again at 10 Hz or
+        more.
+        """
+        if not isinstance(pressed, bool):
+            raise ValueError(f"clutch: {pressed!r} given; True or False needed")
+        self._publish({"clutch": lambda _: cdr.encode_bool(pressed)}, None)
+
+    def wish_gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
+        """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
+        self._publish_closure("gripper/wish", closure, stamp_ns)
+
+    def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
+        """Publish all objects on the bench, for viewers and recordings."""
+        scene = tuple(objects)
+        for one in scene:
+            if not isinstance(one, SceneObject):
+                raise ValueError(f"object {one!r} given; a SceneObject needed")
+            if one.shape not in markers.NUMBERS:
+                accepted = ", ".join(markers.NUMBERS)
+                raise ValueError(f"object {one.name!r}: shape {one.shape!r} given; one of {accepted} accepted")
+        markers.decode_objects(markers.encode_objects(0, scene))  # raises the error that the daemon would report
+        self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
+
+    def watch(self, suffix: str, *, timeout_s: float | None = None) -> Watch:
+        """An iterator over the messages of a channel: `tool/target`, `joints/command`, `status`.
+
+        After `timeout_s` [s] without a message it yields None; None: it waits for the next one. To
+        the daemon, a program that watches `joints/command` is the arm's driver.
+        """
+        return Watch(self._session, self._cell, suffix, timeout_s=timeout_s)
+
+    def teach(
+        self, name: str, *, left: Sequence[float], right: Sequence[float], tool: Sequence[float], **more: Any
+    ) -> Reply:
+        """Teach one via-point: the tool's position [m] that belongs to these positions of the
+        hands. `more` are further fields of `ViaPoint`. Returns once it is in force.
+        """
+        point = ViaPoint(name, _position("left", left), _position("right", right), _position("tool", tool), **more)
+        return self.add([point])
+
+    def close(self) -> None:
+        """Close the session, with all that was opened on it."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _publish_closure(self, suffix: str, closure: float, stamp_ns: int | None) -> None:
+        (value,) = _numbers("closure", [closure], 1)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"closure: {closure} given; {FORMS[1]} needed")
+        self._publish({suffix: lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))}, stamp_ns)
+
+    def _publish(self, messages: dict[str, Callable[[int], bytes]], stamp_ns: int | None) -> None:
+        """Publish messages that are encoded for a stamp [ns]; None: the time when all of them are
+        heard. With a time before that wait, later samples would seem to arrive too early.
+        """
+        publishers = [self._heard(suffix) for suffix in messages]
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        for one, encode in zip(publishers, messages.values(), strict=True):
+            one.put(encode(stamp_ns))
+
+    def _heard(self, suffix: str) -> zenoh.Publisher:
+        """The publisher on a channel, once somebody listens. Raises UnreachableError."""
+        if (known := self._publishers.get(suffix)) is not None:
+            return known
+        one = publisher(self._session, self._cell, suffix, express=True)
+        try:
+            wait_until_heard(one, timeout_s=LISTENER_TIMEOUT_S)
+        except BaseException:
+            one.undeclare()  # type: ignore[no-untyped-call]
+            raise
+        return self._publishers.setdefault(suffix, one)
+
+
+def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:
+    """The encoding of a pose for a stamp [ns]."""
+    return lambda stamp_ns: cdr.encode_pose(PoseStamped(stamp_ns, frame_id, position, orientation))
+
+
+def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
+    """Position [m] and orientation of a pose of three or seven numbers. Raises ValueError."""
+    numbers = _numbers(what, pose, 3, 7)
+    position, turned = (numbers[0], numbers[1], numbers[2]), numbers[3:]
+    if not turned:
+        return position, UNTURNED
+    if abs((norm := math.hypot(*turned)) - 1.0) > NORM_TOLERANCE:
+        raise ValueError(f"{what}: quaternion {list(turned)} has norm {norm:.4g}; 1 needed (x y z w)")
+    return position, (turned[0], turned[1], turned[2], turned[3])
+
+
+def _position(what: str, given: Sequence[float]) -> Vector3:
+    """The three numbers of a position [m]. Raises ValueError."""
+    x, y, z = _numbers(what, given, 3)
+    return x, y, z
+
+
+def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
+    """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
+    try:
+        numbers = tuple(float(value) for value in given)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what}: {given!r} given; {FORMS[counts[-1]]} needed") from None
+    if len(numbers) not in counts:
+        raise ValueError(f"{what}: {len(numbers)} numbers given; {FORMS[counts[-1]]} needed")
+    if not finite(numbers):
+        raise ValueError(f"{what}: {list(numbers)} given; finite numbers needed")
+    return numbers

@@ -1,0 +1,115 @@
+"""A calibration in a cell's files: the settings, whose other lines remain as they are, and a record
+of the calibration beside them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import tomlkit
+import tomlkit.exceptions
+
+from service.contract.explain import InvalidError, in_words, validated
+from service.settings.config import Settings, load, parse
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.trackers.calibration.solver import Calibration, CalibrationError
+
+
+class CalibrationRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A calibration with its origin; `--check` compares with it."""
+
+    date: str
+    method: Literal["held", "points"]
+    hand: str
+    frame: str
+    calibration: Calibration
+
+
+def hand_settings(calibration: Calibration, frame: str) -> dict[str, Any]:
+    """The values of [hands] that a calibration gives. A frame without a name is not written."""
+    x, y, z, *quaternion = calibration.base_from_tracker
+    pose = [round(value, 4) for value in (x, y, z)] + [round(value, 6) for value in quaternion]
+    return ({"frame": frame} if frame else {}) | {"base_from_tracker": pose}
+
+
+def lines(values: Mapping[str, Any]) -> str:
+    """The values of [hands] as lines of a TOML file."""
+    return "[hands]\n" + "".join(f"{name} = {_literal(value)}\n" for name, value in values.items())
+
+
+def _literal(value: Any) -> str:
+    return str(tomlkit.item(value).as_string())
+
+
+def record_path(path: Path) -> Path:
+    """The path of the record beside a cell's settings."""
+    return path.with_suffix(".calibration.json")
+
+
+def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord) -> Path:
+    """Write values of [hands] into a cell's settings, and the record beside them. Returns the path
+    of the earlier file, which is kept.
+
+    Comments and all other lines remain. The new text is validated before anything is written, and
+    replaces the file at once. Raises CalibrationError, SettingsError, OSError.
+    """
+    path = path.resolve()  # a link remains a link
+    before, text = load(path), path.read_text(encoding="utf-8")
+    try:
+        document = tomlkit.parse(text)
+        section: Any = document.setdefault("hands", tomlkit.table())
+        for name, value in values.items():
+            section[name] = value
+        changed = tomlkit.dumps(document)
+    except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
+        raise CalibrationError(f"{path} cannot be changed: {error}. Write into it:\n{lines(values)}") from None
+    after = parse(changed, origin=str(path), folder=path.parent)
+    wanted = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    if after != msgspec.structs.replace(before, hands=msgspec.structs.replace(before.hands, **wanted)):
+        raise CalibrationError(f"{path} cannot be changed without other settings. Write into it:\n{lines(values)}")
+    kept = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
+    shutil.copy2(path, kept)
+    _replace(path, changed.encode(), path.stat().st_mode)
+    _replace(record_path(path), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+    return kept
+
+
+def _replace(path: Path, data: bytes, mode: int) -> None:
+    """Replace a file at once, or leave it as it is."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, mode & 0o777)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def recorded(path: Path, settings: Settings) -> CalibrationRecord:
+    """The record of a calibration, with the pose in the settings. Raises CalibrationError."""
+    beside = record_path(path.resolve())
+    try:
+        given = msgspec.json.decode(content(beside, LARGEST_CONFIGURATION))
+        record = validated(given, CalibrationRecord)
+    except FileNotFoundError:
+        raise CalibrationError(
+            f"{beside} does not exist, so that the hand's place in the tool is unknown: `thirdhand calibrate --held` "
+            "writes it"
+        ) from None
+    except (OSError, UnusableError, msgspec.DecodeError, UnicodeDecodeError, InvalidError) as error:
+        raise CalibrationError(f"{beside} cannot be read: {in_words(error, named=False)}") from None
+    pose = settings.hands.base_from_tracker
+    return msgspec.structs.replace(
+        record, calibration=msgspec.structs.replace(record.calibration, base_from_tracker=pose)
+    )

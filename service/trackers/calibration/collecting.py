@@ -1,0 +1,355 @@
+"""Hands and tool for a calibration, of a running cell or of a recording, in common time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.contract import channels
+from service.contract.messages import BASE
+from service.contract.records import SIDES
+from service.core.frame import Vector
+from service.core.intake.stage import UNIT_M
+from service.files.demonstration_reader import is_by_tracker
+from service.files.pose_streams import ENDINGS, JOINT_STATES, PoseRecording
+from service.files.tool_poses import tool_poses
+from service.files.track import Track
+from service.settings.config import HandSettings, Settings, robot_description
+from service.trackers.calibration.solver import (
+    LEAD_APART,
+    TURN_WRIST,
+    Calibration,
+    CalibrationError,
+    Coverage,
+    HeldTool,
+    coverage,
+    solve_held,
+)
+from service.trackers.capture import Capture, Sample
+
+CLOCK_TOLERANCE_S = 0.5  # stamps that differ more from the time of arrival are of another clock
+MAX_GAP_S = 0.25  # in a longer gap between the arm's states, the tool's pose is unknown
+SHOWN_SAMPLES = 120  # the expected accuracy is computed from this number of samples
+SHOW_EVERY_S = 2.0
+LEAST_LED_S = 15.0  # the tool is led at least this long
+LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at half of that
+LEAST_LED_M, LEAST_TURNED_RAD = 0.10, math.radians(40)  # and at least this far, in each direction
+LED_POLL_S = 0.05
+TOUCH_S = 0.5  # a touch is the median over this time
+MAX_TOUCH_M = 0.015  # in which the hand moves at most this far
+LEAST_TOUCH_SAMPLES = 5
+
+
+class LedTracks(NamedTuple):
+    """The tracks of the hands that arrived, by side, in the tracker's unit, and of the tool; and
+    remarks on what was left out.
+    """
+
+    hands: Mapping[str, Track]
+    tool: Track
+    remarks: Sequence[str] = ()
+
+
+class SolvedHand(NamedTuple):
+    """A calibration, the hand and frame that it is of, what it was computed from, and remarks."""
+
+    calibration: Calibration
+    side: str
+    frame: str
+    held: HeldTool
+    remarks: Sequence[str]
+
+
+def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Settings]:
+    """Hands and tool in a recording or demonstration with joint states, and the settings: those
+    given, else those in the file. Raises RecordingError, CalibrationError.
+    """
+    recorded = PoseRecording(path)
+    settings = settings or recorded.settings or Settings()
+    joints = recorded.joint_topic(settings)
+    if not joints:
+        raise CalibrationError(
+            f"{path} has no {JOINT_STATES} of the joints {', '.join(settings.joints.names)}: give the arm by --config, "
+            f"or record them; its topics: {', '.join(sorted(recorded.topics)) or 'none'}"
+        )
+    hands: dict[str, Track] = {}
+    for side in SIDES:
+        for topic in recorded.topics:
+            if f"/{topic}".endswith(f"/{ENDINGS[side]}") and recorded.topics[topic] == channels.POSE.type:
+                stamps, logged, poses, frame = recorded.tracks(topic).get("", ([], [], [], ""))
+                if stamps:
+                    arrays = np.array(stamps, np.int64), np.array(logged, np.int64), np.array(poses)
+                    hands[side] = Track(ENDINGS[side], topic, *arrays, frame)
+    if not hands:
+        raise CalibrationError(f"{path} has no hands: a topic ending in hands/left or hands/right needed")
+    tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
+    return LedTracks(hands, tool), settings
+
+
+class LiveLed:
+    """Hands and joints of a running cell, subscribed until closed."""
+
+    def __init__(self, session: zenoh.Session, cell: str, settings: Settings) -> None:
+        self._settings, self._urdf = settings, robot_description(settings)
+        self._capture = Capture(session, cell, settings)
+        self.begun_s = time.monotonic()
+
+    def close(self) -> None:
+        """End the subscriptions."""
+        self._capture.close()
+
+    def collect(self) -> None:
+        """Decode the messages since the last call."""
+        self._capture.collect()
+
+    def missing(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
+        """The required streams from which nothing arrived; without a side, one hand is enough."""
+        samples = self._capture.samples
+        wanted = [ENDINGS[one] for one in SIDES if side in (None, one)]
+        lacking = [] if any(samples[key] for key in wanted) else [" or ".join(wanted)]
+        return lacking + ([JOINT_STATES] if needs_joints and not samples[JOINT_STATES] else [])
+
+    @property
+    def arriving(self) -> list[str]:
+        """The sides of the hands that arrive."""
+        return [side for side in SIDES if self._capture.samples[ENDINGS[side]]]
+
+    @property
+    def malformed(self) -> Mapping[str, int]:
+        """Numbers of unreadable messages, by key."""
+        return self._capture.malformed
+
+    def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
+        """What arrived: with at most `most_states` poses of the tool, of the last `since_s` [s].
+
+        Of a hand whose frame changed, only the samples in the newest frame are used.
+        """
+        hands: dict[str, Track] = {}
+        remarks = []
+        for side in self.arriving:
+            samples = _lately(self._capture.samples[ENDINGS[side]], since_s)
+            poses = [channels.POSE.decode(sample.payload) for sample in samples]
+            frame = poses[-1].frame_id if poses else ""
+            kept = [i for i, pose in enumerate(poses) if pose.frame_id == frame]
+            if len(kept) < len(poses):
+                remarks.append(
+                    f"{ENDINGS[side]} changed its frame to {frame!r}: the {len(poses) - len(kept)} samples before are "
+                    "not used"
+                )
+            if kept:
+                stamps = np.array([poses[i].stamp_ns for i in kept], np.int64)
+                logged = np.array([samples[i].arrived_ns for i in kept], np.int64)
+                rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept])
+                hands[side] = Track(ENDINGS[side], "", stamps, logged, rows, frame)
+        return LedTracks(hands, self._tool(most_states, since_s), remarks)
+
+    def _tool(self, most: int | None, since_s: float | None) -> Track:
+        states = _lately(self._capture.samples[JOINT_STATES], since_s)
+        if not states:
+            nothing = np.zeros(0, np.int64)
+            return Track("tool", "", nothing, nothing, np.zeros((0, 7)), BASE)
+        step = math.ceil(len(states) / most) if most else 1
+        states = states[::step]
+        logged = np.array([state.arrived_ns for state in states], np.int64)
+        stamps = np.array([channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64)
+        stamps = np.where(stamps == 0, logged, stamps)
+        poses, kept = tool_poses(self._settings, self._urdf, stamps, np.array([state.at for state in states]))
+        return Track("tool", "", stamps[kept], logged[kept], poses, BASE)
+
+    def touch(self, side: str) -> Vector:
+        """The position (3,) [m] of a hand that rests, in the tracker's frame. Raises
+        CalibrationError.
+        """
+        samples = _lately(self._capture.samples[ENDINGS[side]], TOUCH_S)
+        if len(samples) < LEAST_TOUCH_SAMPLES:
+            raise CalibrationError(f"{len(samples)} samples of {ENDINGS[side]} in {TOUCH_S:g} s: is the hand seen?")
+        at = np.array([channels.POSE.decode(sample.payload).position for sample in samples])
+        at *= UNIT_M[self._settings.hands.unit]
+        moved_m = float(np.ptp(np.sort(at, axis=0)[len(at) // 10 : len(at) - len(at) // 10], axis=0).max())
+        if moved_m > MAX_TOUCH_M:
+            raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
+        return np.asarray(np.median(at, axis=0))
+
+    def tip(self) -> Vector:
+        """The present position (3,) [m] of the tool. Raises CalibrationError."""
+        tool = self.led(since_s=TOUCH_S).tool
+        if not len(tool.poses):
+            raise CalibrationError(f"no {JOINT_STATES} in {TOUCH_S:g} s: is the arm's driver running?")
+        return np.asarray(np.median(tool.poses[:, :3], axis=0))
+
+
+def _lately(samples: Sequence[Sample], since_s: float | None) -> Sequence[Sample]:
+    """The samples of the last `since_s` [s]; None: all."""
+    if since_s is None:
+        return samples
+    since_ns = time.time_ns() - int(1e9 * since_s)
+    return [sample for sample in samples if sample.arrived_ns >= since_ns]
+
+
+def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, list[str]]:
+    """Hand and tool in common time, in metres, and remarks. Raises CalibrationError.
+
+    Stamps are used unless they are of another clock; then the times of arrival are used.
+    """
+    if not is_by_tracker(hand.name, hand.frame, hands):
+        raise CalibrationError(
+            f"{hand.name} is in frame {BASE!r}, and [hands] frame is {hands.frame!r}: its publisher maps it already, "
+            "and base_from_tracker has no effect. Let it publish in the tracker's own frame"
+        )
+    remarks: list[str] = []
+    (hand_ns, hand_is_foreign), (tool_ns, tool_is_foreign) = map(_clock, (hand, tool))
+    if hand_is_foreign or tool_is_foreign:
+        hand_ns, tool_ns = hand.logged_ns, tool.logged_ns
+        whose = hand.name if hand_is_foreign else JOINT_STATES
+        remarks.append(f"the stamps of {whose} are of another clock: times of arrival are used")
+    finite = np.asarray(np.isfinite(hand.poses[:, :3]).all(axis=1))
+    if not finite.all():
+        remarks.append(f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite and not used")
+    tool_ns, tool_rows = np.unique(tool_ns, return_index=True)
+    sound = np.isfinite(tool.poses[tool_rows]).all(axis=1)
+    tool_ns, tool_rows = tool_ns[sound], tool_rows[sound]
+    hand_ns, hand_rows = np.unique(hand_ns[finite], return_index=True)
+    positions = UNIT_M[hands.unit] * hand.poses[finite][hand_rows, :3]
+    if len(tool_ns) < 2:
+        raise CalibrationError(f"no {JOINT_STATES} arrived while the tool was led: is the arm's driver running?")
+    after = np.clip(np.searchsorted(tool_ns, hand_ns), 1, len(tool_ns) - 1)
+    near = (hand_ns >= tool_ns[0]) & (hand_ns <= tool_ns[-1]) & (np.diff(tool_ns)[after - 1] < 1e9 * MAX_GAP_S)
+    origin = tool_ns[0]
+    held = HeldTool(
+        (hand_ns[near] - origin) / 1e9,
+        positions[near],
+        (tool_ns - origin) / 1e9,
+        tool.poses[tool_rows, :3],
+        tool.poses[tool_rows, 3:],
+    )
+    return held, remarks
+
+
+def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
+    """Stamps [ns], and true if they are of another clock than the times of arrival."""
+    if not len(track.stamps_ns):
+        return track.stamps_ns, False
+    return track.stamps_ns, bool(abs(np.median(track.logged_ns - track.stamps_ns)) > 1e9 * CLOCK_TOLERANCE_S)
+
+
+def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int) -> SolvedHand:
+    """The calibration by the hand of a side; without one, by the hand that moves with the tool.
+
+    Raises CalibrationError, which names the other hand if that one moves with the tool.
+    """
+    found: dict[str, SolvedHand] = {}
+    errors: dict[str, CalibrationError] = {}
+    for one in SIDES:
+        if (track := led.hands.get(one)) is None:
+            continue
+        try:
+            held, remarks = held_tool(track, led.tool, settings.hands)
+            calibration = solve_held(held, corners, **more)
+        except CalibrationError as error:
+            errors[one] = error
+        else:
+            found[one] = SolvedHand(calibration, one, track.frame, held, [*led.remarks, *remarks])
+        if one == side and one in found:
+            return found[one]
+    if side is None and found:
+        return min(found.values(), key=lambda one: one.calibration.rms_m)
+    if side is not None and side not in led.hands:
+        others = f"; {', '.join(led.hands)} arrives" if led.hands else ""
+        raise CalibrationError(f"{ENDINGS[side]} is needed, and nothing arrives there{others}")
+    if side is not None and found:
+        (other,) = found
+        raise CalibrationError(
+            f"{errors[side]}. {ENDINGS[other]} moves with the tool, with a residual of "
+            f"{1e3 * found[other].calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else "
+            "the tracker exchanges left and right"
+        )
+    if not errors:
+        raise CalibrationError("no hand arrives: is the tracker running?")
+    raise errors[side] if side is not None else next(iter(errors.values()))
+
+
+class LedProgress(NamedTuple):
+    """The coverage of the led tool so far, the expected accuracy [m] if known, and what to do."""
+
+    coverage: Coverage
+    std_m: float | None
+    advice: str
+
+    def text(self) -> str:
+        """The progress in one line."""
+        moved = " x ".join(f"{100 * size:.0f}" for size in self.coverage.extent_m)
+        turned = ", ".join(f"{math.degrees(angle):.0f}°" for angle in self.coverage.turned_rad[:2])
+        known = "unknown" if self.std_m is None else f"{1e3 * self.std_m:.1f} mm"
+        return f"led over {moved} cm, turned {turned}; accuracy {known}: {self.advice}"
+
+
+def progress(led: LedTracks, settings: Settings, corners: Vector, side: str | None) -> LedProgress | None:
+    """The progress of a calibration; None before the arm was heard."""
+    if len(led.tool.poses) < 4:
+        return None
+    cover, std_m, advice = coverage(led.tool.poses[:, :3], led.tool.poses[:, 3:]), None, ""
+    try:
+        found = solved(led, settings, corners, side, max_samples=SHOWN_SAMPLES).calibration
+        std_m, advice = found.std_m, found.remedy
+    except CalibrationError as error:
+        advice = str(error) if len(led.tool.poses) > SHOWN_SAMPLES else ""
+    if cover.extent_m[2] < LEAST_LED_M:
+        x, y, z = cover.narrow
+        advice = f"{LEAD_APART.partition(',')[0]} along ({x:.1f}, {y:.1f}, {z:.1f})"
+    elif cover.turned_rad[1] < LEAST_TURNED_RAD:
+        advice = TURN_WRIST
+    return LedProgress(cover, std_m, advice or "continue")
+
+
+def lead(
+    live: LiveLed,
+    settings: Settings,
+    corners: Vector,
+    side: str | None,
+    *,
+    accept_m: float,
+    longest_s: float,
+    is_ended: Callable[[], bool],
+    show: Callable[[str], None],
+) -> str:
+    """Collect while the tool is led; return the reason for the end.
+
+    It ends once the accuracy is half of `accept_m`, after LED_S once it is accepted, when
+    `is_ended`, or after `longest_s`.
+    """
+    begun_s = shown_s = time.monotonic()
+    while (now_s := time.monotonic()) - begun_s < longest_s:
+        time.sleep(LED_POLL_S)
+        live.collect()
+        if is_ended():
+            return "ended by the operator"
+        if now_s - shown_s < SHOW_EVERY_S:
+            continue
+        found = progress(live.led(most_states=4 * SHOWN_SAMPLES), settings, corners, side)
+        shown_s = time.monotonic()
+        if found is None:
+            continue
+        lasts_s = now_s - begun_s
+        show(f"{lasts_s:4.0f} s  {found.text()}")
+        wide = found.coverage.extent_m[2] >= LEAST_LED_M and found.coverage.turned_rad[1] >= LEAST_TURNED_RAD
+        goal_m = accept_m if lasts_s > LED_S else 0.5 * accept_m
+        if found.std_m is not None and wide and lasts_s > LEAST_LED_S and found.std_m < goal_m:
+            return f"ended: the expected accuracy is {1e3 * found.std_m:.1f} mm"
+    return f"ended after {longest_s:g} s"
+
+
+def distances_m(held: HeldTool, calibration: Calibration) -> Vector:
+    """Distances (N,) [m] between the mapped hand and where it is by the tool's pose."""
+    at_s = np.clip(held.hand_s - calibration.delay_s, held.tool_s[0], held.tool_s[-1])
+    rows = np.clip(np.searchsorted(held.tool_s, at_s), 0, len(held.tool_s) - 1)
+    tool = np.stack([np.interp(at_s, held.tool_s, axis) for axis in held.tool.T], axis=1)
+    expected = tool + Rotation.from_quat(held.turn[rows]).apply(calibration.hand_in_tool)
+    return np.asarray(np.linalg.norm(calibration.mapped(held.hand) - expected, axis=1))

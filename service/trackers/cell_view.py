@@ -1,0 +1,89 @@
+"""A cell as pages show it: the newest status in the words of their buttons, and their orders."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+import zenoh
+
+from service.client import Client, RefusedError, decoded
+from service.contract import channels
+from service.contract.explain import ExplainedError
+from service.contract.incidents import ORDERS, in_brief, title
+from service.contract.messages import BASE, SceneObject, WireError
+from service.contract.requests import Status
+from service.trackers.web_server import Address
+
+_COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
+SHOWN_FIELDS = (
+    *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief"),
+    *("demonstrated_m", "hands_at_m", "trackers"),
+)
+
+
+class Latest:
+    """The newest status of the daemon, its age, and the objects on the bench."""
+
+    def __init__(self, session: zenoh.Session, cell: str, first: Status | None = None) -> None:
+        self._status, self._at = first, time.monotonic()
+        self._objects: tuple[SceneObject, ...] = ()
+        self._subscribers = [
+            session.declare_subscriber(channels.key(cell, suffix), take)
+            for suffix, take in (("status", self._take), ("objects", self._take_objects))
+        ]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        with contextlib.suppress(RefusedError):
+            self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
+
+    def _take_objects(self, sample: zenoh.Sample) -> None:
+        with contextlib.suppress(WireError):  # the daemon reports them
+            self._objects = channels.BY_KEY["objects"].codec.decode(sample.payload.to_bytes())
+
+    def objects(self) -> list[dict[str, Any]]:
+        """The objects on the bench: name, shape, position [m], size [m], colour, `held`: true if
+        the position is in a frame of the arm, which holds it.
+        """
+        fields = ("name", "shape", "position", "size", "colour")
+        return [{name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects]
+
+    @property
+    def stream(self) -> Address:
+        """The server of the live view; it changes when the scribe is started again."""
+        live = self._status.scribe.get("live") if self._status else None
+        parts = urlsplit(str(live or "").removeprefix("rerun+"))
+        return Address(parts.hostname or "127.0.0.1", parts.port or 0)
+
+    def summary(self) -> dict[str, Any]:
+        """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
+        [s], the daemon's time [ms], the live view that it serves, and further facts in one line;
+        empty before the first status.
+        """
+        now, age_s = self._status, time.monotonic() - self._at
+        if now is None:
+            return {}
+        hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
+        near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
+        facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
+        shown = {name: getattr(now, name) for name in SHOWN_FIELDS} | {"title": title(now.reason)}
+        remedy = _COMMAND.sub(
+            lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
+            now.remedy,
+        )
+        now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
+        return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
+
+
+def carried_out(client: Client, order: str) -> tuple[bool, str]:
+    """True if the daemon carried out hold, resume or reset, and its answer in words."""
+    try:
+        reply = client.ask(order)
+    except ExplainedError as error:
+        return False, f"{order} was NOT carried out: {error}"
+    now = in_brief(reply.get("mode", ""), reply.get("reason", "")).replace("_", " ")
+    note = f"; {reply['note']}" if reply.get("note") else ""
+    return True, f"{order} carried out at tick {reply['tick']}; mode then: {now}{note}"

@@ -1,0 +1,132 @@
+"""The lag that `thirdhand doctor` measures, on simulated servos whose lag is known."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from service.cli.arm_lag import Lag, lag
+from service.settings.config import Settings
+from support.paths import ROOT
+
+NAMES = ("a", "b", "c")
+SERVOS = ("delay", "servo")
+LAGS_MS = (0, 20, 50, 100)
+PERIOD_S = 0.002
+
+
+def followed(commanded: np.ndarray, lag_s: float) -> np.ndarray:
+    """The joints (N, J) of a critically damped servo without velocity feedforward, kv / kp = lag:
+    acceleration = kp (command - position) - kv velocity.
+    """
+    if not lag_s:
+        return commanded.copy()
+    kp, kv = 4.0 / lag_s**2, 4.0 / lag_s
+    measured, velocity = np.empty_like(commanded), np.zeros(commanded.shape[1])
+    position = commanded[0].copy()
+    for i, target in enumerate(commanded):
+        measured[i] = position
+        velocity += PERIOD_S * (kp * (target - position) - kv * velocity)
+        position += PERIOD_S * velocity
+    return measured
+
+
+def simulated(
+    servo: str, lag_s: float, *, state_hz: float = 500.0, noise_rad: float = 0.0, size: float = 0.3, seed: int = 0
+) -> Lag | None:
+    """The lag that is measured in 3 s: joints on smooth paths, followed by a pure delay or by a
+    servo.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, 5.0, PERIOD_S)
+    commanded = np.zeros((len(times), len(NAMES)))
+    for frequency_hz in (0.2, 0.35, 0.6):
+        commanded += rng.uniform(-size, size, 3) * np.sin(
+            2 * np.pi * frequency_hz * times[:, None] + rng.uniform(0, 6, 3)
+        )
+    if servo == "delay":
+        measured = np.column_stack([np.interp(times - lag_s, times, column) for column in commanded.T])
+    else:
+        measured = followed(commanded, lag_s)
+    measured += np.array([0.02, -0.01, 0.0])  # what gravity bends
+    seen = times >= 2.0
+    every = round(1 / (state_hz * PERIOD_S))
+
+    def arrived(values: np.ndarray, step: int, noise_rad: float) -> dict[str, list[tuple[float, float]]]:
+        at = times[seen][::step] + rng.uniform(0, 0.0015, len(times[seen][::step]))
+        noisy = values[seen][::step] + rng.normal(0, noise_rad, (len(at), 3))
+        return {name: list(zip(at.tolist(), noisy[:, i].tolist(), strict=True)) for i, name in enumerate(NAMES)}
+
+    return lag(arrived(commanded, 1, 0.0), arrived(measured, every, noise_rad))
+
+
+@pytest.mark.parametrize("lag_ms", LAGS_MS)
+@pytest.mark.parametrize("servo", SERVOS)
+@pytest.mark.parametrize(("state_hz", "noise_rad"), [(500, 0.0), (500, 0.001), (50, 0.001), (100, 0.003)])
+def test_the_lag_of_a_servo_is_measured(servo: str, lag_ms: int, state_hz: float, noise_rad: float) -> None:
+    """Within 1 ms; a servo is late by up to 2 % less than its constant at these frequencies."""
+    errors_ms = []
+    for seed in range(3):
+        found = simulated(servo, lag_ms / 1000, state_hz=state_hz, noise_rad=noise_rad, seed=seed)
+        assert found is not None
+        errors_ms.append(1000 * found.lag_s - lag_ms)
+    assert max(errors_ms) < 1.0
+    assert min(errors_ms) > -1.0 - (0.02 * lag_ms if servo == "servo" else 0.0)
+
+
+def test_an_arm_that_does_not_move_shows_no_lag() -> None:
+    assert simulated("delay", 0.05, size=0.0) is None
+    assert simulated("delay", 0.05, size=0.004, noise_rad=0.001) is None
+
+
+def test_neither_does_one_that_moves_by_itself_or_is_not_heard() -> None:
+    rng = np.random.default_rng(1)
+    times = np.arange(0.0, 3.0, PERIOD_S)
+    paths = {name: list(zip(times.tolist(), np.sin(times).tolist(), strict=True)) for name in NAMES}
+    strange = {
+        name: list(zip(times.tolist(), np.cumsum(rng.normal(0, 0.05, len(times))).tolist(), strict=True))
+        for name in NAMES
+    }
+    assert lag(paths, strange) is None
+    assert lag(paths, {}) is None
+    assert lag({}, paths) is None
+
+
+def test_a_continuous_joint_may_wrap() -> None:
+    times = np.arange(0.0, 4.0, PERIOD_S)
+    path = 3.0 + 0.4 * np.sin(2 * times)
+    late = 3.0 + 0.4 * np.sin(2 * (times - 0.05))
+    wrapped = (late + np.pi) % (2 * np.pi) - np.pi
+    pairs = [list(zip(times.tolist(), values.tolist(), strict=True)) for values in (path, wrapped)]
+    found = lag({"a": pairs[0]}, {"a": pairs[1]})
+    assert found is not None
+    assert found.lag_s == pytest.approx(0.05, abs=0.001)
+
+
+def rms_mrad(lag_s: float, lead_s: float) -> float:
+    """The error of joints that the driver template moves through a servo of the second order."""
+    spec = importlib.util.spec_from_file_location("own_arm", ROOT / "examples" / "own_arm.py")
+    assert spec is not None
+    assert spec.loader is not None
+    own_arm = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(own_arm)
+    arm = own_arm.FakeArm(Settings())
+    arm.lag_s, written = lead_s, list[np.ndarray]()
+    arm.move = lambda position, velocity: written.append(position)
+    times = np.arange(0.0, 8.0, PERIOD_S)
+    paths = np.array(Settings().arm.posture) + 0.3 * np.sin(2.5 * times[:, None] - 1.0)
+    for position, velocity in zip(paths, np.gradient(paths, PERIOD_S, axis=0), strict=True):
+        arm.write(position, velocity)
+    measured = followed(np.array(written), lag_s)
+    settled = times > 2.0
+    return float(1000 * np.sqrt(np.mean((measured - paths)[settled] ** 2)))
+
+
+def test_the_driver_template_leads_by_the_lag_of_its_servo() -> None:
+    """At 100 ms the error falls to less than a tenth."""
+    plain, led = rms_mrad(0.1, 0.0), rms_mrad(0.1, 0.1)
+    assert 40 < plain < 60
+    assert led < 0.1 * plain
+    assert rms_mrad(0.0, 0.0) == 0.0

@@ -1,0 +1,222 @@
+"""`import thirdhand`: the same classes as in `service.client` however it is installed; and a
+connection's calls.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from service.client import Connection, SceneObject, UnreachableError, Watch, endpoints, open_session, publisher
+from service.client.streams import wait_until_heard
+from service.contract import channels
+from service.contract.messages import JointState, PoseStamped
+from support.installed import CLIENT, isolated, unpacked, wheel_of
+from support.paths import ROOT
+
+DEPENDENCIES = ("zenoh", "msgspec")
+SAME = """
+import sys, thirdhand
+assert len(thirdhand.__all__) > 25
+from service import client
+assert all(getattr(thirdhand, name) is getattr(client, name) for name in client.__all__)
+print(thirdhand.__file__, sorted({name.split(".")[0] for name in sys.modules} - sys.stdlib_module_names))
+"""
+INSTALLED = {  # the projects, and the file that is then imported
+    "client": ([(CLIENT, False)], "thirdhand.py"),
+    "wheel": ([(ROOT, False)], "thirdhand/__init__.py"),
+    "editable": ([(ROOT, True)], "thirdhand/__init__.py"),
+    "client and wheel": ([(CLIENT, False), (ROOT, False)], "thirdhand/__init__.py"),
+    "client and editable": ([(CLIENT, False), (ROOT, True)], "thirdhand/__init__.py"),
+}
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Path, bool], Path]:
+    """The wheels by project and kind."""
+    kinds = ((CLIENT, False), (ROOT, False), (ROOT, True))
+    return {
+        (project, editable): wheel_of(project, tmp_path_factory.mktemp("wheel"), editable=editable)
+        for project, editable in kinds
+    }
+
+
+@pytest.mark.parametrize(("projects", "file"), INSTALLED.values(), ids=INSTALLED)
+def test_both_names_have_the_same_classes_and_import_nothing_else(
+    projects: list[tuple[Path, bool]], file: str, wheels: dict[tuple[Path, bool], Path], tmp_path: Path
+) -> None:
+    for project in projects:
+        unpacked(wheels[project], tmp_path)
+    done = isolated(tmp_path, SAME, *DEPENDENCIES)
+    assert done.returncode == 0, done.stderr
+    imported, _, modules = done.stdout.partition(" ")
+    assert imported == str(tmp_path / file)
+    assert set(ast.literal_eval(modules)) == {"__main__", "thirdhand", "service", *DEPENDENCIES}
+
+
+def test_the_two_distributions_share_no_file(wheels: dict[tuple[Path, bool], Path], tmp_path: Path) -> None:
+    """So that each is updated and removed without the other."""
+    folders = (unpacked(wheels[CLIENT, False], tmp_path / "client"), unpacked(wheels[ROOT, False], tmp_path / "wheel"))
+    client, whole = ({path.relative_to(one) for path in one.rglob("*") if path.is_file()} for one in folders)
+    assert len(client) > 20
+    assert client & whole == set()
+    modules = {path for path in client if path.suffix == ".py" and path.name != "thirdhand.py"}
+    assert {path.relative_to("_thirdhand_client") for path in modules} <= whole
+    metadata = (next(folders[0].glob("*.dist-info")) / "METADATA").read_text(encoding="utf-8")
+    needs = [line for line in metadata.splitlines() if line.startswith("Requires-Dist: ") and ";" not in line]
+    assert [line.split()[1].partition(">")[0] for line in needs] == ["eclipse-zenoh", "msgspec"]
+
+
+@pytest.mark.parametrize("module", [True, False])
+def test_another_package_of_the_name_service_is_named(
+    module: bool, wheels: dict[tuple[Path, bool], Path], tmp_path: Path
+) -> None:
+    site, other = unpacked(wheels[CLIENT, False], tmp_path / "site"), tmp_path / "own"
+    (other / ("" if module else "service")).mkdir(parents=True)
+    file = other / ("service.py" if module else "service/__init__.py")
+    file.write_text("")
+    code = f"import sys; sys.path.insert(0, {str(other)!r})\nimport service\nimport thirdhand"
+    done = isolated(site, code, *DEPENDENCIES)
+    assert f"ImportError: `import thirdhand` found another package named `service` ({file})" in done.stderr
+
+
+def test_the_client_alone_can_be_read_by_python_3_10(wheels: dict[tuple[Path, bool], Path], tmp_path: Path) -> None:
+    sources = list(unpacked(wheels[CLIENT, False], tmp_path).rglob("*.py"))
+    assert len(sources) > 20
+    for path in sources:
+        ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 10))
+
+
+# --- a connection --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def listener() -> Iterator[zenoh.Session]:
+    """A session that listens as a daemon does."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        yield session
+
+
+@pytest.fixture
+def cell(listener: zenoh.Session) -> Iterator[Connection]:
+    """A connection to it."""
+    with Connection(open_session(connect=endpoints(listener)), "bench") as connected:
+        yield connected
+
+
+GREEN = (0.0, 0.5, 0.0, 1.0)
+BOX = SceneObject("board", "box", "base", (0.6, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0), (0.1, 0.2, 0.01), GREEN)
+TURNED = (0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8)
+PUBLISHED: dict[str, tuple[Callable[[Connection], None], dict[str, Any]]] = {
+    "both hands": (
+        lambda cell: cell.hands(left=(0.1, 0.2, 0.3), right=TURNED, stamp_ns=5, frame_id="headset"),
+        {
+            "hands/left": PoseStamped(5, "headset", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0)),
+            "hands/right": PoseStamped(5, "headset", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)),
+        },
+    ),
+    "a hand": (
+        lambda cell: cell.hands(right=[0, 1, 2], stamp_ns=6),
+        {"hands/right": PoseStamped(6, "base", (0.0, 1.0, 2.0), (0.0, 0.0, 0.0, 1.0))},
+    ),
+    "the tool": (
+        lambda cell: cell.tool(TURNED, stamp_ns=7),
+        {"tool/pose": PoseStamped(7, "base", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8))},
+    ),
+    "the gripper": (
+        lambda cell: cell.gripper(0.25, stamp_ns=8),
+        {"gripper/state": JointState(8, ("gripper",), (0.25,), ())},
+    ),
+    "a pressed clutch": (lambda cell: cell.clutch(True), {"clutch": True}),
+    "the gripper that a person wants": (
+        lambda cell: cell.wish_gripper(1.0, stamp_ns=8),
+        {"gripper/wish": 1.0},
+    ),
+    "objects": (
+        lambda cell: cell.objects([BOX], stamp_ns=9),
+        {"objects": (BOX,)},
+    ),
+}
+
+
+@pytest.mark.parametrize(("call", "messages"), PUBLISHED.values(), ids=PUBLISHED)
+def test_one_call_publishes_what_is_then_received(
+    call: Callable[[Connection], None], messages: dict[str, Any], cell: Connection, listener: zenoh.Session
+) -> None:
+    watches = {suffix: Watch(listener, "bench", suffix, timeout_s=10) for suffix in messages}
+    call(cell)
+    assert {suffix: next(watch) for suffix, watch in watches.items()} == messages
+    for watch in watches.values():
+        watch.close()
+
+
+WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
+    "no hand": (lambda cell: cell.hands(), "no hand given; left, right or both needed"),
+    "two numbers": (lambda cell: cell.hands(left=(1, 2)), r"left: 2 numbers given; x y z \[m\], or x y z and a quat"),
+    "six numbers": (lambda cell: cell.tool((0,) * 6), "tool: 6 numbers given; x y z"),
+    "not a number": (lambda cell: cell.hands(right=(0, 0, math.nan)), r"right: \[0.0, 0.0, nan\] given; finite"),
+    "a text": (lambda cell: cell.hands(left="abc"), "left: 'abc' given; x y z"),  # type: ignore[arg-type]
+    "one number": (lambda cell: cell.hands(left=5), "left: 5 given; x y z"),  # type: ignore[arg-type]
+    "no rotation": (lambda cell: cell.tool((0, 0, 0, 0, 0, 0, 2)), r"tool: quaternion .* has norm 2; 1 needed"),
+    "no clutch": (lambda cell: cell.clutch(1), "clutch: 1 given; True or False needed"),  # type: ignore[arg-type]
+    "too far closed": (lambda cell: cell.gripper(1.5), r"closure: 1.5 given; 0 \(open\) to 1 \(closed\) needed"),
+    "no closure": (lambda cell: cell.gripper(None), r"closure: \[None\] given; 0 \(open\)"),  # type: ignore[arg-type]
+    "a shape": (lambda cell: cell.objects([BOX._replace(shape="cone")]), "shape 'cone' given; one of box, ball, cyl"),
+    "no size": (lambda cell: cell.objects([BOX._replace(size=(0.1, 0.1, 0.0))]), "object 'board': .* or no size"),
+    "no object": (lambda cell: cell.objects([("a", "box")]), "a SceneObject needed"),  # type: ignore[list-item]
+    "a channel": (lambda cell: cell.watch("tool/targets"), "channel 'tool/targets' given; one of hands/left, .*status"),
+    "a request": (lambda cell: cell.watch("hold"), "channel 'hold' given"),
+    "a place": (lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)), "left: 2 numbers given; x"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "error"), WRONG.values(), ids=WRONG)
+def test_a_wrong_value_is_refused_before_anything_is_sent(
+    call: Callable[[Connection], object], error: str, cell: Connection
+) -> None:
+    """At once: nobody listens, for which a valid call would wait."""
+    with pytest.raises(ValueError, match=error):
+        call(cell)
+
+
+def test_what_nobody_hears_is_refused(cell: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.client.connection.LISTENER_TIMEOUT_S", 0.2)
+    with pytest.raises(UnreachableError, match=r"nobody listens to bench/tool/pose: is a daemon or `thirdhand record`"):
+        cell.tool((0, 0, 0))
+
+
+def test_a_default_stamp_is_taken_once_somebody_listens(cell: Connection, listener: zenoh.Session) -> None:
+    """Else the next samples would seem to come too early."""
+    late: list[Watch] = []
+    timer = threading.Timer(0.5, lambda: late.append(Watch(listener, "bench", "hands/left", timeout_s=10)))
+    timer.start()
+    before_ns = time.time_ns()
+    cell.hands(left=(0, 0, 0))
+    timer.join()
+    assert next(late[0]).stamp_ns > before_ns + 400_000_000
+    late[0].close()
+
+
+def test_a_watch_yields_in_order_none_in_silence_and_skips_what_is_not_readable(
+    cell: Connection, listener: zenoh.Session
+) -> None:
+    encode = channels.BY_KEY["tool/setpoint"].codec.encode
+    poses = [PoseStamped(n, "base", (0.0, 0.0, float(n)), (0.0, 0.0, 0.0, 1.0)) for n in range(3)]
+    with cell.watch("tool/setpoint", timeout_s=0.2) as watch:
+        assert next(watch) is None
+        daemon = publisher(listener, "bench", "tool/setpoint")
+        wait_until_heard(daemon, timeout_s=10)
+        daemon.put(b"nonsense")
+        for pose in poses:
+            daemon.put(encode(pose))
+        assert list(itertools.islice(watch, 4)) == [*poses, None]
+        assert (watch.rejected, watch.reason[:6]) == (1, "header")

@@ -1,0 +1,154 @@
+"""The clutch as a dead-man's switch, and a person's wish for the gripper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.contract.records import Mode, Reason
+from service.core.controller import Controller
+from service.core.frame import Event, Tick, order
+from service.core.skill.pose import CLOSED, OPEN, UNKNOWN
+from service.core.skill.skill import Skill
+from service.learning.via_points import adapted
+from service.settings.config import Settings
+from sim.scene import Scene
+from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, frames, led, resting, wish
+from support.wam import URDF
+
+LOOP_RATES_HZ = (100, 250, 500, 1000)
+SENT_HZ = 10
+STALE_S = 0.3
+
+
+def cell(base: Settings = ASSUMED, rate_hz: int = 500, **hands: Any) -> Settings:
+    """A cell with a clutch, or with other settings of [hands]."""
+    changed = msgspec.structs.replace(base.hands, **(hands or {"clutch": "key"}))
+    return msgspec.structs.replace(base, rate_hz=rate_hz, hands=changed)
+
+
+def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Event, ...]]:
+    """Events by their ticks, and a pressed clutch every so many ticks before the first of them."""
+    last = min(events, default=10**9)
+    return lambda k: (
+        *((clutch(True),) if every and k % every == 0 and k < last else ()),
+        *((events[k],) if k in events else ()),
+    )
+
+
+def reasons(settings: Settings, skill: Skill, ticks: list[Tick]) -> np.ndarray:
+    seen = frames(Controller(settings, skill, urdf=URDF), ticks)
+    assert ((seen["mode"] == Mode.FOLLOW) == (seen["reason"] == Reason.NONE)).all()
+    return seen["reason"]
+
+
+@pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
+def test_the_arm_holds_from_the_tick_in_which_the_release_arrives(taught: Skill, rate_hz: int) -> None:
+    release = rate_hz
+    ticks = resting(0, 2 * rate_hz, at({release: clutch(False)}, every=rate_hz // SENT_HZ), every=rate_hz // 100)
+    found = reasons(cell(rate_hz=rate_hz), taught, ticks)
+    assert (found[:release] == Reason.NONE).all()
+    assert (found[release:] == Reason.CLUTCH).all()
+
+
+@pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
+def test_a_clutch_that_falls_silent_is_released(taught: Skill, rate_hz: int) -> None:
+    pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
+    found = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
+    silent = 10 + round(STALE_S * rate_hz)
+    assert (found[:silent] == Reason.NONE).all()
+    assert (found[silent:] == Reason.CLUTCH).all()
+
+
+def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
+    ticks = resting(0, 20, lambda k: (clutch(True),) if k == 0 else ())
+    late = [Tick(k, tick.inbox) for k, tick in zip(range(149, 169), resting(20, 20, every=1), strict=True)]
+    found = reasons(cell(), taught, [*ticks, *late])
+    assert (found[:21] == Reason.NONE).all()  # tick 149 is the last one
+    assert (found[21:] == Reason.CLUTCH).all()
+
+
+def test_without_a_clutch_in_the_settings_its_messages_change_nothing(taught: Skill) -> None:
+    plain = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 300))
+    chattered = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 300, lambda k: (clutch(k % 3 == 0), wish(1))))
+    assert plain.tobytes() == chattered.tobytes()
+
+
+def test_the_last_message_of_a_tick_counts(taught: Skill) -> None:
+    both = lambda k: (clutch(k < 100), clutch(k >= 100))  # noqa: E731
+    found = reasons(cell(), taught, resting(0, 200, both))
+    assert (found[:100] == Reason.CLUTCH).all()
+    assert (found[100:] == Reason.NONE).all()
+
+
+@pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
+@pytest.mark.parametrize("period", [1, 2, 7, 40])
+def test_a_clutch_that_chatters_breaks_no_limit(taught: Skill, rate_hz: int, period: int) -> None:
+    """Pressed and released in turn while the hands move, and the arm with them."""
+    random = np.random.default_rng(period)
+    count = 2 * rate_hz
+    path = np.array(((0.75, -0.3, 0.25), (0.75, 0.3, 0.2))) + 0.1 * np.sin(
+        np.arange(count)[:, None, None] / rate_hz * 2 * np.pi * random.uniform(0.5, 1.0, (1, 2, 3))
+    )
+    ticks = list(led(path, lambda k: (clutch(k // period % 2 == 0),), every=max(1, rate_hz // 100)))
+    settings = cell(rate_hz=rate_hz)
+    seen = frames(Controller(settings, taught, urdf=URDF), ticks)
+    assert_limits_hold(seen, settings)
+    assert not (seen["mode"] == Mode.FAULT).any()
+    held = np.array([k // period % 2 == 1 for k in range(count)])
+    assert (seen["reason"][held] == Reason.CLUTCH).all()
+    assert (seen["reason"][~held] != Reason.CLUTCH).all()
+
+
+def test_an_operator_and_an_arm_that_is_not_ready_are_named_before_the_clutch(taught: Skill) -> None:
+    loop = Loop(cell(Settings()), taught)
+    not_ready = loop.run(20)
+    assert (not_ready["reason"] == Reason.ARM_NOT_READY).all()
+    assert (loop.run(100)["reason"][-20:] == Reason.CLUTCH).all()
+    assert (loop.run(10, {0: order("hold")})["reason"] == Reason.OPERATOR).all()
+    assert (loop.run(10, {0: order("resume")})["reason"] == Reason.CLUTCH).all()
+    assert (loop.run(50, {0: clutch(True)})["reason"] == Reason.NONE).all()
+
+
+def test_an_arm_outside_its_limits_returns_only_while_the_clutch_is_pressed(taught: Skill) -> None:
+    settings = cell(Settings())
+    start = np.array(settings.arm.posture)
+    start[3] = settings.joints.upper[3] + 0.02
+    loop = Loop(settings, taught, start=start)
+    released = loop.run(200)
+    assert not released["joint_velocities"].any()
+    pressed = loop.run(400, {k: clutch(True) for k in range(0, 400, 50)})
+    assert (pressed["reason"][:20] == Reason.ARM_NOT_READY).all()
+    assert pressed["joints"][-1, 3] < settings.joints.upper[3]
+
+
+def gripper(settings: Settings, skill: Skill, events: Mapping[int, Event]) -> list[int]:
+    """State of the gripper in each tick in which the hands rest at a via-point."""
+    return frames(Controller(settings, skill, urdf=URDF), resting(0, 900, at(events)))["gripper"].tolist()
+
+
+def test_a_wish_decides_the_gripper_where_the_skill_does_not(taught: Skill) -> None:
+    """With hysteresis and pause as where a skill decides it, and not while the arm holds."""
+    wishes = cell(gripper="key")
+    events = {50: wish(0.2), 350: wish(0.7), 400: wish(0.95), 420: wish(0.0)}
+    found = gripper(wishes, taught, events)
+    assert [found[k] for k in (49, 50, 399, 400, 420, 649)] == [UNKNOWN, OPEN, OPEN, CLOSED, CLOSED, CLOSED]
+    assert found[650:] == [OPEN] * 250  # half a second after it began to close
+    held = gripper(wishes, taught, {50: wish(0.2), 390: order("hold"), 400: wish(1.0), 500: order("resume")})
+    assert held[50:500] == [OPEN] * 450
+    assert held[500:] == [CLOSED] * 400
+
+
+def test_a_skill_with_a_gripper_decides_it_alone(skill: Skill) -> None:
+    first, *more = Scene().via_points()
+    there = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
+    closing = adapted(skill, (there, *more), tolerance=0.05)
+    wishes = cell(gripper="key")
+    alone = frames(Controller(wishes, closing, urdf=URDF), resting(0, 300))
+    assert alone["closure"][-1] >= 0.0
+    wished = frames(Controller(wishes, closing, urdf=URDF), resting(0, 300, lambda k: (wish(k % 2),)))
+    assert alone.tobytes() == wished.tobytes()

@@ -1,0 +1,211 @@
+"""Engaging: after a start, a hold or a fault the tool approaches its target slowly, once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+
+from service.contract.records import Flag, Mode
+from service.core.controller import Controller
+from service.core.frame import Event, Tick, Vector, order
+from service.core.setpoint.tuning import ENGAGED_GAP_M
+from service.core.skill.skill import Skill
+from service.settings.config import Settings, SettingsError, ToolSettings, parse, robot_description
+from sim.scene import Scene
+from sim.script import HandScript
+from support.arm_geometry import ArmGeometry
+from support.in_process import ASSUMED, Loop, assert_limits_hold, clutch, frames, led, ticks_of
+from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
+from support.wam import URDF
+
+E = 0.15  # [m/s]
+LOOP_HZ = (100, 250, 500, 1000)
+TOOL_RISE_MPS = 0.1  # the tool may be faster than its slow setpoint, as in a stop
+RESUMED = 600  # tick in which the hands of the script move
+inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
+wild = st.tuples(*(st.floats(-1e3, 1e3),) * 3)
+
+
+def cell(base: Settings = ASSUMED, rate_hz: int = 500, engage_speed: float = E, **hands: Any) -> Settings:
+    tool = msgspec.structs.replace(base.tool, engage_speed=engage_speed)
+    changed = msgspec.structs.replace(base.hands, **hands)
+    return msgspec.structs.replace(base, rate_hz=rate_hz, tool=tool, hands=changed)
+
+
+def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
+    """Ticks of the script in which the arm is held until the hands are on their way."""
+    orders = {0: order("hold"), RESUMED: order("resume")}
+    for tick in ticks_of(script, wait_s=0.0, tail_s=tail_s):
+        yield Tick(tick.index, (*tick.inbox, *([orders[tick.index]] if tick.index in orders else [])))
+
+
+def engages(seen: np.ndarray) -> np.ndarray:
+    return (seen["flags"] & Flag.ENGAGING) > 0
+
+
+def tool_speeds(settings: Settings, seen: np.ndarray) -> Vector:
+    geometry = ArmGeometry(settings, robot_description(settings))
+    return geometry.tool_speeds(seen["joints"], seen["joint_velocities"])
+
+
+@pytest.fixture(scope="module")
+def reached(taught: Skill) -> tuple[Vector, Vector]:
+    """Positions of both hands (K, 2, 3) along the task, and of the tool's target (K, 3)."""
+    script = HandScript(Scene(), seed=0)
+    hands = np.array([script.sample(t) for t in np.linspace(0.0, script.duration_s, 300)])[:, :, :3]
+    return hands, np.array([taught.mean(both.reshape(1, 6))[0] for both in hands])
+
+
+@pytest.mark.parametrize("rate_hz", LOOP_HZ)
+@pytest.mark.parametrize("apart_m", [0.1, 0.3, 0.6])
+def test_after_a_hold_the_tool_comes_slowly_to_where_the_hands_have_gone(
+    taught: Skill, reached: tuple[Vector, Vector], rate_hz: int, apart_m: float
+) -> None:
+    hands, targets = reached
+    between = np.linalg.norm(targets[:, None] - targets, axis=2)
+    before, after = np.unravel_index(np.abs(between - apart_m).argmin(), between.shape)
+    start_s, hold_s, resume_s, end_s = 0.0, 5.5, 6.5, 12.5
+    at = {round(hold_s * rate_hz): order("hold"), round(resume_s * rate_hz): order("resume")}
+    moved = round((hold_s + 0.5) * rate_hz)
+    path = (hands[before] if k < moved else hands[after] for k in range(round(end_s * rate_hz)))
+    settings = cell(rate_hz=rate_hz)
+    ticks = led(path, lambda k: (at[k],) if k in at else (), every=rate_hz // 100)
+    seen = frames(Controller(settings, taught, urdf=URDF), ticks)
+    assert_limits_hold(seen, settings)
+    slow, speed = engages(seen), tool_speeds(settings, seen)
+    assert np.linalg.norm(seen["setpoint_velocity"][slow], axis=1).max() <= E
+    assert speed[slow].max() <= E + TOOL_RISE_MPS
+    for begin_s in (start_s, resume_s):
+        begin = round(begin_s * rate_hz)
+        first = begin + int(np.argmax(seen["mode"][begin:] == Mode.FOLLOW))
+        lasts = int(np.argmin(slow[first:]))
+        gap = float(np.linalg.norm(seen["target"][first] - seen["tool"][first]))
+        assert lasts / rate_hz <= 0.4 + max(gap - ENGAGED_GAP_M, 0.0) / (0.95 * E)
+        assert not slow[first + lasts : round(hold_s * rate_hz) if begin_s == start_s else None].any(), "engaged once"
+    assert np.linalg.norm(seen["tool"][-1] - seen["target"][-1]) < 0.005
+
+
+def test_a_target_that_moves_away_faster_is_followed_slowly_until_it_pauses(taught: Skill) -> None:
+    """The flag says that the tool is behind; it ends when the target rests."""
+    slowly, ticks = cell(engage_speed=0.1), resumed(HandScript(Scene(), seed=5), tail_s=5.0)
+    seen = frames(Controller(slowly, taught, urdf=URDF), ticks)
+    slow, behind = engages(seen), np.linalg.norm(seen["target"] - seen["setpoint"], axis=1)
+    assert np.linalg.norm(seen["setpoint_velocity"][slow], axis=1).max() <= 0.1
+    assert behind[slow].max() > 1.3 * behind[slow][0]
+    assert not slow[-1]
+    assert (behind[:-1][slow[:-1] & ~slow[1:]] < ENGAGED_GAP_M + 0.1 * PERIOD_S).all()
+
+
+def test_every_following_begins_slowly_also_after_a_fault(taught: Skill) -> None:
+    loop = Loop(cell(Settings()), taught)
+    loop.run(1500)
+    assert loop.frames["mode"][-1] == Mode.FOLLOW
+    assert not engages(loop.frames)[-1]
+    failed = loop.run(600, {0: order("fault"), 200: order("reset")})
+    assert (failed["mode"][:200] == Mode.FAULT).all()
+    begins = int(np.argmax(failed["mode"] == Mode.FOLLOW))
+    assert begins >= 200
+    assert not engages(failed)[begins]  # it is at its target still
+    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.run(1500)
+    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    again = loop.run(1500, {0: order("fault"), 400: order("reset")})
+    begins = int(np.argmax(again["mode"][400:] == Mode.FOLLOW)) + 400
+    assert engages(again)[begins]
+    assert tool_speeds(cell(Settings()), again)[engages(again)].max() <= E + TOOL_RISE_MPS
+
+
+@pytest.mark.parametrize("rate_hz", LOOP_HZ)
+@pytest.mark.parametrize("what", ["resume", "clutch"])
+def test_storms_of_holds_break_no_limit_and_make_nothing_fast(taught: Skill, rate_hz: int, what: str) -> None:
+    """At random, for one tick up to a third of a second, while the hands move."""
+    random, count = np.random.default_rng(rate_hz), 3 * rate_hz
+    lengths = np.maximum(1, (rate_hz * 10 ** random.uniform(-3, -0.5, count)).astype(int))
+    is_on = np.repeat(np.arange(count) % 2 == 0, lengths)[:count]
+    messages: Callable[[int], tuple[Event, ...]] = {
+        "resume": lambda k: (order("resume" if is_on[k] else "hold"),),
+        "clutch": lambda k: (clutch(bool(is_on[k])),),
+    }[what]
+    times = np.arange(count)[:, None, None] / rate_hz
+    path = np.array(((0.75, -0.3, 0.25), (0.75, 0.3, 0.2))) + 0.15 * np.sin(
+        2 * np.pi * random.uniform(0.3, 0.8, (1, 2, 3)) * times
+    )
+    settings = cell(rate_hz=rate_hz, **({"clutch": "key"} if what == "clutch" else {}))
+    seen = frames(Controller(settings, taught, urdf=URDF), led(path, messages, every=max(1, rate_hz // 100)))
+    assert_limits_hold(seen, settings)
+    assert not (seen["mode"] == Mode.FAULT).any()
+    speed, slow = np.linalg.norm(seen["setpoint_velocity"], axis=1), engages(seen)
+    follows = (seen["mode"] == Mode.FOLLOW)[:-1] & slow[1:]
+    assert (speed[1:] <= np.maximum(E, speed[:-1]) + 1e-9)[follows].all()
+
+
+@example_settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    st.lists(st.tuples(inside, wild, wild), min_size=1, max_size=15),
+    st.integers(20, 200),
+    st.floats(0.0, 0.75),
+    st.sampled_from([0.01, 0.05, 0.15, 0.4]),
+)
+def test_bounds_of_a_setpoint_that_engages_hold_whatever_is_asked(
+    told: list[tuple[tuple[float, ...], ...]], ticks: int, speed: float, engage_speed: float
+) -> None:
+    """From any speed, toward any target; `driven` asserts the bounds of the position."""
+    tool = ToolSettings(engage_speed=engage_speed)
+    start = np.array([MIDDLE, (speed, 0.0, 0.0), (0.0, 0.0, 0.0)])
+    targets = [np.array(target) for target in told for _ in range(ticks)] + [at_rest(told[-1][0])] * 10
+    states, _ = driven(targets, start=start, tool=tool)
+    speeds = np.linalg.norm(states[:, 1], axis=1)
+    near = np.linalg.norm(states[:-1, 0] - [target[0] for target in targets], axis=1) < ENGAGED_GAP_M
+    end = int(np.argmax(near)) if near.any() else len(near)
+    assert (speeds[1 : end + 1] <= np.maximum(speeds[:end], engage_speed) + 1e-9).all()
+    assert speeds.max() <= tool.max_speed + 1e-9
+    assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
+    assert np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
+
+
+def test_a_slow_engaging_does_not_look_stuck(taught: Skill) -> None:
+    path: Iterator[Tick] = led(np.tile(((0.62, -0.28, 0.30), (0.98, 0.32, 0.06)), (2000, 1, 1)))
+    seen = frames(Controller(cell(engage_speed=0.02), taught, urdf=URDF), path)
+    assert engages(seen)[-1]
+    assert not (seen["flags"] & Flag.STUCK).any()
+
+
+def test_the_turn_of_the_tool_is_slowed_in_proportion(taught: Skill) -> None:
+    ticks = [*resumed(HandScript(Scene(), seed=5))][: RESUMED + 1000]
+    seen = frames(Controller(cell(engage_speed=0.05), taught, urdf=URDF), ticks)[RESUMED:]
+    assert engages(seen).all()
+    turning = np.linalg.norm(seen["setpoint_turning"], axis=1)
+    assert turning.max() <= 0.05 / ASSUMED.tool.max_speed * ASSUMED.tool.max_turn_speed
+
+
+def test_without_an_engage_speed_nothing_engages(taught: Skill) -> None:
+    ticks = list(ticks_of(HandScript(Scene(), seed=3), wait_s=0.2))[:800]
+    off, full = (frames(Controller(cell(engage_speed=e), taught, urdf=URDF), ticks) for e in (0.0, 0.8))
+    assert off.tobytes() == full.tobytes()
+    assert not engages(off).any()
+
+
+@pytest.mark.parametrize(
+    ("text", "speed", "words"),
+    [
+        ("engage_speed = 0.05", 0.05, ""),
+        ("engage_speed = 0.0\nmax_speed = 0.1", 0.1, ""),
+        ("engage_speed = 0.1\nmax_speed = 0.1", 0.1, ""),
+        ("max_speed = 0.1", 0.1, ""),
+        ("engage_speed = 0.3\nmax_speed = 0.25", 0.0, r"engage_speed: 0.3 given; at most .*max_speed = 0.25 accepted"),
+        ("engage_speed = -0.1", 0.0, "engage_speed"),
+    ],
+)
+def test_the_engage_speed_is_at_most_the_speed_of_the_tool(text: str, speed: float, words: str) -> None:
+    if words:
+        with pytest.raises(SettingsError, match=words):
+            parse(f"[tool]\n{text}", origin="cell.toml")
+        return
+    assert parse(f"[tool]\n{text}", origin="cell.toml").tool.engaging_speed == speed

@@ -1,0 +1,84 @@
+"""The clutch over Zenoh: a switch in another process, which releases it, or dies while pressed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.contract import cdr
+from service.contract.records import Mode, Reason
+from service.files.recording import Recording
+from service.files.replay import replay
+from support.cell import LISTENING, Daemon, Tracker, serving
+from support.paths import ROOT
+
+CLUTCHED = f'{LISTENING}\n[hands]\nclutch = "key"\n'
+SWITCH = """
+import sys, threading, time
+from service.client import connect
+
+released = threading.Event()
+threading.Thread(target=lambda: (sys.stdin.readline(), released.set()), daemon=True).start()
+with connect(sys.argv[1]) as cell:
+    while not released.wait(0.02):
+        cell.clutch(True)
+    cell.clutch(False)
+"""
+
+
+def switch(daemon: Daemon) -> subprocess.Popen[str]:
+    """A pressed clutch in a process of its own, released by a line on its input."""
+    return subprocess.Popen([sys.executable, "-c", SWITCH, daemon.endpoint], stdin=subprocess.PIPE, text=True, cwd=ROOT)
+
+
+def is_held(status: dict[str, Any]) -> bool:
+    return (status["mode"], status["reason"]) == ("hold", "clutch")
+
+
+def is_following(status: dict[str, Any]) -> bool:
+    return status["mode"] == "follow"
+
+
+@pytest.mark.timeout(120)
+def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silence(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+    with (
+        serving(tmp_path, "--joints", "assumed", "--record", str(records), network=CLUTCHED) as daemon,
+        Tracker(daemon.session),
+    ):
+        status = daemon.until(is_held)
+        assert status["because"] == "the clutch has not been heard yet"
+        daemon.session.put("thirdhand/clutch", b"\0\1\0\0\7")
+        daemon.until(lambda s: s["because"].endswith("what arrived is malformed: a bool of 7; 0 or 1 needed"))
+
+        pressed = switch(daemon)
+        daemon.until(is_following)
+        pressed.communicate("release\n", timeout=30)
+        status = daemon.until(is_held)
+        assert status["because"].startswith("the clutch of [hands] clutch is not pressed")
+        assert status["received"]["clutch"] > 2
+
+        with switch(daemon) as killed:
+            daemon.until(is_following)
+            killed.kill()
+        status = daemon.until(is_held)
+        assert status["because"] == "the clutch was last heard as pressed, and then not for 300 ms"
+        assert daemon.end() == 0
+
+    (path,) = records.glob("*.mcap")
+    assert replay(path).exact
+    steps = [step for step in Recording.open(path).steps() if step.frame is not None]
+    heard = [cdr.decode_bool(payload) for step in steps for kind, payload in step.events if kind == "clutch"]
+    assert heard.count(False) == 1
+    newest, until = False, -1  # as a reader of the recording has it: the last message, and when it becomes stale
+    for step in steps:
+        for value in (cdr.decode_bool(payload) for kind, payload in step.events if kind == "clutch"):
+            newest, until = value, step.tick + 150
+        is_pressed = newest and step.tick < until
+        expected = {Reason.NONE, Reason.NO_HANDS} if is_pressed else {Reason.CLUTCH}
+        assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, step.tick  # by the operator at the end
+        assert (step.frame["mode"] == Mode.FOLLOW) <= is_pressed, step.tick

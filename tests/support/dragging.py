@@ -1,0 +1,73 @@
+"""A person at the page for a mouse: finds the hands on it, drags them and lifts them."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from support.chromium import Tab
+
+STEP_S = 0.016  # interval of a mouse's or a finger's events
+DRAG_S = 0.5  # duration of a drag
+WHEEL_M = 0.0002  # [m] that the page lifts a hand by a unit of the wheel
+
+
+class Goal(NamedTuple):
+    """A place on the page to which a hand belongs."""
+
+    side: str
+    at: tuple[float, float, float]
+
+
+class Person:
+    """Drags hands on a page. `drag` moves a pointer along pixels, `lift` a hand by a height [m]."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+
+    def hand(self, side: str, what: str = "at") -> tuple[float, float, float]:
+        """Where a hand is drawn, or with `aim` where it was dragged to [m]."""
+        x, y, z = self._found(f"hands.{side}.{what}")
+        return x, y, z
+
+    def pixel(self, at: tuple[float, float, float]) -> tuple[float, float]:
+        """The pixel of the page at which a point of the bench is drawn."""
+        corner = "canvas.getBoundingClientRect()"
+        x, y = self._found(f"(shown.plan ?? plan()).flat({list(at)}).map((v, i) => v + {corner}[i ? 'y' : 'x'])")
+        return x, y
+
+    def goals(self) -> list[Goal]:
+        """The places that the page shows."""
+        return [
+            Goal(side, (at[0], at[1], at[2])) for side, at in self._found("places().map(one => [one.side, one.at])")
+        ]
+
+    def _found(self, expression: str) -> Any:
+        """The value of an expression, which may be an array or an object."""
+        return json.loads(self.tab.ask(f"JSON.stringify({expression})"))
+
+    def drag(self, side: str, to: tuple[float, float, float]) -> None:
+        """Drag a hand to a point with the mouse, and turn the wheel until it is as high."""
+        self.along(self.pixel(self.hand(side)), self.pixel(to), self.tab.mouse)
+        here = self.pixel(self.hand(side, "aim"))
+        self.tab.mouse("Wheel", *here, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M)
+
+    @staticmethod
+    def along(start: tuple[float, float], end: tuple[float, float], mouse: Callable[..., None]) -> None:
+        """Press at a pixel, move evenly to another one, and release."""
+        mouse("Pressed", *start)
+        steps, begun_s = round(DRAG_S / STEP_S), time.monotonic()
+        for i in range(1, steps + 1):
+            mouse("Moved", *(a + i / steps * (b - a) for a, b in zip(start, end, strict=True)))
+            time.sleep(max(0.0, begun_s + i * STEP_S - time.monotonic()))
+        mouse("Released", *end)
+
+    def arrive(self, side: str, to: tuple[float, float, float], within_m: float = 0.01, within_s: float = 10.0) -> None:
+        """Wait until a hand has arrived at a point."""
+        end = time.monotonic() + within_s
+        while math.dist(self.hand(side), to) > within_m:
+            assert time.monotonic() < end, f"{side} hand: {self.hand(side)}, {to} wanted"
+            time.sleep(0.05)

@@ -1,0 +1,166 @@
+"""A headset for tests: a headless Chromium with npm's `iwer`, which emulates WebXR, and a command
+`thirdhand hands --web` for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from support import chromium
+from support.paths import ROOT
+
+Array = NDArray[np.float64]
+IWER = "2.5.0"
+KNUCKLES = ("wrist", "index-finger-phalanx-proximal", "pinky-finger-phalanx-proximal")
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "thirdhand-tests"
+# Runs ahead of the page: a headset with two hands. In each frame `path(seconds)`, if it is set,
+# moves them, and `truth` gets a row: time [ms since 1970], side, position [m], quaternion x y z w.
+EMULATED = """
+;(() => {
+  const has = feature => !LACKING.includes(feature), quest = IWER.metaQuest3;
+  const config = {...quest, supportedFeatures: quest.supportedFeatures.filter(has)};
+  if (!has("immersive-ar")) config.supportedSessionModes = ["inline", "immersive-vr"];
+  const device = window.device = new IWER.XRDevice(config, {stereoEnabled: STEREO});
+  device.installRuntime({forceInstall: true});
+  device.primaryInputMode = "hand";
+  Object.assign(window, {truth: [], path: null, begun: 0});
+  for (const side of ["left", "right"]) {
+    const hand = device.hands[side], onFrameStart = hand.onFrameStart.bind(hand);
+    hand.onFrameStart = frame => {
+      const now = performance.now();
+      if (window.path) {
+        window.begun ||= now;
+        const {position, quaternion} = window.path((now - window.begun) / 1000)[side];
+        hand.position.set(...position);
+        hand.quaternion.set(...quaternion);
+        window.truth.push([performance.timeOrigin + now, side, ...position, ...quaternion]);
+      }
+      onFrameStart(frame);
+    };
+  }
+  // What `iwer` keeps behind symbols: the offset of a space from its parent.
+  const inside = one => String(one).includes("xr-space");
+  window.offset = space => space[Object.getOwnPropertySymbols(space).find(inside)].offsetMatrix;
+  window.joints = side =>
+    Object.fromEntries([...device.hands[side].inputSource.hand].map(([name, joint]) => [name, [...offset(joint)]]));
+})();
+"""
+
+
+def lacking() -> str:
+    """What a test with a headset lacks here; empty if nothing."""
+    if chromium.PROGRAM is None:
+        return "needs Chromium: on Debian, apt install chromium"
+    if not _script().exists() and shutil.which("npm") is None:
+        return f"needs npm, once, for iwer {IWER}: on Debian, apt install npm"
+    try:
+        _fetch()
+    except (OSError, subprocess.SubprocessError) as error:
+        return f"needs iwer {IWER} of npm, which could not be fetched: {error}"
+    return ""
+
+
+def _script() -> Path:
+    return CACHE / f"iwer-{IWER}.min.js"
+
+
+def _fetch() -> None:
+    """Fetch iwer into the cache, unless it is there."""
+    if _script().exists():
+        return
+    CACHE.mkdir(parents=True, exist_ok=True)
+    fetched = subprocess.run(
+        ["npm", "pack", "--silent", f"iwer@{IWER}"], cwd=CACHE, check=True, timeout=60, capture_output=True, text=True
+    )
+    with tarfile.open(CACHE / fetched.stdout.split()[-1]) as package:
+        script = package.extractfile("package/build/iwer.min.js")
+        assert script is not None
+        partial = _script().with_suffix(f".{os.getpid()}")
+        partial.write_bytes(script.read())
+    partial.replace(_script())
+
+
+def emulation(*, without: tuple[str, ...] = (), stereo: bool = False) -> str:
+    """The script that emulates a headset, `without` some features or `immersive-ar`."""
+    constants = f"const LACKING = {list(without)}, STEREO = {str(stereo).lower()};"
+    return f"{_script().read_text(encoding='utf-8')};{constants}{EMULATED}"
+
+
+@contextlib.contextmanager
+def worn(url: str, folder: Path, *, size: tuple[int, int] = (320, 240), **more: Any) -> Iterator[chromium.Tab]:
+    """The page in the browser of a headset, with its session started."""
+    with chromium.opened(url, folder, size=size, timeout_s=250, before=emulation(**more)) as tab:
+        tab.until("document.getElementById('start')?.disabled === false")
+        tab.ask("document.getElementById('start').click()")
+        tab.until("session !== null")
+        yield tab
+
+
+class Served:
+    """A running `thirdhand hands --web`."""
+
+    def __init__(self, process: subprocess.Popen[str], url: str) -> None:
+        self.process, self.url, self.ended = process, url, ""
+
+    def end(self) -> str:
+        """End it; returns what it wrote to standard error at its end."""
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.stderr is not None
+        self.ended = self.process.stderr.read()
+        assert self.process.wait(20) == 0, self.ended
+        return self.ended
+
+    def counts(self) -> tuple[int, int, int]:
+        """Messages published, lost and dropped as too late, once it has ended."""
+        found = re.search(r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended)
+        assert found is not None, self.ended
+        return int(found[1]), int(found[2]), int(found[3])
+
+
+@contextlib.contextmanager
+def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> Iterator[Served]:
+    """The command, connected to a Zenoh endpoint, with its token under a home folder."""
+    command = [sys.executable, "-m", "service", "hands", "--web", "--connect", endpoint, *arguments]
+    if "--listen" not in arguments:
+        command += ["--listen", f"127.0.0.1:{port}"]
+    environment = os.environ | {"HOME": str(home)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+    ) as process:
+        watchdog = threading.Timer(60, process.kill)
+        watchdog.start()
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().strip()
+            assert url, process.stderr and process.stderr.read()
+            watchdog.cancel()
+            yield Served(process, url)
+        finally:
+            watchdog.cancel()
+            process.kill()
+
+
+def palm_in_hand(joints: dict[str, list[float]], side: str) -> tuple[Array, Array]:
+    """Position (3,) [m] and axes (3, 3) of the palm in the emulated hand, from the offsets of its
+    joints, as docs/headset.md defines it.
+    """
+    wrist, index, little = (np.array(joints[name])[12:15] for name in KNUCKLES)
+    back = wrist - (index + little) / 2
+    across = index - little if side == "left" else little - index
+    axes = np.column_stack([across, np.cross(back, across), back])
+    turn, triangle = np.linalg.qr(axes[:, ::-1])  # z first, then y
+    return (wrist + index + little) / 3, (turn * np.sign(np.diag(triangle)))[:, ::-1]

@@ -1,0 +1,256 @@
+"""The server of hands from a browser, without a browser: what it publishes, and what it refuses
+with a reason while the hands of others are followed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import ssl
+import struct
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.contract.explain import ExplainedError
+from service.contract.messages import WireError
+from service.trackers import browser_hands
+from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
+from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
+from service.trackers.headset_page import HeadsetPage
+from service.trackers.web_server import FOREIGN, server_certificate
+from support.cell import told
+from support.page_hands import PALM, hands_message, page_of_hands, serving_page
+
+NAN_PALM, NO_ROTATION = (math.nan, *PALM[1:]), (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
+DAY_MS = 86_400_000.0
+REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refused
+    "too short": (lambda: hands_message()[:-1], "119 bytes, 120 needed"),
+    "too long for a websocket here": (lambda: bytes(300), ""),
+    "another magic number": (lambda: hands_message(magic=1), "not a message of hands"),
+    "no hand": (lambda: hands_message(seen=0), "not a message of hands"),
+    "a third hand": (lambda: hands_message(seen=5), "not a message of hands"),
+    "NaN": (lambda: hands_message(left=NAN_PALM), "left hand: a number that is not finite"),
+    "infinity": (lambda: hands_message(right=(math.inf, *PALM[1:])), "right hand: a number that is not finite"),
+    "no rotation": (lambda: hands_message(left=NO_ROTATION), "left hand: a quaternion of norm 0.5"),
+    "yesterday": (lambda: hands_message(at_ms=time.time() * 1e3 - DAY_MS), "hands of 8.64e+04 s ago: the page's clock"),
+    "far future": (lambda: hands_message(at_ms=time.time() * 1e3 + DAY_MS), "s ahead: the page's clock is wrong"),
+    "no time": (lambda: hands_message(at_ms=math.nan), "hands of no time"),
+    "predicted for tomorrow": (lambda: hands_message(ahead_ms=DAY_MS), "ms ahead, 0 to 200 accepted"),
+    "predicted for NaN": (lambda: hands_message(ahead_ms=math.nan), "predicted nan ms ahead"),
+    "text that is no order": (lambda: "open", "hold or resume or reset needed"),
+}
+
+
+@contextlib.asynccontextmanager
+async def opened(
+    page: HeadsetPage, at: str, *, token: str | None = None, **more: Any
+) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
+    """A websocket to a page."""
+    url = f"{page.server.scheme}://{at}/hands?token={page.server.token if token is None else token}"
+    async with aiohttp.ClientSession() as session, session.ws_connect(url, **more) as socket:
+        yield socket
+
+
+async def reason(socket: aiohttp.ClientWebSocketResponse) -> tuple[int | None, str]:
+    """Close code and reason with which the server closes a websocket."""
+    async with asyncio.timeout(10):
+        while not socket.closed:
+            message = await socket.receive()
+            if message.type == aiohttp.WSMsgType.CLOSE:
+                return message.data, message.extra or ""
+    return socket.close_code, ""
+
+
+def test_hands_are_published_as_they_were_sent_and_a_prediction_is_stamped_now() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, opened(page, at) as socket:
+            before_ns = time.time_ns()
+            await socket.send_bytes(hands_message(seen=1, at_ms=before_ns / 1e6 - 20))
+            (first,) = await heard.until("left", 1)
+            assert abs(first.stamp_ns - (before_ns - 20_000_000)) < 1000
+            assert first.frame_id == "webxr"
+            assert first.position == pytest.approx(PALM[:3], abs=1e-7)
+            assert first.orientation == pytest.approx(PALM[3:7], abs=1e-7)
+            assert math.isclose(math.hypot(*first.orientation), 1.0, abs_tol=1e-12)
+            before_ns = time.time_ns()
+            await socket.send_bytes(hands_message(seen=1, number=1, ahead_ms=150.0))
+            second = (await heard.until("left", 2))[1]
+            assert before_ns <= second.stamp_ns <= time.time_ns()
+            await socket.send_bytes(hands_message(epoch=3, number=5))
+            assert (await heard.until("left", 3))[2].frame_id == "webxr3"
+            assert len(await heard.until("right", 1)) == 1  # it was seen once
+            assert (page.hands.published, page.hands.lost) == (3, 3)
+            held_up = time.time() * 1e3 - 2000
+            await socket.send_bytes(hands_message(number=6, at_ms=held_up))
+            await socket.send_bytes(hands_message(number=7))
+            await heard.until("left", 4)
+            assert page.hands.delayed == 1
+
+    with page_of_hands() as (page, heard):
+        asyncio.run(scenario())
+
+
+def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, opened(page, at) as socket:
+            await socket.send_bytes(PING.pack(PING_MAGIC, 12.5))
+            while (answer := await socket.receive(10)).type != aiohttp.WSMsgType.BINARY:
+                assert json.loads(answer.data) == {"status": {}, "objects": []}  # there is no daemon
+            magic, sent, server_ms = struct.unpack("<I4xdd", answer.data)
+            assert (magic, sent) == (PING_MAGIC, 12.5)
+            assert abs(server_ms - time.time() * 1e3) < 5000
+            await socket.send_str("hold")
+            while "answer" not in (message := await socket.receive_json(timeout=20)):
+                pass
+            assert message["done"] is False
+            assert message["answer"].startswith("hold was NOT carried out: nobody answers")
+
+    with page_of_hands() as (page, _):
+        asyncio.run(scenario())
+
+
+def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, opened(page, at) as good:
+
+            async def go_on() -> None:
+                count = len(heard.poses["left"])
+                await good.send_bytes(hands_message(number=count))
+                await heard.until("left", count + 1)
+
+            await go_on()
+            for name, (bad, why) in REFUSED.items():
+                async with opened(page, at) as socket:
+                    sent = bad()
+                    await (socket.send_str(sent) if isinstance(sent, str) else socket.send_bytes(sent))
+                    code, text = await reason(socket)
+                    assert (code, why in text) == (4400 if why else 1009, True), (name, code, text)
+                await go_on()
+            async with opened(page, at) as other:
+                await other.send_bytes(hands_message())
+                assert await reason(other) == (4409, TAKEN)
+            for token in ("", "guessed", "gü\udcff"):
+                async with opened(page, at, token=token.encode(errors="replace").decode()) as socket:
+                    assert await reason(socket) == (4403, NO_TOKEN)
+            for headers in ({"Origin": "https://elsewhere.example"}, {"Origin": "null"}, {"Host": "rebound.example"}):
+                async with opened(page, at, headers=headers) as socket:
+                    assert await reason(socket) == (4403, FOREIGN)
+            await go_on()
+            assert len(heard.poses["left"]) == len(REFUSED) + 2
+
+    with page_of_hands() as (page, heard):
+        asyncio.run(scenario())
+
+
+def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, contextlib.AsyncExitStack() as stack:
+            first = await stack.enter_async_context(opened(page, at))
+            await first.send_bytes(hands_message())
+            await heard.until("left", 1)
+            others = [await stack.enter_async_context(opened(page, at)) for _ in range(100)]
+            refused = [await reason(socket) for socket in others[MAX_PAGES - 1 :]]
+            assert set(refused) == {(4429, FULL)}
+            assert len(refused) == 101 - MAX_PAGES
+            await first.send_bytes(hands_message(number=1))
+            await heard.until("left", 2)
+            await others[0].close()
+            async with opened(page, at) as late:  # there is room again
+                await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
+                while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
+                    pass
+
+    with page_of_hands() as (page, heard):
+        asyncio.run(scenario())
+
+
+def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
+    monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
+
+    async def scenario() -> None:
+        async with serving_page(page) as at, opened(page, at) as silent:
+            async with opened(page, at) as leaving:
+                await leaving.send_bytes(hands_message())
+                await heard.until("left", 1)
+            await silent.send_bytes(hands_message())
+            await heard.until("left", 2)
+            await asyncio.sleep(0.3)
+            async with opened(page, at) as next_one:
+                await next_one.send_bytes(hands_message())
+                await heard.until("left", 3)
+                assert (await reason(silent))[0] == 4408
+
+    with page_of_hands() as (page, heard):
+        asyncio.run(scenario())
+
+
+def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, aiohttp.ClientSession(f"http://{at}") as session:
+            async with session.get("/") as answer:
+                assert (answer.status, await answer.text()) == (403, NO_TOKEN)
+            async with session.get("/", params={"token": page.server.token}) as answer:
+                text = await answer.text()
+                assert answer.status == 200
+                assert page.server.token not in text
+                assert "__" not in text
+                assert "https:" not in text.replace('"https:"', "")
+                policy = answer.headers["Content-Security-Policy"].split("; ")
+                assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{at}"]
+            async with session.get("/hands", params={"token": page.server.token}) as answer:
+                assert answer.status == 426
+            async with session.get("/", headers={"Host": "rebound.example"}) as answer:
+                assert (answer.status, await answer.text()) == (403, FOREIGN)
+
+    with page_of_hands() as (page, _):
+        asyncio.run(scenario())
+
+
+def test_a_certificate_of_this_command_serves_https_under_its_names_alone(tmp_path: Path) -> None:
+    done = told("certificates", str(tmp_path / "secrets"), "--host", "bench.example")
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "secrets" / "headset"
+    trusted = ssl.create_default_context(cafile=folder / "authority.pem")
+
+    async def scenario() -> None:
+        async with serving_page(page) as at:
+            for name in ("127.0.0.1", "localhost", "bench.example"):
+                host = f"{name}:{at.rpartition(':')[2]}"
+                headers = {"Host": host, "Origin": f"https://{host}"}
+                async with opened(page, at, ssl=trusted, headers=headers) as socket:
+                    await socket.send_bytes(hands_message())
+                    await heard.until("left", 1)
+                    await socket.close()
+            async with opened(page, at, ssl=trusted, headers={"Host": "rebound.example"}) as socket:
+                assert await reason(socket) == (4403, FOREIGN)
+            with pytest.raises(aiohttp.ClientError):  # HTTP where HTTPS is spoken
+                async with aiohttp.ClientSession() as session, session.get(f"http://{at}/"):
+                    pass
+
+    with page_of_hands(certificate=server_certificate(folder)) as (page, heard):
+        asyncio.run(scenario())
+    (folder / "key.pem").unlink()
+    with pytest.raises(ExplainedError, match=r"key\.pem: No such file"):
+        server_certificate(folder)
+    (folder / "key.pem").write_bytes((tmp_path / "secrets" / "daemon" / "key.pem").read_bytes())
+    with pytest.raises(ExplainedError, match="the key does not belong to the certificate"):
+        server_certificate(folder)
+
+
+@given(
+    st.binary(max_size=200)
+    | st.binary(min_size=HANDS_LAYOUT.size, max_size=HANDS_LAYOUT.size).map(lambda b: hands_message()[:4] + b[4:])
+)
+def test_no_bytes_are_an_unexplained_error(data: bytes) -> None:
+    with contextlib.suppress(WireError):
+        decode_hands(data, time.time_ns())

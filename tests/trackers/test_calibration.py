@@ -1,0 +1,576 @@
+"""Calibrations in simulation: their accuracy by arm and tracker, what they refuse and why, and the
+command over Zenoh, whose settings a daemon then maps with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.client import endpoints, open_session
+from service.contract import cdr
+from service.contract.messages import JointState, PoseStamped
+from service.daemon.launch import free_port
+from service.files.mcap_file import whole_file
+from service.files.shipped import cell_of
+from service.files.track import Track
+from service.settings.config import HandSettings, Settings, load
+from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, record_path, recorded, write
+from service.trackers.calibration.collecting import LedTracks, distances_m, held_tool, progress, solved
+from service.trackers.calibration.solver import (
+    Calibration,
+    CalibrationError,
+    HeldTool,
+    bench_corners,
+    solve_held,
+    solve_points,
+)
+from sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
+from support.cell import serving, told
+from support.paths import ROOT
+
+SECONDS, SEEDS = 40.0, range(4)
+CORNERS = bench_corners(Settings())
+
+
+@functools.cache
+def path_of(arm: str, seed: int, seconds: float = SECONDS) -> LedArm:
+    """The arm of a shipped cell as it is led."""
+    return led(cell_of(arm), seconds, np.random.default_rng(seed))
+
+
+def held_by(kind: str, *, arm: str = "wam", seed: int = 0, rate_hz: float = 50) -> HeldTool:
+    return held(path_of(arm, seed), KINDS[kind], np.random.default_rng([seed, 1]), rate_hz=rate_hz)
+
+
+# --- accuracy -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", ["wam", "franka", "ur5"])
+@pytest.mark.parametrize(
+    ("kind", "median_mm", "worst_mm"), [("mocap", 0.6, 1.2), ("headset", 9, 16), ("camera", 35, 55)]
+)
+def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: float, worst_mm: float) -> None:
+    """And how accurately it does: errors are about as large as they are expected to be."""
+    errors, shares = [], []
+    for seed in SEEDS:
+        found = solve_held(held_by(kind, arm=arm, seed=seed), bench_corners(cell_of(arm)))
+        errors.append(1e3 * error_m(found))
+        corners = np.array(found.corners)
+        off_m = np.linalg.norm(found.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1)
+        shares.append(np.square(off_m / np.array(found.corner_std_m)).mean())
+        assert np.linalg.norm(np.array(found.hand_in_tool) - GRIP) < 1e-3 * worst_mm
+        assert abs(found.delay_s - KINDS[kind].delay_s) < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
+        assert found.outliers < 5
+        assert found.condition < 20
+    assert np.median(errors) < median_mm, errors
+    assert max(errors) < worst_mm, errors
+    assert 0.5 < np.sqrt(np.mean(shares)) < 1.7, shares
+
+
+def spoilt(held: HeldTool, how: str) -> HeldTool:
+    """A held tool with outliers, lost samples, or a slower arm."""
+    random = np.random.default_rng(3)
+    if how == "outliers":
+        hand = held.hand.copy()
+        wrong = random.random(len(hand)) < 0.05
+        hand[wrong] += 0.3 * Rotation.random(int(wrong.sum()), rng=random).apply([1.0, 0.0, 0.0])
+        return held._replace(hand=hand)
+    if how == "lost samples":
+        kept = (random.random(len(held.hand)) < 0.6) & (np.sin(2.1 * held.hand_s) < 0.8)
+        return held._replace(hand_s=held.hand_s[kept], hand=held.hand[kept])
+    kept = np.arange(0, len(held.tool), 4)  # 25 Hz
+    return held._replace(tool_s=held.tool_s[kept], tool=held.tool[kept], turn=held.turn[kept])
+
+
+@pytest.mark.parametrize("how", ["outliers", "lost samples", "slow joints"])
+def test_spoilt_samples_cost_little(how: str) -> None:
+    errors = [1e3 * error_m(solve_held(spoilt(held_by("headset", seed=seed), how), CORNERS)) for seed in SEEDS]
+    assert np.median(errors) < 10, errors
+    found = solve_held(spoilt(held_by("mocap"), how), CORNERS)
+    assert 1e3 * error_m(found) < 1.5
+    if how == "outliers":
+        assert 10 < found.outliers < 40, "of 400 samples"
+
+
+@pytest.mark.parametrize(("kind", "median_mm"), [("mocap", 8), ("headset", 15)])
+def test_touched_points_show_it_too(kind: str, median_mm: float) -> None:
+    errors = []
+    for seed in range(9):
+        random = np.random.default_rng(seed)
+        hand, base = touched(path_of("wam", seed % 3), 12, KINDS[kind], random)
+        hand[5] += 0.2 * (seed % 2)  # one touch that misses
+        found = solve_points(hand, base, CORNERS)
+        errors.append(1e3 * error_m(found))
+    assert np.median(errors) < median_mm, errors
+
+
+def test_more_time_makes_it_more_accurate_and_progress_says_what_to_do() -> None:
+    stds = []
+    for share in (0.2, 0.4, 1.0):
+        held = held_by("headset")
+        count, states = int(share * len(held.hand)), int(share * len(held.tool))
+        part = HeldTool(
+            held.hand_s[:count], held.hand[:count], held.tool_s[:states], held.tool[:states], held.turn[:states]
+        )
+        seen = progress(led_of(part), Settings(), CORNERS, None)
+        assert seen is not None
+        assert seen.std_m is not None
+        stds.append(seen.std_m)
+    assert stds[0] > stds[1] > stds[2]
+    still = np.repeat(held.turn[:1], states, 0)
+    seen = progress(led_of(part._replace(turn=still)), Settings(), CORNERS, "right")
+    assert seen is not None
+    assert (seen.std_m, seen.advice) == (None, "turn the wrist while you lead the tool, about two axes")
+    assert seen.text().startswith("led over ")
+    flat = part._replace(tool=part.tool * [1, 1, 0.1])
+    seen = progress(led_of(flat), Settings(), CORNERS, "right")
+    assert seen is not None
+    assert seen.advice == "lead the tool farther apart along (0.0, 0.0, 1.0)"
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+def never_turned(held: HeldTool) -> HeldTool:
+    still = held._replace(turn=np.repeat(held.turn[:1], len(held.turn), 0))
+    tool = np.stack([np.interp(still.hand_s, still.tool_s, axis) for axis in still.tool.T], 1)
+    hand = TURN.inv().apply(tool + Rotation.from_quat(held.turn[0]).apply(GRIP) - ORIGIN)
+    return still._replace(hand=hand + 0.002 * np.random.default_rng(0).normal(size=hand.shape))
+
+
+REFUSED: dict[str, tuple[Callable[[HeldTool], HeldTool], str]] = {
+    "a hand that never turned": (
+        never_turned,
+        r"the positions do not determine the tracker's pose: their condition number is \d+, at most 1000 accepted\. "
+        r"The tool turned by 0° and 0°\. To determine it, turn the wrist while you lead the tool, about two axes",
+    ),
+    "too little spread": (
+        lambda held: held._replace(tool=held.tool.mean(axis=0) + 0.1 * (held.tool - held.tool.mean(axis=0))),
+        r"the positions extend over \d+ x \d+ x \d cm; 5 cm or more needed in every direction\. Lead the tool farther "
+        r"apart, above all along \(",
+    ),
+    "millimetres": (
+        lambda held: held._replace(hand=1e3 * held.hand),
+        r'the hand moves \d+ times as far as the tool: the tracker looks to publish mm\. Set \[hands\] unit = "mm"',
+    ),
+    "metres taken for millimetres": (
+        lambda held: held._replace(hand=1e-3 * held.hand),
+        r"the hand moves 0\.00\d+ times as far as the tool\. Let it publish metres, or correct \[hands\] unit",
+    ),
+    "feet": (lambda held: held._replace(hand=held.hand / 0.3048), r"looks to publish feet\. Let it publish metres"),
+    "mirrored axes": (
+        lambda held: held._replace(hand=held.hand * [1, 1, -1]),
+        r"the tracker's axes are mirrored \(left-handed\): the residual is \d+ mm, and \d+ mm with one axis reversed\. "
+        r"base_from_tracker cannot express that: reverse one axis in the tracker's program",
+    ),
+    "a free hand": (
+        lambda held: held._replace(hand=held.hand[::-1].copy()),
+        r"the hand does not move with the tool: they differ by \d+ mm while the tool moves by \d+ mm\. Hold ",
+    ),
+    "clocks that differ": (
+        lambda held: held._replace(hand_s=held.hand_s + 0.7),
+        r"the stamps of hand and arm differ by 0\.5 s or more: synchronise the clocks|does not move with the tool",
+    ),
+    "few samples": (
+        lambda held: held._replace(hand_s=held.hand_s[:50], hand=held.hand[:50]),
+        r"50 samples of the hand and 4000 of the arm in the same time; 100 of each needed: lead the tool for longer",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ["mocap", "headset"])
+@pytest.mark.parametrize(("spoil", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_calibrated_is_refused_with_the_likely_cause(
+    spoil: Callable[[HeldTool], HeldTool], words: str, kind: str
+) -> None:
+    with pytest.raises(CalibrationError, match=f"(?s)^.*({words})"):
+        solve_held(spoil(held_by(kind)), CORNERS)
+
+
+def test_points_that_show_nothing_are_refused() -> None:
+    hand, base = touched(path_of("wam", 0), 8, KINDS["mocap"], np.random.default_rng(0))
+    with pytest.raises(CalibrationError, match="3 points given; 4 or more needed, 8 recommended"):
+        solve_points(hand[:3], base[:3], CORNERS)
+    with pytest.raises(
+        CalibrationError, match=r"extend over \d+ x \d+ x 0 cm; 5 cm or more needed .* along \(0\.0, 0\.0, 1"
+    ):
+        solve_points(hand, base * [1, 1, 0], CORNERS)
+    with pytest.raises(CalibrationError, match="mirrored"):
+        solve_points(hand * [-1, 1, 1], base, CORNERS)
+
+
+# --- from streams to a hand and a tool ------------------------------------------------------------
+
+BEGIN_NS = 10**18
+
+
+def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
+    """The tracks of a held tool, and those of other hands."""
+
+    def track(name: str, at_s: np.ndarray, poses: np.ndarray) -> Track:
+        stamps = BEGIN_NS + np.rint(1e9 * at_s).astype(np.int64)
+        return Track(name, "", stamps, stamps + 3_000_000, poses, "mocap")
+
+    def of_hand(name: str, held: HeldTool) -> Track:
+        return track(f"hands/{name}", held.hand_s, np.hstack([held.hand, np.tile([0.0, 0, 0, 1], (len(held.hand), 1))]))
+
+    tool = track("tool", held.tool_s, np.hstack([held.tool, held.turn]))._replace(frame="base")
+    return LedTracks({side: of_hand(side, held), **{name: of_hand(name, one) for name, one in hands.items()}}, tool)
+
+
+def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -> None:
+    held = held_by("mocap")
+    free = held._replace(hand=held.hand[::-1].copy())
+    streams = led_of(held, "right", left=free)
+    assert solved(streams, Settings(), CORNERS, None).side == "right"
+    assert solved(streams, Settings(), CORNERS, "right").frame == "mocap"
+    with pytest.raises(
+        CalibrationError, match=r"does not move .*\. hands/right moves with the tool, with a residual of 1 mm"
+    ):
+        solved(streams, Settings(), CORNERS, "left")
+    with pytest.raises(CalibrationError, match="hands/left is needed, and nothing arrives there; right arrives"):
+        solved(led_of(held), Settings(), CORNERS, "left")
+    with pytest.raises(CalibrationError, match="no hand arrives"):
+        solved(streams._replace(hands={}), Settings(), CORNERS, None)
+
+
+def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
+    held, tracker = held_by("mocap"), HandSettings(frame="mocap")
+    streams = led_of(held)
+    hand, tool = streams.hands["right"], streams.tool
+    poses = hand.poses.copy()
+    poses[::7, 1] = np.nan
+    clean, remarks = held_tool(hand._replace(poses=poses), tool, tracker)
+    assert remarks == [f"{len(poses[::7])} of {len(poses)} positions of hands/right are not finite and not used"]
+    assert 1e3 * error_m(solve_held(clean, CORNERS)) < 1.5
+    gap = (held.tool_s < 10) | (held.tool_s > 14)
+    clean, _ = held_tool(hand, tool.at(gap), tracker)
+    assert ((clean.hand_s < 10.1) | (clean.hand_s > 13.9)).all()
+    clean, remarks = held_tool(hand._replace(stamps_ns=hand.stamps_ns - 3600 * 10**9), tool, tracker)
+    assert remarks == ["the stamps of hands/right are of another clock: times of arrival are used"]
+    assert 1e3 * error_m(solve_held(clean, CORNERS)) < 1.5
+    with pytest.raises(
+        CalibrationError, match=r"hands/right is in frame 'base', and \[hands\] frame is 'mocap': its pub"
+    ):
+        held_tool(hand._replace(frame="base"), tool, tracker)
+    with pytest.raises(CalibrationError, match="no joints/state arrived"):
+        held_tool(hand, tool.at(np.zeros(0, np.intp)), tracker)
+    nothing = tool._replace(poses=np.full_like(tool.poses, np.nan))
+    with pytest.raises(CalibrationError, match="no joints/state arrived"):
+        held_tool(hand, nothing, tracker)
+    scaled, _ = held_tool(hand._replace(poses=1e3 * hand.poses), tool, HandSettings(frame="mocap", unit="mm"))
+    assert 1e3 * error_m(solve_held(scaled, CORNERS)) < 1.5
+
+
+def test_a_check_measures_how_far_the_tracker_moved() -> None:
+    held = held_by("headset")
+    found = solve_held(held, CORNERS)
+    again = held_by("headset", seed=4)
+    assert 5 < 1e3 * np.median(distances_m(again, found)) < 15
+    moved = again._replace(hand=again.hand + TURN.inv().apply([0.0, 0.05, 0.0]))
+    assert 45 < 1e3 * np.median(distances_m(moved, found)) < 60
+
+
+# --- the cell's file ------------------------------------------------------------------------------
+
+FOUND = Calibration(
+    base_from_tracker=(1.2, -0.1, 0.5, 0.5, 0.5, 0.5, 0.5),
+    rms_m=0.001,
+    residual_95_m=0.002,
+    covariance=((1.0,),),
+    corners=((0.0, 0.0, 0.0),),
+    corner_std_m=(0.001,),
+    condition=10.0,
+    samples=400,
+    outliers=3,
+    remedy="",
+)
+RECORD = CalibrationRecord(date="2026-01-01", method="held", hand="right", frame="webxr", calibration=FOUND)
+KEPT = '# my cell\ncell = "lab"   # its name\n\n[tool]\nmax_speed = 0.3  # [m/s]\n'
+FILES = {
+    "a table with comments": (
+        KEPT
+        + '\n[hands]  # the tracker\nframe = "old"  # who\nunit = "mm"\n'
+        + "base_from_tracker = [0, 0, 0, 0, 0, 0, 1]  # by eye\n",
+        ['frame = "webxr"  # who', "[hands]  # the tracker", "0.5]  # by eye", 'unit = "mm"'],
+    ),
+    "no table": (KEPT, ["[hands]"]),
+    "an inline table": ('hands = { unit = "cm" }  # short\n' + KEPT, ["# short", 'unit = "cm"']),
+    "dotted keys": ('hands.unit = "cm"\nhands.frame = "x"\n' + KEPT, ['hands.unit = "cm"', 'hands.frame = "webxr"']),
+    "several lines": (KEPT + "[hands]\nbase_from_tracker = [\n  0, 0, 0,  # position\n  0, 0, 0, 1,\n]\n", []),
+    "an empty file": ("", ["[hands]"]),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), FILES.values(), ids=FILES)
+def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(text)
+    path.chmod(0o640)
+    link = tmp_path / "link.toml"
+    link.symlink_to(path)
+    before = load(path)
+    kept = write(link, hand_settings(FOUND, "webxr"), RECORD)
+    after = load(path)
+    assert after.hands.base_from_tracker == FOUND.base_from_tracker
+    assert after.hands.frame == "webxr"
+    unchanged = msgspec.structs.replace(after.hands, frame="", base_from_tracker=before.hands.base_from_tracker)
+    assert unchanged == msgspec.structs.replace(before.hands, frame="")
+    assert msgspec.structs.replace(after, hands=before.hands) == before
+    changed = path.read_text()
+    assert [line for line in text.splitlines() if "#" in line and "hands" not in line and "frame" not in line
+            and "position" not in line and "eye" not in line and line not in changed] == []  # fmt: skip
+    assert [word for word in words if word not in changed] == []
+    assert kept.read_text() == text
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert link.is_symlink()
+    assert recorded(path, after) == RECORD
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(
+        ["cell.calibration.json", "cell.toml", kept.name, "link.toml"]
+    )
+
+
+def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text("rate_hz = 200\n")
+    values = hand_settings(FOUND, "webxr") | {"unit": "miles"}
+    with pytest.raises(Exception, match=r"\[hands\] unit: 'miles' given"):
+        write(path, values, RECORD)
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("cell.toml", "rate_hz = 200\n")]
+    with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist.*thirdhand calibrate --held"):
+        recorded(path, load(path))
+    record_path(path).write_text('{"date": 3}')
+    with pytest.raises(CalibrationError, match=r"cell\.calibration\.json cannot be read: .*"):
+        recorded(path, load(path))
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings) -> None:
+    """A recording of both hands, of which the left one holds the tool, and of joint states."""
+    messages = []
+    for at_s, hand in zip(held.hand_s, held.hand, strict=True):
+        stamp = BEGIN_NS + int(1e9 * at_s)
+        for side, at in (("left", hand), ("right", (0.1, 0.2, 0.3))):
+            pose = PoseStamped(stamp, "mocap", tuple(map(float, at)), (0.0, 0.0, 0.0, 1.0))
+            messages.append(
+                (stamp + 2_000_000, f"hands/{side}", "geometry_msgs/msg/PoseStamped", cdr.encode_pose(pose))
+            )
+    for at_s, q in zip(held.tool_s, joints, strict=True):
+        stamp = BEGIN_NS + int(1e9 * at_s)
+        state = cdr.encode_joints(JointState(stamp, settings.joints.names, tuple(q.tolist()), ()))
+        messages.append((stamp + 1_000_000, "joints/state", "sensor_msgs/msg/JointState", state))
+    with whole_file(path, joints=len(settings.joints.names)) as file:
+        for i, (at_ns, key, kind, payload) in enumerate(sorted(messages)):
+            file.put(f"lab/{key}", kind, payload, at_ns, i)
+
+
+def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
+    settings, arm = cell_of("ur5"), path_of("ur5", 0)
+    recording(tmp_path / "led.mcap", held_by("mocap", arm="ur5"), arm.joints, settings)
+    urdf = ROOT / "service" / "arms" / "ur5.urdf"
+    text = (ROOT / "service" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
+    (tmp_path / "cell.toml").write_text(text)
+    cell = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
+    done = told(*cell)
+    assert done.returncode == 0, done.stderr
+    assert "left hand     held, 40 s, 398 samples, 0 outliers" in done.stdout
+    assert "residual       1.0 mm rms" in done.stdout
+    assert "delay          0 ms" in done.stdout
+    assert "cell.toml; the earlier file is cell.toml.before-" in done.stdout
+    after = load(tmp_path / "cell.toml")
+    assert after.hands.frame == "mocap"
+    true = (*ORIGIN, *TURN.as_quat())
+    np.testing.assert_allclose(after.hands.base_from_tracker, true, atol=0.002)
+    done = told(*cell, "--check")
+    assert (done.returncode, done.stdout) == (0, "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"), (
+        done.stderr
+    )
+    moved = text.replace(
+        "[joints]", f"[hands]\nframe = 'mocap'\nbase_from_tracker = {[true[0] + 0.04, *map(float, true[1:])]}\n[joints]"
+    )
+    (tmp_path / "cell.toml").write_text(moved.replace("np.float64(1.44)", "1.44"))
+    done = told(*cell, "--check")
+    assert done.returncode == 1
+    assert "hand at the tool: 40 mm (95 %: 41 mm); up to 11 mm accepted. Does the hand hold the tool" in done.stdout
+    for more, code, words in (
+        (("--accept", "0.1"), 1, "not accurate enough: 0."),
+        (("--hand", "right"), 1, "hands/left moves with the tool, with a residual of 1 mm: if the left hand holds it"),
+        (("--points",), 2, "--points are touched in a running cell: --from needs --held"),
+    ):
+        done = told(*cell, *more)
+        assert (done.returncode, words in done.stderr) == (code, True), done.stderr
+    assert load(tmp_path / "cell.toml").hands.base_from_tracker[0] == pytest.approx(1.44)
+    without = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "ur5")
+    assert 'Write this into the cell\'s settings; --config FILE does it:\n[hands]\nframe = "mocap"' in without.stdout
+    wrong_arm = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam")
+    assert "has no joints/state of the joints wam/base_yaw_joint" in wrong_arm.stderr
+    hands = told("calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
+    assert (hands.returncode, "has no joints/state of the joints" in hands.stderr) == (1, True), hands.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--held", "--points"], 2, "not allowed with argument"),
+        (["--check"], 2, "--check compares with the last calibration of a cell: give its settings by --config FILE"),
+        (["--at", "0", "0", "0"], 2, "--at and --at-file give points to touch: give --points too"),
+        (["--points", "--at", "0", "0", "0"], 2, "1 points given; 4 or more needed"),
+        (["--points", "--at-file", "FILE"], 2, "line 2: '1 2' given; three numbers needed"),
+        (["--accept", "0"], 2, "0 given, 0.1 to 200 mm needed"),
+        (["--hand", "both"], 2, "invalid choice"),
+        (["--config", "nowhere.toml"], 1, "cannot read configuration nowhere.toml"),
+        (["--from", "nowhere.mcap"], 1, "nowhere.mcap"),
+        (["--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
+    ],
+)
+def test_what_cannot_be_meant_is_said(arguments: list[str], code: int, words: str, tmp_path: Path) -> None:
+    (tmp_path / "points").write_text("# x y z\n1 2\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.cli.calibrate.CONNECT_TIMEOUT_S", 0.2)
+        done = told("calibrate", *[str(tmp_path / "points") if one == "FILE" else one for one in arguments])
+    assert (done.returncode, words in done.stderr) == (code, True), done.stderr
+
+
+class LedCell:
+    """An arm that is led in real time and a hand that holds its tool, published until closed.
+
+    While `touched` is a position in frame `base` [m], the right hand rests there instead.
+    """
+
+    def __init__(self, endpoint: str, settings: Settings, arm: LedArm) -> None:
+        self.touched: tuple[float, float, float] | None = None
+        self._session, self._settings, self._arm = open_session(connect=[endpoint], timeout_s=30), settings, arm
+        self._hands = arm.tool + Rotation.from_quat(arm.turn).apply(GRIP)
+        self._end, self._thread = threading.Event(), threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self) -> None:
+        random, begun_ns, names = np.random.default_rng(0), time.time_ns(), self._settings.joints.names
+        while not self._end.wait(0.01):
+            now_ns = time.time_ns()
+            k = int((now_ns - begun_ns) / 1e7) % len(self._arm.times_s)
+            state = JointState(now_ns, names, tuple(self._arm.joints[k].tolist()), ())
+            self._session.put("thirdhand/joints/state", cdr.encode_joints(state))
+            at = self._hands[k] if self.touched is None else np.array(self.touched)
+            seen = TURN.inv().apply(at - ORIGIN) + 0.001 * random.normal(size=3)
+            pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(seen.tolist()), (0.0, 0.0, 0.0, 1.0))
+            self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
+
+    def __enter__(self) -> LedCell:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join(10)
+        self._session.close()
+
+
+@contextlib.contextmanager
+def calibrating(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process with a keyboard."""
+    command = [sys.executable, "-m", "service", "calibrate", *arguments]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, cwd=ROOT, **pipes) as process:  # type: ignore[call-overload]
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def line_with(process: subprocess.Popen[str], words: str) -> str:
+    """The next line on standard error with these words."""
+    assert process.stderr is not None
+    seen = []
+    while line := process.stderr.readline():
+        seen.append(line)
+        if words in line:
+            return line
+    raise AssertionError("".join(seen))
+
+
+def press_enter(process: subprocess.Popen[str]) -> None:
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+
+
+LIVE = '# my cell\n[network]\nlisten = ["tcp/127.0.0.1:0"]\n[arm]\nsource = "assumed"\n'
+POINTS = ((0.5, -0.3, 0.05), (0.5, 0.3, 0.05), (0.9, 0.3, 0.1), (0.9, -0.3, 0.1), (0.7, 0.0, 0.4), (0.5, 0.0, 0.3))
+
+
+@pytest.mark.timeout(600)
+def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, endpoint = tmp_path / "my.toml", f"tcp/127.0.0.1:{free_port()}"
+    cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
+    (tmp_path / "points.txt").write_text("".join("{} {} {}\n".format(*point) for point in POINTS))
+    arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
+    with calibrating("--config", str(cell), "--listen", endpoint) as process, LedCell(endpoint, Settings(), arm):
+        line_with(process, "hold the tool and lead it")
+        assert "accuracy" in line_with(process, "led over")
+        time.sleep(8)
+        press_enter(process)
+        out, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "ended by the operator" in errors
+    assert out.startswith("right hand     held, ")
+    delay_ms = int(next(line for line in out.splitlines() if line.startswith("delay")).split()[1])
+    assert abs(delay_ms - 35) < 15
+    assert load(cell).hands.frame == "webxr"
+    np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.02)
+    assert "# my cell" in cell.read_text()
+
+    monkeypatch.setattr("service.cli.calibrate.CHECK_S", 2.0)
+    check = ["calibrate", "--check", "--config", str(cell)]
+    with open_session(listen=["tcp/127.0.0.1:0"]) as hub, LedCell(endpoints(hub)[0], Settings(), arm):
+        done = told(*check, "--connect", endpoints(hub)[0])
+        assert (done.returncode, "hand at the tool: " in done.stdout) == (0, True), done.stdout + done.stderr
+
+    with serving(tmp_path, "--config", str(cell)) as daemon, LedCell(daemon.endpoint, Settings(), arm) as led_cell:
+        led_cell.touched = (0.7, 0.2, 0.2)
+        status = daemon.until(lambda now: "right" in now["hands_m"] and now["sources"]["right"]["fresh"], 30)
+        np.testing.assert_allclose(status["hands_m"]["right"], led_cell.touched, atol=0.01)
+        assert status["below_table_m"] == {}
+        points = [
+            "--points",
+            "--config",
+            str(cell),
+            "--connect",
+            daemon.endpoint,
+            "--at-file",
+            str(tmp_path / "points.txt"),
+        ]
+        with calibrating(*points) as process:
+            for number, point in enumerate(POINTS, 1):
+                led_cell.touched = point
+                line_with(process, f"{number}: touch ({point[0]:g}, ")
+                time.sleep(0.8)
+                press_enter(process)
+            out, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert out.startswith("right hand     points, ")
+    assert ", 6 points, 0 outliers" in out
+    np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.005)
+    assert len(list(tmp_path.glob("my.toml.before-*"))) == 2
+
+
+def test_without_hands_or_arm_the_command_says_what_is_missing() -> None:
+    done = told("calibrate", "--listen", f"tcp/127.0.0.1:{free_port()}", "--wait", "0")
+    assert done.returncode == 1
+    assert "not received: hands/left or hands/right, joints/state. Are tracker and arm running" in done.stderr

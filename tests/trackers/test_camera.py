@@ -1,0 +1,129 @@
+"""Hands of a camera: palms found in a picture, and the model that MediaPipe loads."""
+
+from __future__ import annotations
+
+import importlib.util
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.trackers import hand_model
+from service.trackers.camera import CameraError, HandCamera, pictures
+from service.trackers.hand_model import HandModelError
+from service.trackers.palm import AVERAGE_PALM, PALM, PALM_CORNERS, Array, Lens, palm_pose
+
+LENS, LENGTH_M = Lens(600.0, 640, 480), 0.18
+HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None
+
+
+def seen(turn: Rotation, centre: Array, length: float = LENGTH_M) -> tuple[Array, Array, Array]:
+    """Points in the picture (21, 2), the hand's shape (21, 3), the palm's true position (3,)."""
+    shape = np.zeros((21, 3))
+    shape[list(PALM)] = turn.apply(length * AVERAGE_PALM)
+    at = shape + centre
+    picture = LENS.focal * at[:, :2] / at[:, 2:] / [LENS.width, LENS.height] + 0.5
+    return picture, shape, at[list(PALM)][PALM_CORNERS].mean(axis=0)
+
+
+def drawn(seed: int) -> tuple[Rotation, Array]:
+    rng = np.random.default_rng(seed)
+    facing = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T)
+    return Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * facing, rng.uniform([-0.2, -0.1, 0.35], [0.2, 0.1, 0.9])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_palm_is_where_it_was_seen(seed: int) -> None:
+    turn, centre = drawn(seed)
+    picture, shape, position = seen(turn, centre)
+    rough = Rotation.from_rotvec(np.random.default_rng(seed).uniform(-0.3, 0.3, 3)).apply(shape)
+    ahead, thumb = (position - centre) / np.linalg.norm(position - centre), turn.apply([0.0, 1.0, 0.0])
+    for side, right in (("right", -thumb), ("left", thumb)):
+        found = palm_pose(side, picture, rough, LENS, LENGTH_M)
+        assert found is not None
+        np.testing.assert_allclose(found.position, position, atol=1e-4)
+        x, y, z = found.orientation.as_matrix().T
+        np.testing.assert_allclose(z, -ahead, atol=1e-3)
+        np.testing.assert_allclose(y, np.cross(z, x), atol=1e-9)
+        assert x @ right > 0.99
+
+
+def test_noise_of_a_pixel_costs_a_centimetre() -> None:
+    errors = []
+    for seed in range(100):
+        picture, shape, position = seen(*drawn(seed))
+        noise = np.random.default_rng(seed).standard_normal(picture.shape) / [LENS.width, LENS.height]
+        found = palm_pose("left", picture + noise, shape, LENS, LENGTH_M)
+        assert found is not None
+        errors.append(np.linalg.norm(found.position - position))
+    assert np.median(errors) < 0.01
+    assert max(errors) < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_a_wrong_length_scales_the_distance(scale: float) -> None:
+    picture, shape, position = seen(*drawn(1))
+    found = palm_pose("left", picture, shape, LENS, scale * LENGTH_M)
+    assert found is not None
+    np.testing.assert_allclose(found.position, scale * position, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda picture: np.full_like(picture, 0.5), lambda picture: np.random.default_rng(0).random(picture.shape)],
+)
+def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) -> None:
+    picture, shape, _ = seen(*drawn(2))
+    assert palm_pose("left", spoil(picture), shape, LENS, LENGTH_M) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "there is no such file"),
+        (b"no zip", "the wheel of mediapipe==0.10.21 needed"),
+        ({"other": b""}, "the wheel of mediapipe==0.10.21 needed"),
+        ({path: b"changed" for path, _ in hand_model.NETWORKS.values()}, "is not that of mediapipe==0.10.21"),
+    ],
+)
+def test_another_wheel_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | dict[str, bytes] | None, says: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    wheel = tmp_path / "mediapipe.whl"
+    if isinstance(content, bytes):
+        wheel.write_bytes(content)
+    elif content is not None:
+        with zipfile.ZipFile(wheel, "w") as package:
+            for name, data in content.items():
+                package.writestr(name, data)
+    with pytest.raises(HandModelError, match=says):
+        hand_model.hand_model(wheel, lambda _: None)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_without_a_network_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", "")
+    with pytest.raises(HandModelError, match="then give the wheel here by --model"):
+        hand_model.hand_model(None, lambda _: None)
+
+
+@pytest.mark.skipif(HAS_MEDIAPIPE, reason="MediaPipe is installed")
+def test_without_mediapipe_the_remedy_is_named(tmp_path: Path) -> None:
+    for call in (lambda: HandCamera(tmp_path, view_deg=60.0, hand_length=0.18), lambda: next(pictures("0"))):
+        with pytest.raises(CameraError, match=r"pip install 'thirdhand\[camera\]'"):
+            call()
+
+
+@pytest.mark.skipif(not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'")
+def test_a_camera_that_is_not_there_and_a_file_that_is_no_model_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="no camera 63"):
+        next(pictures("63"))
+    (tmp_path / "model.task").write_bytes(b"nothing")
+    with pytest.raises(CameraError, match="no model of hands"):
+        HandCamera(tmp_path / "model.task", view_deg=60.0, hand_length=0.18)

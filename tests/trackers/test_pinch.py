@@ -1,0 +1,35 @@
+"""Pinches: when the clutch is pressed, and how far a person wants the gripper closed."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.client import Watch, endpoints, open_session
+from service.trackers.pinch import Pinches
+
+LEFT_M = {  # distance of thumb and index tip of the left hand, None where it is not seen: whether the clutch is pressed
+    "parted": ([0.09], [False]),
+    "pinched": ([0.09, 0.03, 0.019], [False, False, True]),
+    "held between the two distances": ([0.01, 0.03, 0.039, 0.041, 0.03], [True, True, True, False, False]),
+    "out of sight": ([0.01, None, 0.03, 0.01], [True, False, False, True]),
+}
+CLOSURES = [(0.10, 0.0), (0.08, 0.0), (0.05, 0.5), (0.02, 1.0), (0.0, 1.0)]
+
+
+@pytest.mark.parametrize(("left_m", "pressed"), LEFT_M.values(), ids=LEFT_M)
+def test_the_left_hand_presses_the_clutch_and_the_right_one_closes_the_gripper(
+    left_m: list[float | None], pressed: list[bool]
+) -> None:
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
+        Watch(hearing, "bench", "clutch", timeout_s=10) as clutch,
+        Watch(hearing, "bench", "gripper/wish", timeout_s=10) as wish,
+        open_session(connect=[endpoints(hearing)[0]]) as session,
+    ):
+        pinches = Pinches(session, "bench", clutch="left", gripper="right")
+        for apart_m, is_pressed in zip(left_m, pressed, strict=True):
+            pinches.publish({} if apart_m is None else {"left": apart_m}, 1)
+            assert next(clutch) is is_pressed
+        for number, (apart_m, closure) in enumerate(CLOSURES):
+            pinches.publish({"right": apart_m}, number)
+            assert next(wish) == pytest.approx(closure)
