@@ -90,10 +90,6 @@ def parser() -> argparse.ArgumentParser:
         "port of this machine)"
     )
     option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
-    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
-    c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
-    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
-    c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
     c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     c.add_argument("--json", action="store_true", help="print the report as one JSON object")
 
@@ -169,15 +165,15 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
     https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
     option(c, "--https", "DIR", https)
-    length = "of --camera: length of your hand, from the crease of the wrist to the tip of the middle finger"
+    length = "length of your hand, from the crease of the wrist to the tip of the middle finger (--camera)"
     option(c, "--hand-length", "M", length, 0.18, type=within(float, 0.1, 0.3, " m"))
-    view = "of --camera: horizontal angle of view of its lens, in degrees"
+    view = "horizontal angle of view of the lens, in degrees (--camera)"
     option(c, "--view", "DEG", view, 60.0, type=within(float, 20, 150, " degrees"))
-    model = "of --camera: hand_landmarker.task, or the wheel of mediapipe 0.10.21 (default: it is downloaded once)"
+    model = "hand_landmarker.task, or the wheel of mediapipe 0.10.21 (--camera; default: it is downloaded once)"
     option(c, "--model", "FILE", model)
-    clutch = "of --web: the clutch is pressed while this hand pinches, for a cell with `[hands] clutch`"
+    clutch = "press the clutch of `[hands] clutch` while this hand pinches (--web)"
     c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
-    gripper = "of --web: the gripper closes with the fingers of this hand, for a cell with `[hands] gripper`"
+    gripper = "close the gripper of `[hands] gripper` with the fingers of this hand (--web)"
     c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
     c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
     _reach(c)

@@ -25,7 +25,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from service.contract.records import SIDES
-from service.trackers.camera import CameraError, HandCamera, HandPoints
+from service.trackers.camera import CameraError, HandCamera, HandPoints, mediapipe
 from service.trackers.hand_model import HandModelError, hand_model
 from service.trackers.palm import INDEX, LITTLE, WRIST, Lens, palm_pose, where_seen
 from sim.experiments.catalogue import EXPERIMENTS
@@ -63,6 +63,10 @@ class Frame(NamedTuple):
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: errors by method, and by the distance of the hands."""
+    try:
+        mediapipe()
+    except CameraError as error:
+        raise ExperimentError(str(error)) from None
     stream = EXPERIMENTS["camera"].seeds.evaluation["hands"]
     sequences = list(stream.share(options.share, least=len(DISTANCES_M)))
     with tempfile.TemporaryDirectory() as folder:

@@ -73,6 +73,9 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
         if i % 4 == 0:
             joints = messages.JointState(at_ns(i), JOINT_NAMES, tuple(frame["joints"].tolist()), ())
             inbox.append(Event("joints/state", cdr.encode_joints(joints), None))
+            inbox.append(Event("clutch", cdr.encode_bool(i % 2 == 0), None))
+            wish = messages.JointState(at_ns(i), (messages.GRIPPER,), (0.5,), ())
+            inbox.append(Event("gripper/wish", cdr.encode_joints(wish), None))
         if i % 100 == 50:
             inbox += [
                 Event(kind, cdr.encode_string("{}"), None)
