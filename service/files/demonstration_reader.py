@@ -251,12 +251,19 @@ def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
     return frame not in ("", BASE) or (name != ENDINGS["tool"] and frame in tracker_frames)
 
 
-def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
+def in_metres(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) [m] in the tracker's frame, right-handed, given those in its axes and
+    unit.
+    """
     if hands.axes == "left-handed":
         positions = positions * (1.0, 1.0, -1.0)
+    return np.asarray(UNIT_M[hands.unit] * positions)
+
+
+def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
     axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
-    return np.asarray(UNIT_M[hands.unit] * positions @ axes.T + origin)
+    return np.asarray(in_metres(positions, hands) @ axes.T + origin)
 
 
 def far_away(name: str, frame: str, position: Sequence[float], settings: Settings) -> str:

@@ -21,8 +21,13 @@ UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with i
 class HandsPage:
     """The page and its server: the file `page` with the scripts and fields that it names filled in.
 
-    The poses are published in the frame `frame`, see `BrowserHands`. `more` are further routes.
+    Each kind of page is a subclass that names its file, scripts and frame. The poses are published
+    in that frame, see `BrowserHands`. `more` are further routes.
     """
+
+    page: str
+    scripts: tuple[str, ...]
+    frame: str
 
     def __init__(
         self,
@@ -31,18 +36,14 @@ class HandsPage:
         latest: Latest,
         *,
         cell: str,
-        page: str,
-        scripts: Iterable[str],
-        frame: str,
         certificate: ServerCertificate | None = None,
         token: str = "",
         more: Iterable[web.AbstractRouteDef] = (),
         pinches: Pinches | None = None,
         **fields: str,
     ) -> None:
-        self._page, self._scripts = PAGE_FOLDER / page, tuple(scripts)
-        self._fields = {"cell": html.escape(cell), "frame": frame} | fields
-        self.hands = BrowserHands(tracker, client, latest, frame=frame, has_token=self.has_token, pinches=pinches)
+        self._fields = {"cell": html.escape(cell), "frame": self.frame} | fields
+        self.hands = BrowserHands(tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches)
         routes = [web.get("/", self._front), web.get("/hands", self.hands.socket), *more]
         self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 
@@ -55,5 +56,5 @@ class HandsPage:
             return answer(403, NO_TOKEN)
         socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"
         policy = f"connect-src 'self' {socket}; {INLINE}; frame-ancestors 'none'"
-        scripts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in self._scripts}
-        return answer(200, filled(self._page, **self._fields, **scripts), kind=HTML, policy=policy)
+        scripts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in self.scripts}
+        return answer(200, filled(PAGE_FOLDER / self.page, **self._fields, **scripts), kind=HTML, policy=policy)

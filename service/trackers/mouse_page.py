@@ -44,6 +44,8 @@ class PlayedTask:
 class MousePage(HandsPage):
     """The page and its server; with a `task`, the page shows it and can end it."""
 
+    page, scripts, frame = "mouse.html", ("link",), BASE
+
     def __init__(
         self,
         tracker: Tracker,
@@ -69,9 +71,6 @@ class MousePage(HandsPage):
         super().__init__(
             *(tracker, client, latest),
             cell=cell,
-            page="mouse.html",
-            scripts=("link",),
-            frame=BASE,
             certificate=certificate,
             token=token,
             more=[web.get("/task", show), web.post("/end", end)] if task else (),

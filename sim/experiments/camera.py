@@ -195,7 +195,7 @@ def _poses(seed: int, sequence: int) -> Iterator[dict[str, list[float]]]:
 
 
 async def _drawn(folder: Path, chromium: str, frames: list[dict[str, list[float]]]) -> list[dict[str, Any]]:
-    """What the page posts for each frame. Raises ExperimentError."""
+    """The page's posts, one for each frame. Raises ExperimentError."""
     got, done = list[dict[str, Any]](), asyncio.Event()
 
     async def page(_: web.Request) -> web.FileResponse:

@@ -273,6 +273,10 @@ def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
         held_tool(hand, nothing, tracker)
     scaled, _ = held_tool(hand._replace(poses=1e3 * hand.poses), tool, HandSettings(frame="mocap", unit="mm"))
     assert 1e3 * error_m(solve_held(scaled, CORNERS)) < 1.5
+    mirrored = hand.poses * (1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0)
+    settings = HandSettings(frame="mocap", axes="left-handed")
+    righted, _ = held_tool(hand._replace(poses=mirrored), tool, settings)
+    np.testing.assert_array_equal(righted.hand, held_tool(hand, tool, tracker)[0].hand)
 
 
 def test_a_check_measures_how_far_the_tracker_moved() -> None:

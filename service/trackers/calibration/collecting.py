@@ -17,8 +17,7 @@ from service.contract import channels
 from service.contract.messages import BASE
 from service.contract.records import SIDES
 from service.core.frame import Vector
-from service.core.intake.stage import UNIT_M
-from service.files.demonstration_reader import is_by_tracker
+from service.files.demonstration_reader import in_metres, is_by_tracker
 from service.files.pose_streams import ENDINGS, JOINT_STATES, PoseRecording
 from service.files.tool_poses import tool_poses
 from service.files.track import Track
@@ -44,7 +43,7 @@ LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at
 LEAST_LED_M, LEAST_TURNED_RAD = 0.10, math.radians(40)  # and at least this far, in each direction
 LED_POLL_S = 0.05
 TOUCH_S = 0.5  # a touch is the median over this time
-MAX_TOUCH_M = 0.015  # in which the hand moves at most this far
+MAX_TOUCH_M = 0.015  # during a touch, the hand moves at most this far
 LEAST_TOUCH_SAMPLES = 5
 
 
@@ -128,7 +127,8 @@ class LiveLed:
         return self._capture.malformed
 
     def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
-        """What arrived: with at most `most_states` poses of the tool, of the last `since_s` [s].
+        """The hands and the tool of the last `since_s` [s], None: all; the tool with at most
+        `most_states` poses.
 
         Of a hand whose frame changed, only the samples in the newest frame are used.
         """
@@ -172,7 +172,7 @@ class LiveLed:
         if len(samples) < LEAST_TOUCH_SAMPLES:
             raise CalibrationError(f"{len(samples)} samples of {ENDINGS[side]} in {TOUCH_S:g} s: is the hand seen?")
         at = np.array([channels.POSE.decode(sample.payload).position for sample in samples])
-        at *= UNIT_M[self._settings.hands.unit]
+        at = in_metres(at, self._settings.hands)
         moved_m = float(np.ptp(np.sort(at, axis=0)[len(at) // 10 : len(at) - len(at) // 10], axis=0).max())
         if moved_m > MAX_TOUCH_M:
             raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
@@ -217,7 +217,7 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
     sound = np.isfinite(tool.poses[tool_rows]).all(axis=1)
     tool_ns, tool_rows = tool_ns[sound], tool_rows[sound]
     hand_ns, hand_rows = np.unique(hand_ns[finite], return_index=True)
-    positions = UNIT_M[hands.unit] * hand.poses[finite][hand_rows, :3]
+    positions = in_metres(hand.poses[finite][hand_rows, :3], hands)
     if len(tool_ns) < 2:
         raise CalibrationError(f"no {JOINT_STATES} arrived while the tool was led: is the arm's driver running?")
     after = np.clip(np.searchsorted(tool_ns, hand_ns), 1, len(tool_ns) - 1)

@@ -165,7 +165,7 @@ def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SA
     cover = coverage(held.tool, held.turn)
     _check_extent(cover)
     flips = np.where(np.sum(held.turn[1:] * held.turn[:-1], axis=1) < 0, -1.0, 1.0)
-    turn = held.turn * np.cumprod(np.r_[1.0, flips])[:, None]  # so that neighbours can be interpolated
+    turn = held.turn * np.cumprod(np.r_[1.0, flips])[:, None]  # without changes of sign, to interpolate neighbours
     poses = [*held.tool.T, *turn.T]
     rows = np.arange(0, len(held.hand), math.ceil(len(held.hand) / max_samples), dtype=np.intp)
     span_s = (held.tool_s[0], held.tool_s[-1])
@@ -260,7 +260,7 @@ def _robust(problem: _Problem) -> _Fit:
             raise CalibrationError(
                 f"the tracker's axes are mirrored (left-handed): the residual is {1e3 * np.median(fit.off):.0f} mm, "
                 f"and {1e3 * np.median(mirrored.off):.0f} mm with one axis reversed. base_from_tracker cannot express "
-                "that: reverse one axis in the tracker's program, like z = -z for Unity's axes"
+                "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change [hands] axes"
             )
     return fit
 
