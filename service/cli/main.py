@@ -137,6 +137,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
+    option(c, "--end-with", "PID", "stop when this process ends, as after SIGTERM", type=within(int, 1, 2**31 - 1))
 
     c = command(
         "play",

@@ -6,6 +6,7 @@ import argparse
 import gc
 import logging
 import os
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -27,6 +28,8 @@ def serve(args: argparse.Namespace) -> int:
     """Run the daemon until it is stopped; exit code 0, or 1 if recordings lack ticks."""
     os.umask(0o077)  # files are private to the user
     _open_standard_streams()
+    if args.end_with is not None:
+        _end_with(args.end_with)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -61,6 +64,14 @@ def serve(args: argparse.Namespace) -> int:
         missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
+
+
+def _end_with(pid: int) -> None:
+    """Send this process SIGTERM when another one ends. Raises UsageError if there is none."""
+    try:
+        child.when_ended(pid, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    except ProcessLookupError:
+        raise UsageError(f"--end-with {pid}: no such process; the number of a running one accepted") from None
 
 
 def _open_standard_streams() -> None:

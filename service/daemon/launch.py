@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import os
 import select
 import socket
 import subprocess
@@ -100,7 +101,8 @@ def launched(
         f"{described(settings or Settings())}{network}[files]\nrerun = {json.dumps(rerun)}\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
-    command, environment = python(*program, "serve", "--config", str(config), *arguments)
+    ends = ("--end-with", str(os.getpid()))  # also if this process is killed
+    command, environment = python(*program, "serve", "--config", str(config), *ends, *arguments)
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
     with process:

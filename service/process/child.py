@@ -26,12 +26,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 _PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
+ENDED_POLL_S = 0.5
 _ALIGNED = 64  # [bytes] parts begin at multiples of this, so that arrays are used without a copy
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36  # Linux defines them, Python does not
 CHILD_NICE = 5  # children yield to the control process
@@ -306,14 +307,35 @@ def end_with_parent(grace_s: float = 0.0) -> None:
     process.
     """
 
-    def wait(parent: int) -> None:
-        select.select([parent], [], [])
+    def end() -> None:
         time.sleep(grace_s)
         os._exit(1)
 
     _continue_with_parent()
-    with contextlib.suppress(OSError, AttributeError):  # an older kernel: the closed socket must suffice
-        threading.Thread(target=wait, args=(os.pidfd_open(os.getppid()),), name="parent", daemon=True).start()
+    with contextlib.suppress(ProcessLookupError):  # it has just ended: the closed socket suffices
+        when_ended(os.getppid(), end)
+
+
+def when_ended(pid: int, then: Callable[[], object]) -> None:
+    """Call `then` in a thread once a process has ended. Raises ProcessLookupError."""
+    with contextlib.suppress(PermissionError):
+        os.kill(pid, 0)
+    process = -1
+    with contextlib.suppress(OSError, AttributeError):  # a kernel before 5.3, or another system
+        process = os.pidfd_open(pid)
+
+    def wait() -> None:
+        if process >= 0:
+            select.select([process], [], [])
+        else:
+            with contextlib.suppress(ProcessLookupError):
+                while True:
+                    time.sleep(ENDED_POLL_S)
+                    with contextlib.suppress(PermissionError):
+                        os.kill(pid, 0)
+        then()
+
+    threading.Thread(target=wait, name="ends", daemon=True).start()
 
 
 def in_memory(*parts: Any) -> int:

@@ -117,6 +117,7 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "accepted as a take's name", ("record", "a/b", *NOBODY)),
         (2, "a port from 0 to 65535 needed", ("status", "--connect", "tcp/127.0.0.1:99999")),
         (2, "0 to 65535 needed", ("serve", "--live", "99999")),
+        (2, "no such process", ("serve", "--end-with", "2147483647")),
         (2, "nan given, -10 to 10 m needed", ("via-points", "add", "here", "--left", "nan", "0", "0")),
         (2, "nan given, 0 to 10 m needed", ("via-points", "add", "here", "--std", "nan")),
         (2, "", ("bench", "--seconds", "-1")),

@@ -116,7 +116,7 @@ def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
     """Of a target that stops at once, from 0.4 m/s. While it moves, that costs LATE_STOP_MAX_M."""
     velocity, passed, behind = np.array([0.4, 0.0, 0.0]), [], []
     for response_s in (0.0235, 0.04):
-        generator, state, farthest = SetpointGenerator(Settings()), blank(STATE), 0.0
+        generator, state, farthest = SetpointGenerator(Settings(tool=TOOL)), blank(STATE), 0.0
         generator.begin(state, at_rest(MIDDLE))
         state["response_s"] = response_s
         for k in range(700):
@@ -141,7 +141,7 @@ def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_reach_that_a_noisy_tracker_sees_is_followed_smoothly(seed: int) -> None:
     random = np.random.default_rng(seed)
-    settings = Settings()
+    settings = Settings(tool=TOOL)
     intake, generator, state = Intake(settings), SetpointGenerator(settings), blank(STATE)
     intake.begin(state)
     generator.begin(state, at_rest(MIDDLE))

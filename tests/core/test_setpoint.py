@@ -148,7 +148,7 @@ def test_a_target_on_a_side_of_the_workspace_is_reached_and_the_setpoint_rests_t
 
 def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:
     """Bounded for good: it used to creep on to its target."""
-    generator, state = Explained(Settings()), blank(STATE)
+    generator, state = Explained(Settings(tool=TOOL)), blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
     for _ in range(5000):

@@ -142,7 +142,8 @@ def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Pat
     assert "Traceback" not in said.read_text()
 
 
-def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals) -> None:
     said = tmp_path / "said"
     process = begun(["demo", "--output", str(tmp_path / "demo")], said)
     wait_for(lambda: "service at" in said.read_text(), 100)
@@ -152,10 +153,12 @@ def test_an_interrupted_demo_leaves_no_process_behind(tmp_path: Path) -> None:
         return [line for line in lines if str(tmp_path).encode() in line and b"defunct" not in line]
 
     assert len(services()) == 2  # the demo and its daemon
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 130
-    assert services() == []
-    assert said.read_text().splitlines()[-1] == SAID
+    process.send_signal(number)
+    assert process.wait(60) == (130 if number == signal.SIGINT else -number)
+    if number == signal.SIGINT:
+        assert services() == []
+        assert said.read_text().splitlines()[-1] == SAID
+    wait_for(lambda: not services())
     assert "Traceback" not in said.read_text()
 
 
