@@ -36,9 +36,6 @@ _ATTACHMENT = struct.Struct("<qqB16s")
 _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
 
 
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-
-
 class Topic(NamedTuple):
     """A topic: its full name, its message type and the channel of its messages. The cell subscribes
     if `heard`, and publishes otherwise. Later subscribers of a `latched` topic get the last
@@ -58,8 +55,8 @@ SET = (  # the setting with the beginning of a topic's name, and the topic with 
     ("position_commands", Topic("", "std_msgs/msg/Float64MultiArray", "joints/command")),
     ("trajectory", Topic("", "trajectory_msgs/msg/JointTrajectory", "joints/command")),
     ("joint_states", Topic("", "sensor_msgs/msg/JointState", "joints/state", heard=True)),
-    ("tf", Topic("", TRANSFORMS, "/tf")),
-    ("tf", Topic("_static", TRANSFORMS, "/tf_static", latched=True)),
+    ("tf", Topic("", channels.TRANSFORMS.type, "/tf")),
+    ("tf", Topic("_static", channels.TRANSFORMS.type, "/tf_static", latched=True)),
     ("robot_description", Topic("", "std_msgs/msg/String", "/robot_description", latched=True)),
     ("diagnostics", Topic("", "diagnostic_msgs/msg/DiagnosticArray", "status", every=10)),
 )
@@ -75,7 +72,7 @@ def of_settings(settings: Any) -> Iterator[Topic]:
     for channel, source in zip(FRAMES, (*settings.hands, settings.tool), strict=True):
         name, _, frame = source.partition(":")
         if frame:
-            yield Topic(name, TRANSFORMS, channel, heard=True, frame=frame)
+            yield Topic(name, channels.TRANSFORMS.type, channel, heard=True, frame=frame)
 
 
 def heard(cell: str, settings: Any, suffixes: Collection[str]) -> list[Topic]:

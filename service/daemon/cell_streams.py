@@ -31,7 +31,7 @@ CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are he
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
 MAX_JOINT_STATES = 16  # messages of the arm's topic, on which grippers and other parts may publish too
-MAX_TRANSFORM_MESSAGES = 16  # messages of a topic of transforms, on which all nodes publish
+MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
 
 
 class Arrivals:
