@@ -31,6 +31,7 @@ from service.trackers.calibration.collecting import (
     held_tool,
     lead,
     solved,
+    tracker_of,
 )
 from service.trackers.calibration.solver import (
     MIN_POINTS,
@@ -58,11 +59,11 @@ def calibrate(args: argparse.Namespace) -> int:
         led, settings = from_recording(args.recording, settings)
         if only_check:
             assert file is not None
-            return _checked(led, settings, recorded(file, settings), args)
+            return _checked(led, settings, _last(led, file, settings, args.hand), args)
         found = solved(led, settings, bench_corners(settings), args.hand)
         record = _record(found.calibration, found.side, found.frame or settings.hands.frame, "held")
         _show(record, args, found.remarks, lasts_s=float(np.ptp(found.held.hand_s)))
-        _write(file, record, found.frame, args)
+        _write(file, record, found.frame, settings)
         return _checked(led, settings, record, args) if args.check else 0
     settings = settings or Settings()
     with inputs_session(args, CONNECT_TIMEOUT_S) as session:
@@ -113,13 +114,15 @@ def _live(
     _await(live, args, needs_joints=not given)
     if only_check:
         assert file is not None
-        record = recorded(file, settings)
+        record = _last(live.led(most_states=1), file, settings, args.hand)
     else:
         begun_s = time.monotonic()
         if args.points:
             side = _side(live, args)
-            calibration = _touched(live, side, corners, given, pressed)
-            frame, remarks = live.led(most_states=1).hands[side].frame, list[str]()
+            track, remarks = live.led(most_states=1).hands[side], list[str]()
+            tracker_of(track, settings)
+            frame = track.frame
+            calibration = _touched(live, side, corners, given, pressed, settings.tracker_section(frame))
         else:
             say("hold the tool and lead it: up and down, far apart, and turn the wrist; Enter or Ctrl-C ends it")
             try:
@@ -143,7 +146,7 @@ def _live(
         remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
         record = _record(calibration, side, frame or settings.hands.frame, "points" if args.points else "held")
         _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
-        _write(file, record, frame, args)
+        _write(file, record, frame, settings)
     if not args.check:
         return 0
     say(f"check: {'hold' if record.method == 'held' else 'touch'} the tool as before, for {CHECK_S:g} s")
@@ -178,7 +181,12 @@ def _side(live: LiveLed, args: argparse.Namespace) -> str:
 
 
 def _touched(
-    live: LiveLed, side: str, corners: Vector, given: list[tuple[float, float, float]], pressed: EnterPressed
+    live: LiveLed,
+    side: str,
+    corners: Vector,
+    given: list[tuple[float, float, float]],
+    pressed: EnterPressed,
+    section: str,
 ) -> Calibration:
     """The calibration from points that are touched one after another. Raises CalibrationError."""
     hand: list[Vector] = []
@@ -204,7 +212,7 @@ def _touched(
             base.append(point)
             if len(hand) >= MIN_POINTS:
                 try:
-                    found = solve_points(np.array(hand), np.array(base), corners)
+                    found = solve_points(np.array(hand), np.array(base), corners, section=section)
                     say(
                         f"residual {1e3 * found.rms_m:.1f} mm, accuracy {1e3 * found.std_m:.1f} mm; Ctrl-C ends it here"
                     )
@@ -212,7 +220,7 @@ def _touched(
                     say(f"not enough yet: {error}")
     except KeyboardInterrupt:
         say(f"ended after {len(hand)} points")
-    return solve_points(np.array(hand).reshape(-1, 3), np.array(base).reshape(-1, 3), corners)
+    return solve_points(np.array(hand).reshape(-1, 3), np.array(base).reshape(-1, 3), corners, section=section)
 
 
 def _shower() -> Callable[[str], None]:
@@ -255,22 +263,47 @@ def _show(record: CalibrationRecord, args: argparse.Namespace, remarks: Sequence
         )
 
 
-def _write(file: Path | None, record: CalibrationRecord, frame: str, args: argparse.Namespace) -> None:
-    """Write the calibration into the cell's settings, or print what to write."""
-    values = hand_settings(record.calibration, "" if frame == BASE else frame)
+def _write(file: Path | None, record: CalibrationRecord, frame: str, settings: Settings) -> None:
+    """Write the calibration into the tracker's table in the cell's settings, or print what to
+    write.
+    """
+    tracker = frame if frame in settings.trackers else ""
+    values = hand_settings(record.calibration, "" if frame == BASE or tracker else frame)
     if file is None:
-        print(f"\nWrite this into the cell's settings; --config FILE does it:\n{lines(values)}", end="")
+        print(f"\nWrite this into the cell's settings; --config FILE does it:\n{lines(values, tracker)}", end="")
         return
-    kept = write(file, values, record)
-    print(f"\n{lines(values)}", end="")
+    kept = write(file, values, record, tracker)
+    print(f"\n{lines(values, tracker)}", end="")
     print(f"written into {file}; the earlier file is {kept.name}. Start the daemon again to use it")
+
+
+def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> CalibrationRecord:
+    """The last calibration of the tracker in whose frame the hand of a side is; without a side, of
+    the calibrated one among those of the hands. Raises CalibrationError.
+    """
+    hands = [track for one, track in led.hands.items() if side in (None, one)]
+    if not hands:
+        return recorded(file, settings)
+    found, errors = dict[str, CalibrationRecord](), list[CalibrationError]()
+    for track in hands:
+        try:
+            tracker = tracker_of(track, settings)
+            found[tracker] = recorded(file, settings, tracker)
+        except CalibrationError as error:
+            errors.append(error)
+    if len(found) > 1:
+        frames = " and ".join(repr(one.frame) for one in found.values())
+        raise CalibrationError(f"the hands are of two trackers, {frames}: give the hand that holds the tool by --hand")
+    if not found:
+        raise errors[0]
+    return next(iter(found.values()))
 
 
 def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
     """Print how far the hand is from where the tool has it; 1 if that is more than accepted."""
     if (track := led.hands.get(record.hand)) is None:
         raise CalibrationError(f"hands/{record.hand} does not arrive, which was calibrated on {record.date}")
-    held, remarks = held_tool(track, led.tool, settings.hands)
+    held, remarks = held_tool(track, led.tool, settings.hands_in(tracker_of(track, settings)))
     if not len(held.hand):
         raise CalibrationError("no samples of hand and arm at the same time")
     off_mm = 1e3 * distances_m(held, record.calibration)

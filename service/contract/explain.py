@@ -146,7 +146,7 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
         and message.startswith(("Expected", "Invalid"))
     ):
         if isinstance(node, inspect.TupleType | inspect.VarTupleType) and isinstance(value, list):
-            counted = "numbers" if isinstance(node, inspect.TupleType) else "given"
+            counted = "numbers" if isinstance(node, inspect.TupleType) and not accepted else "given"
             return f"{path}: {len(value) or 'none'} {counted}, {needed}"
         return f"{path}: {_short(value)} given; {needed}"
     return f"{path}: {message[:MAX_MESSAGE]}"

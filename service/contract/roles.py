@@ -99,7 +99,7 @@ def access_control(
     shown = {ros2.key(ros2_domain or 0, topic): topic for topic in more_topics if topic.channel.startswith("/")}
     latched = [one for key, topic in shown.items() if topic.latched for one in (key, ros2.kept(key))]
     hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *shown])
-    record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL)))
+    record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True))
     ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
     status, present = keys(("status",)), [channels.presence(cell)]

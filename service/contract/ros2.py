@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from service.contract import channels
@@ -25,6 +25,8 @@ TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
+OWN_FRAMES = ("left_hand", "right_hand", "setpoint", "target", "tool")  # of a cell, beside the arm's links
+FRAMES = ("hands/left", "hands/right", "tool/pose")  # channels whose messages may be frames of TFMessages
 HEARD = tuple(channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event)
 SAID = tuple(channel for channel in channels.CHANNELS if channel.direction == "out")
 _DEPTH = 10
@@ -37,7 +39,7 @@ _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
 class Topic(NamedTuple):
     """A topic: its full name, its message type and the channel of its messages. The cell subscribes
     if `heard`, and publishes otherwise. Later subscribers of a `latched` topic get the last
-    message.
+    message. Of a TFMessage that is heard, the transforms of one `frame` are the channel's messages.
     """
 
     name: str
@@ -46,24 +48,37 @@ class Topic(NamedTuple):
     heard: bool = False
     latched: bool = False
     every: int = 1  # one of this number of the channel's messages is published
+    frame: str = ""
 
 
 SET = (  # the setting with the beginning of a topic's name, and the topic with its end
     ("position_commands", Topic("", "std_msgs/msg/Float64MultiArray", "joints/command")),
     ("trajectory", Topic("", "trajectory_msgs/msg/JointTrajectory", "joints/command")),
     ("joint_states", Topic("", "sensor_msgs/msg/JointState", "joints/state", heard=True)),
-    ("tf", Topic("", "tf2_msgs/msg/TFMessage", "/tf")),
-    ("tf", Topic("_static", "tf2_msgs/msg/TFMessage", "/tf_static", latched=True)),
+    ("tf", Topic("", channels.TRANSFORMS.type, "/tf")),
+    ("tf", Topic("_static", channels.TRANSFORMS.type, "/tf_static", latched=True)),
     ("robot_description", Topic("", "std_msgs/msg/String", "/robot_description", latched=True)),
     ("diagnostics", Topic("", "diagnostic_msgs/msg/DiagnosticArray", "status", every=10)),
 )
 
 
 def of_settings(settings: Any) -> Iterator[Topic]:
-    """The topics named in a cell's settings: those of ros2_control, RViz and rqt."""
+    """The topics named in a cell's settings: those of ros2_control, RViz and rqt, and of frames
+    that are hands or tool.
+    """
     for setting, topic in SET:
         if name := getattr(settings, setting):
             yield topic._replace(name=name + topic.name)
+    for channel, source in zip(FRAMES, (*settings.hands, settings.tool), strict=True):
+        name, _, frame = source.partition(":")
+        if frame:
+            yield Topic(name, channels.TRANSFORMS.type, channel, heard=True, frame=frame)
+
+
+def heard(cell: str, settings: Any, suffixes: Collection[str]) -> list[Topic]:
+    """The topics on which a cell with these settings receives messages of some channels."""
+    own = [of_channel(cell, channel) for channel in HEARD if channel.key in suffixes]
+    return own + [topic for topic in of_settings(settings) if topic.heard and topic.channel in suffixes]
 
 
 def of_channel(cell: str, channel: channels.Channel) -> Topic:
@@ -96,16 +111,16 @@ def all_tokens(domain: int) -> str:
     return f"@ros2_lv/{domain}/**"
 
 
-def tokens(domain: int, cell: str, session: str, topics: Sequence[Topic]) -> dict[str, str]:
-    """The liveliness tokens of the daemon of a Zenoh session, by the topic's name; its node's is
-    under "".
+def tokens(domain: int, cell: str, session: str, topics: Iterable[Topic]) -> dict[tuple[str, bool], str]:
+    """The liveliness tokens of the daemon of a Zenoh session, by the topic's name and whether it is
+    heard; its node's is under ("", False).
     """
     node = f"%/{_mangled(f'/{cell}')}/{NODE}"
-    found = {"": f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
-    for number, topic in enumerate(topics, start=1):
+    found = {("", False): f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
+    for number, topic in enumerate({(one.name, one.heard): one for one in topics}.values(), start=1):
         kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _LATCHED if topic.latched else _RELIABLE)
         what = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
-        found[topic.name] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{what}"
+        found[topic.name, topic.heard] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{what}"
     return found
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import zenoh
 from zenoh.handlers import RingChannel
 
 from service.client import publisher
-from service.contract import channels, ros2
-from service.contract.cdr import encode_joints
+from service.contract import cdr, channels, ros2
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.core.frame import Event, Frame, Record
@@ -32,6 +31,7 @@ CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are he
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
 MAX_JOINT_STATES = 16  # messages of the arm's topic, on which grippers and other parts may publish too
+MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
 
 
 class Arrivals:
@@ -98,16 +98,22 @@ class CellStreams:
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
-        inputs = heard(settings)
-        keys = [(channel, channels.key(cell, channel.key)) for channel in inputs]
+        inputs = [channel.key for channel in heard(settings)]
+        keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
         if domain is not None:
-            topics = [ros2.of_channel(cell, channel) for channel in (*inputs, *ros2.SAID)]
-            topics += [
-                one for one in ros2.of_settings(settings.ros2) if not one.heard or settings.arm.source == "state"
-            ]
-            keys += [(channels.BY_KEY[one.channel], ros2.key(domain, one)) for one in topics if one.heard]
+            topics = ros2.heard(cell, settings.ros2, inputs)
+            keys += [(one.channel, ros2.key(domain, one)) for one in topics if not one.frame]
+            for one in (topic for topic in topics if topic.frame):
+                frames.setdefault(ros2.key(domain, one), {})[one.frame] = one.channel
+            topics += [ros2.of_channel(cell, channel) for channel in ros2.SAID]
+            topics += [one for one in ros2.of_settings(settings.ros2) if not one.heard]
         self._subscribers = [
-            (channel, session.declare_subscriber(key, RingChannel(_most(channel)))) for channel, key in keys
+            (suffix, session.declare_subscriber(key, RingChannel(_most(suffix)))) for suffix, key in keys
+        ]
+        remote = zenoh.Locality.REMOTE  # the cell may publish frames of its own on the same topic
+        self._transforms = [
+            (by_frame, session.declare_subscriber(key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote))
+            for key, by_frame in frames.items()
         ]
         self._publishers = {
             channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
@@ -121,30 +127,46 @@ class CellStreams:
         cannot be decoded are counted.
         """
         events: list[Event] = []
-        for channel, source in self._subscribers:
-            arrived: list[Event] = []
-            for _ in range(_most(channel)):
-                if (sample := source.try_recv()) is None:
-                    break
-                if event := self._decoded(channel, sample):
-                    arrived.append(event)
-            events += arrived[-1:] if channel.key == ARM_STATE else arrived
+        for suffix, source in self._subscribers:
+            payloads = (sample.payload for sample in _waiting(source, _most(suffix)))
+            arrived = [event for payload in payloads if (event := self._decoded(suffix, payload))]
+            events += arrived[-1:] if suffix == ARM_STATE else arrived
+        for by_frame, source in self._transforms:
+            for suffix, poses in self._poses(by_frame, source).items():
+                encoded = map(cdr.encode_pose, poses[-MAX_ARRIVALS:])
+                events += [event for payload in encoded if (event := self._decoded(suffix, payload))]
         return events
 
-    def _decoded(self, channel: channels.Channel, sample: Any) -> Event | None:
-        arrivals = self._arrivals[channel.key]
+    def _poses(self, by_frame: Mapping[str, str], source: Any) -> dict[str, list[PoseStamped]]:
+        """The poses by channel in the messages of a topic of transforms. Only the newest messages
+        with a frame of `by_frame` are decoded: most are of other nodes.
+        """
+        payloads = [sample.payload.to_bytes() for sample in _waiting(source, MAX_TRANSFORM_MESSAGES)]
+        named = [(one, [frame for frame in by_frame if cdr.bytes_of_frame(frame) in one]) for one in payloads]
+        found: dict[str, list[PoseStamped]] = {}
+        for payload, frames in [one for one in named if one[1]][-MAX_ARRIVALS:]:
+            try:
+                for frame, pose in cdr.decode_transforms(payload, tuple(by_frame)):
+                    found.setdefault(by_frame[frame], []).append(pose)
+            except WireError as error:
+                for frame in frames:
+                    self._arrivals[by_frame[frame]].refuse(str(error))
+        return found
+
+    def _decoded(self, suffix: str, raw: Any) -> Event | None:
+        channel, arrivals = channels.BY_KEY[suffix], self._arrivals[suffix]
         try:
-            if len(sample.payload) > MAX_SAMPLE_BYTES:
-                raise WireError(f"{len(sample.payload)} bytes, at most {MAX_SAMPLE_BYTES} accepted")
-            payload, at_ns = sample.payload.to_bytes(), time.time_ns()
+            if len(raw) > MAX_SAMPLE_BYTES:
+                raise WireError(f"{len(raw)} bytes, at most {MAX_SAMPLE_BYTES} accepted")
+            payload, at_ns = bytes(raw), time.time_ns()
             message = channel.codec.decode(payload)
-            if channel.key == ARM_STATE:
+            if suffix == ARM_STATE:
                 state = self._joints.take(message, at_ns / 1e9) or self._joints.incomplete(message, at_ns / 1e9)
                 if state is None:
                     return None
                 if state is not message:
-                    message, payload = state, encode_joints(state)
-            event = self.newest[channel.key] = Event(channel.key, payload, message)
+                    message, payload = state, cdr.encode_joints(state)
+            event = self.newest[suffix] = Event(suffix, payload, message)
             arrivals.take(message, at_ns)
             return event
         except WireError as error:
@@ -180,6 +202,14 @@ def heard(settings: Settings) -> list[channels.Channel]:
     return [c for c in ros2.HEARD if c.key not in CONFIGURED or CONFIGURED[c.key](settings)]
 
 
-def _most(channel: channels.Channel) -> int:
+def _most(suffix: str) -> int:
     """Largest number of messages of a channel that are read in one tick."""
-    return MAX_JOINT_STATES if channel.key == ARM_STATE else MAX_ARRIVALS
+    return MAX_JOINT_STATES if suffix == ARM_STATE else MAX_ARRIVALS
+
+
+def _waiting(source: Any, most: int) -> Iterator[zenoh.Sample]:
+    """The samples that wait in a ring, at most this number."""
+    for _ in range(most):
+        if (sample := source.try_recv()) is None:
+            return
+        yield sample

@@ -85,7 +85,7 @@ class Ros2Domain:
         self._period_ns = round(1e9 * settings.period_s)
         self._topics = [topic for topic in topics if not topic.heard]
         self._publishers = {topic.name: _publisher(session, ros2.key(domain, topic), topic) for topic in self._topics}
-        self._gids = {topic.name: ros2.gid(tokens[topic.name]) for topic in self._topics}
+        self._gids = {topic.name: ros2.gid(tokens[topic.name, False]) for topic in self._topics}
         self._sent, self._received = Counter[str](), Counter[str]()
         self._tokens = [session.liveliness().declare_token(token) for token in tokens.values()]
         self._waiting: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()

@@ -303,7 +303,7 @@ class Settings(Section, frozen=True):
                 f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
                 "none of them with a digit first, joined by slashes needed"
             )
-        named = [topic.name for topic in ros2.of_settings(self.ros2)]
+        named = dict.fromkeys(topic.name for topic in ros2.of_settings(self.ros2))
         if named and self.network.ros2_domain is None:
             yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
         if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):

@@ -18,11 +18,18 @@ Domain = Annotated[
 ]
 
 
-Topic = Annotated[
+_TOPIC = "(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)"
+Topic = Annotated[str, msgspec.Meta(pattern=rf"\A{_TOPIC}*\Z", extra={"accepted": "a topic's full name, /like/this,"})]
+FrameSource = Annotated[
     str,
     msgspec.Meta(
-        pattern=r"\A(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*\Z", extra={"accepted": "a topic's full name, /like/this,"}
+        pattern=rf"\A({_TOPIC}+:[\w.-][\w./-]{{0,63}})?\Z",
+        extra={"accepted": "a topic and a frame, like /tf:left_wrist,"},
     ),
+]
+HandSources = Annotated[
+    tuple[FrameSource, FrameSource],
+    msgspec.Meta(extra={"accepted": 'both hands\' frames, like ["/tf:left_wrist", "/tf:right_wrist"],'}),
 ]
 
 
@@ -77,14 +84,31 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Topics in the domain `network.ros2_domain`: of the arm's controllers in ros2_control, and of
-    RViz and rqt. Each setting is the full name of a topic; empty: none.
+    """Topics in the domain `network.ros2_domain`: of the arm's controllers in ros2_control, of RViz
+    and rqt, and of trackers that publish transforms. Each setting is the full name of a topic,
+    with `:` and a frame for transforms; empty: none.
     """
 
     position_commands: Topic = ""  # forward_command_controller for positions: /<its name>/commands
     trajectory: Topic = ""  # joint_trajectory_controller: /<its name>/joint_trajectory
     joint_states: Topic = ""  # joint_state_broadcaster: /joint_states, received in addition to the cell's own
     joints: tuple[str, ...] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
+    hands: HandSources = ("", "")  # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
+    tool: FrameSource = ""  # the tool in demonstrations, as such a frame
     tf: Topic = ""  # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
     robot_description: Topic = ""  # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
     diagnostics: Topic = ""  # /diagnostics: mode, reason and lateness each second
+
+    def __post_init__(self) -> None:
+        sources = {"$.ros2.hands[0]": self.hands[0], "$.ros2.hands[1]": self.hands[1], "$.ros2.tool": self.tool}
+        first_of: dict[str, str] = {}
+        for path, source in sources.items():
+            topic, _, frame = source.partition(":")
+            if topic.endswith("_static"):
+                raise ValueError(f"{path}: {source!r} given; a topic of frames that move needed, like /tf")
+            if source and topic == self.tf and frame in ros2.OWN_FRAMES:
+                raise ValueError(
+                    f"{path}: {source!r} given, which this cell publishes itself on $.ros2.tf; a tracker's frame needed"
+                )
+            if source and (first := first_of.setdefault(source, path)) != path:
+                raise ValueError(f"{path}: {source!r} given; another frame than that of {first} needed")

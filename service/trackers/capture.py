@@ -15,7 +15,7 @@ import numpy as np
 import zenoh
 
 from service.client import Overheard
-from service.contract import cdr, channels
+from service.contract import cdr, channels, ros2
 from service.contract.explain import ExplainedError
 from service.contract.joint_states import JointStates, measured
 from service.contract.messages import BASE, PoseStamped, WireError, finite
@@ -77,13 +77,28 @@ class Capture:
         self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in self.samples}
         self._heard_s, self._moved = time.monotonic(), False
         self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
-        self._subscribers = [
-            session.declare_subscriber(channels.key(cell, key), self._listener(key)) for key in self.samples
-        ]
+        heard = [(channels.key(cell, key), self._listener(key)) for key in self.samples]
+        if (domain := settings.network.ros2_domain) is not None:
+            topics = ros2.heard(cell, settings.ros2, self.samples)
+            heard += [(ros2.key(domain, topic), self._listener(topic.channel, topic.frame)) for topic in topics]
+        self._subscribers = [session.declare_subscriber(key, listener) for key, listener in heard]
 
-    def _listener(self, key: str) -> Callable[[zenoh.Sample], None]:
-        waiting = self._waiting[key]
-        return lambda sample: waiting.append((time.time_ns(), sample.payload.to_bytes()))
+    def _listener(self, key: str, frame: str = "") -> Callable[[zenoh.Sample], None]:
+        """A function that takes the messages of a channel, or those of transforms with a frame."""
+        waiting, name = self._waiting[key], cdr.bytes_of_frame(frame)
+
+        def take(sample: zenoh.Sample) -> None:
+            arrived_ns, payload = time.time_ns(), sample.payload.to_bytes()
+            if not frame:
+                waiting.append((arrived_ns, payload))
+            elif name in payload:
+                try:
+                    poses = cdr.decode_transforms(payload, (frame,))
+                    waiting.extend((arrived_ns, cdr.encode_pose(pose)) for _, pose in poses)
+                except WireError:
+                    self.malformed[key] = self.malformed.get(key, 0) + 1
+
+        return take
 
     def close(self) -> None:
         """End the subscriptions and decode the last messages."""

@@ -16,8 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.client import Watch, endpoints, open_session
-from service.contract import cdr, ros2
-from service.contract.messages import PoseStamped, Transform
+from service.contract.messages import PoseStamped
 from support.cell import until
 from support.paths import ROOT
 
@@ -52,13 +51,6 @@ HTS = b"""Left wrist | f = 12 | t = 99:, 0.1, 1.2, 0.5, 0.1, -0.5, 0.5, 0.7
 Left landmarks:, 1, 2, 3
 Head pose:, 0, 0, 0, 0, 0, 0, 1
 """
-TF = cdr.encode_transforms(
-    9,
-    [
-        Transform("world", "iron", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)),
-        Transform("/world", "left", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)),
-    ],
-)
 KEYS = {"left": "hands/left", "right": "hands/right"}
 
 
@@ -92,20 +84,13 @@ def test_a_wrist_without_seven_numbers_is_refused(values: str) -> None:
         list(example("hts_hands").poses(f"Right wrist:, {values}".encode(), 9))
 
 
-def test_a_frame_of_tf_is_a_hand_in_its_parents_frame() -> None:
-    found = list(example("tf_hands").poses(TF, KEYS))
-    assert found == [("hands/left", PoseStamped(9, "world", (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)))]
-
-
-@pytest.mark.parametrize(("name", "frame"), [("vicon_hands", "vicon"), ("hts_hands", "hts"), ("tf_hands", "world")])
+@pytest.mark.parametrize(("name", "frame"), [("vicon_hands", "vicon"), ("hts_hands", "hts")])
 def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name: str, frame: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    topic = ros2.key(3, ros2.Topic("/tf", "tf2_msgs/msg/TFMessage", "/tf"))
     named = ["--left", "left", "--right", "right"] if name != "hts_hands" else []
-    where = ["--domain", "3"] if name == "tf_hands" else ["--port", str(port)]
-    packets = {"vicon_hands": VICON, "hts_hands": HTS, "tf_hands": TF}
+    packets = {"vicon_hands": VICON, "hts_hands": HTS}
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as session,
         Watch(session, "thirdhand", "hands/left", timeout_s=0.2) as hands,
@@ -115,7 +100,8 @@ def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name:
             sys.executable,
             str(ROOT / "examples" / f"{name}.py"),
             *named,
-            *where,
+            "--port",
+            str(port),
             "--connect",
             *endpoints(session),
         ]
@@ -124,10 +110,7 @@ def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name:
 
             def received() -> PoseStamped | None:
                 for packet in (b"nonsense", packets[name]):
-                    if name == "tf_hands":
-                        session.put(topic, packet)
-                    else:
-                        sender.sendto(packet, ("127.0.0.1", port))
+                    sender.sendto(packet, ("127.0.0.1", port))
                 pose: PoseStamped | None = next(hands)
                 return pose
 
@@ -138,6 +121,6 @@ def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name:
     assert b"Traceback" not in errors
 
 
-@pytest.mark.parametrize("name", ["optitrack_hands", "vicon_hands", "hts_hands", "tf_hands"])
+@pytest.mark.parametrize("name", ["optitrack_hands", "vicon_hands", "hts_hands"])
 def test_an_example_is_short(name: str) -> None:
     assert len((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 90

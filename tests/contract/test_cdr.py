@@ -183,6 +183,24 @@ def test_transforms_are_the_bytes_of_another_implementation(stamp_ns: int, items
     ]
     ours = cdr.encode_transforms(stamp_ns, [messages.Transform(*item) for item in items])
     assert ours == _bytes("tf2_msgs/msg/TFMessage", theirs)
+    read = [(child, messages.PoseStamped(stamp_ns, parent, xyz, turn)) for parent, child, xyz, turn in items]
+    slashless = [(child.lstrip("/"), pose._replace(frame_id=pose.frame_id.lstrip("/"))) for child, pose in read]
+    assert cdr.decode_transforms(ours) == slashless
+    for child, _ in slashless:
+        assert cdr.decode_transforms(ours, (child,)) == [one for one in slashless if one[0] == child]
+
+
+def test_the_frames_of_a_message_are_read_each_with_its_own_stamp_and_parent() -> None:
+    stamped, transform = ROS.types["geometry_msgs/msg/TransformStamped"], ROS.types["geometry_msgs/msg/Transform"]
+    vector, quaternion = ROS.types["geometry_msgs/msg/Vector3"], ROS.types["geometry_msgs/msg/Quaternion"]
+    still = transform(vector(1.0, 2.0, 3.0), quaternion(0.0, 0.0, 0.0, 1.0))
+    frames = {"wrist": (1, "world"), "my_wrist": (2, "w"), "/wrist": (3, "/rig/1"), "wrist_2": (4, ""), "é": (5, "map")}
+    theirs = [stamped(_header(stamp, parent), child, still) for child, (stamp, parent) in frames.items()]
+    data = _bytes("tf2_msgs/msg/TFMessage", theirs)
+    found = [(name, pose.stamp_ns, pose.frame_id) for name, pose in cdr.decode_transforms(data, ("wrist", "é"))]
+    assert found == [("wrist", 1, "world"), ("wrist", 3, "rig/1"), ("é", 5, "map")]
+    assert cdr.decode_transforms(data, ("elbow",)) == []
+    assert all(cdr.bytes_of_frame(child) in data for child in frames)
 
 
 POSE = cdr.encode_pose(messages.PoseStamped(7, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
@@ -190,7 +208,13 @@ JOINTS = cdr.encode_joints(messages.JointState(7, JOINT_NAMES, (0.5,) * 7, ()))
 COVARIANCE = cdr.encode_pose_with_covariance(
     messages.PoseWithCovarianceStamped(7, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 36)
 )
-MESSAGES = [(POSE, cdr.decode_pose), (JOINTS, cdr.decode_joints), (COVARIANCE, cdr.decode_pose_with_covariance)]
+TRANSFORMS = cdr.encode_transforms(7, [messages.Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))] * 3)
+MESSAGES = [
+    (POSE, cdr.decode_pose),
+    (JOINTS, cdr.decode_joints),
+    (COVARIANCE, cdr.decode_pose_with_covariance),
+    (TRANSFORMS, cdr.decode_transforms),
+]
 
 
 @pytest.mark.parametrize(("data", "decode"), MESSAGES)

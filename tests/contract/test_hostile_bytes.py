@@ -75,10 +75,18 @@ def test_a_name_of_any_length_is_told_in_few_words() -> None:
             assert not check("via_points", json.dumps({field: value}).encode())
 
 
-@pytest.mark.parametrize("decode", [cdr.decode_pose, cdr.decode_pose_with_covariance, cdr.decode_joints])
-def test_what_the_loop_reads_is_refused_by_its_size_alone(decode: Callable[[bytes], object]) -> None:
-    with pytest.raises(WireError, match="a message of 8193 bytes, at most 8192 accepted"):
-        decode(b"x" * 8193)
+@pytest.mark.parametrize(
+    ("decode", "most"),
+    [
+        (cdr.decode_pose, 8192),
+        (cdr.decode_pose_with_covariance, 8192),
+        (cdr.decode_joints, 8192),
+        (cdr.decode_transforms, 32768),
+    ],
+)
+def test_what_the_loop_reads_is_refused_by_its_size_alone(decode: Callable[[bytes], object], most: int) -> None:
+    with pytest.raises(WireError, match=f"a message of {most + 1} bytes, at most {most} accepted"):
+        decode(b"x" * (most + 1))
 
 
 def test_a_stamp_has_less_than_a_second_of_nanoseconds() -> None:

@@ -23,9 +23,11 @@ from service.settings.network import Ros2
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
 COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"
 VIEWED = {"tf": "/arm/tf", "robot_description": "/robot_description", "diagnostics": "/diagnostics"}
+HANDS = {"hands": ["/tf:left_wrist", "/mocap/tf:right"], "tool": "/tf:iron"}
 NAMED = msgspec.convert(
-    VIEWED | {"position_commands": COMMANDS, "trajectory": TRAJECTORY, "joint_states": STATES}, Ros2
+    VIEWED | HANDS | {"position_commands": COMMANDS, "trajectory": TRAJECTORY, "joint_states": STATES}, Ros2
 )
+FRAMES = ("/tf", "/mocap/tf")
 LATCHED = ("/arm/tf_static", "/robot_description")
 
 
@@ -42,13 +44,19 @@ def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -
     topics += ros2.of_settings(NAMED)
     tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
     node = NodeEntity(DOMAIN, SESSION, 0, ros2.NODE, f"/{CELL}")
-    assert tokens.pop("") == node_liveliness_keyexpr(node)
+    assert tokens.pop(("", False)) == node_liveliness_keyexpr(node)
     streams = [c.key for c in channels.CHANNELS if c.direction == "out" or (c.direction == "in" and c.event)]
     own = [f"/{CELL}/{suffix}" for suffix in streams]
-    assert set(tokens) == {*own, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED}
-    for number, ((name, token), topic) in enumerate(zip(tokens.items(), topics, strict=True), start=1):
+    assert {name for name, _ in tokens} == {*own, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED, *FRAMES}
+    once = [*{(one.name, one.heard): one for one in topics}.values()]  # three frames are heard on two topics
+    assert [(one.frame, one.channel) for one in topics if one.frame] == [
+        ("left_wrist", "hands/left"),
+        ("right", "hands/right"),
+        ("iron", "tool/pose"),
+    ]
+    for number, (((name, _), token), topic) in enumerate(zip(tokens.items(), once, strict=True), start=1):
         named = (name, ros2_to_dds_type(topic.type), f"RIHS01_{ros2.TYPE_HASHES[topic.type]}")
-        is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name == STATES
+        is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name in (STATES, *FRAMES)
         quality = QosProfile(reliability=QosReliability.BEST_EFFORT if is_in else QosReliability.RELIABLE)
         if name in LATCHED:
             quality = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
@@ -91,6 +99,24 @@ def test_diagnostics_are_read_by_others() -> None:
         ('ros2.trajectory = "a/b"', r"\[ros2\] trajectory: 'a/b' given; a topic's full name, /like/this, accepted"),
         ('ros2.tf = "tf"', r"\[ros2\] tf: 'tf' given; a topic's full name, /like/this, accepted"),
         ('ros2.tf = "/tf"', r"\[network\] ros2_domain: none given; for /tf, /tf_static one from 0 to 232 needed"),
+        ('ros2.hands = ["/tf:l", ""]', r"\[network\] ros2_domain: none given; for /tf one from 0 to 232 needed"),
+        ('ros2.hands = "/tf:l"', r"hands: '/tf:l' given; both hands' frames, like \[\"/tf:left_wrist\", \"/tf:right_"),
+        ('ros2.hands = ["/tf:l"]', r"\[ros2\] hands: 1 given, both hands' frames, like \[\"/tf:left_wrist\", \"/tf:r"),
+        (
+            'ros2.hands = ["/tf:l", "/tf"]',
+            r"hands, entry 2: '/tf' given; a topic and a frame, like /tf:left_wrist, acc",
+        ),
+        ('ros2.hands = ["tf:l", ""]', r"hands, entry 1: 'tf:l' given; a topic and a frame, like /tf:left_wrist, accep"),
+        (
+            'ros2.hands = ["/tf:l", "/tf:l"]',
+            r"entry 2: '/tf:l' given; another frame than that of \[ros2\] hands, entry 1",
+        ),
+        ('ros2.hands = ["", "/tf_static:l"]', r"entry 2: '/tf_static:l' given; a topic of frames that move needed"),
+        (
+            'ros2.hands = ["/tf:left_hand", ""]\nros2.tf = "/tf"',
+            r"'/tf:left_hand' given, which this cell publishes its",
+        ),
+        ('ros2.tool = "/tf:"', r"\[ros2\] tool: '/tf:' given; a topic and a frame, like /tf:left_wrist, accepted"),
         ('ros2.joints = ["elbow"]', r"\[ros2\] joints: \['elbow'\] given; those of \[joints\] names needed, in any"),
     ],
 )

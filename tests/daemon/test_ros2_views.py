@@ -184,7 +184,7 @@ def test_frames_of_every_shipped_arm_are_one_tree_from_base(arm: str) -> None:
     np.testing.assert_allclose(placed(told, "tool"), kinematics(settings, joints), atol=1e-9)
     without = Frames(settings, robot_description(settings), links=False)
     left = {one.child for one in (*without.fixed, *without.moving(frame, joints.tolist()))}
-    assert left - {"base_link"} == {"tool", "setpoint", "target", "left_hand", "right_hand"}
+    assert left - {"base_link"} == set(ros2.OWN_FRAMES)
 
 
 def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:

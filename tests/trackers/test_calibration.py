@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tomllib import loads as load_toml
 from typing import Any
 
 import msgspec
@@ -26,8 +27,15 @@ from service.daemon.launch import free_port
 from service.files.mcap_file import whole_file
 from service.files.shipped import cell_of
 from service.files.track import Track
-from service.settings.config import HandSettings, Settings, load
-from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, record_path, recorded, write
+from service.settings.config import HandSettings, Settings, TrackerSettings, load
+from service.trackers.calibration.cell_file import (
+    CalibrationRecord,
+    hand_settings,
+    lines,
+    record_path,
+    recorded,
+    write,
+)
 from service.trackers.calibration.collecting import LedTracks, distances_m, held_tool, progress, solved
 from service.trackers.calibration.solver import (
     Calibration,
@@ -247,6 +255,30 @@ def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -
         solved(streams._replace(hands={}), Settings(), CORNERS, None)
 
 
+def test_each_hand_is_mapped_by_the_table_of_its_own_tracker() -> None:
+    held = held_by("mocap")
+    free = held._replace(hand=held.hand[::-1].copy())
+    tool, of_right, of_left = led_of(held).tool, led_of(held).hands["right"], led_of(free, "left").hands["left"]
+    mocap = of_right.poses * np.r_[[1000.0, 1000.0, -1000.0], np.ones(4)]
+    streams = LedTracks({"left": of_left._replace(frame="webxr"), "right": of_right._replace(poses=mocap)}, tool)
+    tables = {"mocap": TrackerSettings(unit="mm", axes="left-handed")}
+    found = solved(streams, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, None)
+    assert (found.side, found.frame) == ("right", "mocap")
+    assert 1e3 * error_m(found.calibration) < 1.5
+    wrong = {"mocap": TrackerSettings(axes="left-handed")}
+    with pytest.raises(CalibrationError, match=r'Set \[trackers\.mocap\] unit = "mm"'):
+        solved(streams, Settings(trackers=wrong), CORNERS, "right")
+    with pytest.raises(CalibrationError, match=r"or change \[trackers\.mocap\] axes"):
+        solved(streams, Settings(trackers={"mocap": TrackerSettings(unit="mm")}), CORNERS, "right")
+    recentred = streams._replace(hands={"right": of_right._replace(frame="webxr1")})
+    with pytest.raises(
+        CalibrationError,
+        match=r"hands/right is in frame 'webxr1', which has no table in the settings: add \[trackers\.webxr1\], or, "
+        r"if it is that of \[hands\] \(now 'webxr'\), set \[hands\] frame = 'webxr1'",
+    ):
+        solved(recentred, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, None)
+
+
 def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
     held, tracker = held_by("mocap"), HandSettings(frame="mocap")
     streams = led_of(held)
@@ -347,6 +379,36 @@ def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], 
     )
 
 
+TRACKERS = {
+    "a table": "[trackers.mocap]  # ours\n",
+    "a table between others": "[trackers.a]\n[tool]\nradius = 0.03\n[trackers.mocap]  # ours\n[trackers.b]\n",
+    "an inline table": "trackers = { mocap = {} }  # ours\n",
+    "dotted keys": 'trackers.mocap.unit = "mm"  # ours\n',
+    "a name with a slash": '[hands]\nframe = "webxr"\n[trackers."rig/1.b"]  # ours\n',
+}
+
+
+@pytest.mark.parametrize("text", TRACKERS.values(), ids=TRACKERS)
+def test_the_table_of_a_tracker_is_changed_and_nothing_else(text: str, tmp_path: Path) -> None:
+    path, tracker = tmp_path / "cell.toml", "rig/1.b" if "rig" in text else "mocap"
+    path.write_text(text)
+    before = load(path)
+    record = msgspec.structs.replace(RECORD, frame=tracker)
+    write(path, hand_settings(FOUND, ""), record, tracker)
+    after = load(path)
+    assert after.trackers[tracker].base_from_tracker == FOUND.base_from_tracker
+    there = msgspec.structs.replace(after.trackers[tracker], base_from_tracker=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    assert msgspec.structs.replace(after, trackers=after.trackers | {tracker: there}) == before
+    assert "# ours" in path.read_text()
+    assert recorded(path, after, tracker) == record
+    assert record_path(path, tracker).parent == tmp_path
+    with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist"):
+        recorded(path, after)
+    assert load_toml(lines(hand_settings(FOUND, ""), tracker)) == {
+        "trackers": {tracker: {"base_from_tracker": list(FOUND.base_from_tracker)}}
+    }
+
+
 def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text("rate_hz = 200\n")
@@ -364,13 +426,15 @@ def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path
 # --- the command ----------------------------------------------------------------------------------
 
 
-def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings) -> None:
-    """A recording of both hands, of which the left one holds the tool, and of joint states."""
+def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings, frame: str = "mocap") -> None:
+    """A recording of both hands, of which the left one holds the tool, and of joint states. The
+    right one is in a frame of its own.
+    """
     messages = []
     for at_s, hand in zip(held.hand_s, held.hand, strict=True):
         stamp = BEGIN_NS + int(1e9 * at_s)
         for side, at in (("left", hand), ("right", (0.1, 0.2, 0.3))):
-            pose = PoseStamped(stamp, "mocap", tuple(map(float, at)), (0.0, 0.0, 0.0, 1.0))
+            pose = PoseStamped(stamp, "mocap" if side == "left" else frame, tuple(map(float, at)), (0.0, 0.0, 0.0, 1.0))
             messages.append(
                 (stamp + 2_000_000, f"hands/{side}", "geometry_msgs/msg/PoseStamped", cdr.encode_pose(pose))
             )
@@ -425,6 +489,35 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     assert "has no joints/state of the joints wam/base_yaw_joint" in wrong_arm.stderr
     hands = told("calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
     assert (hands.returncode, "has no joints/state of the joints" in hands.stderr) == (1, True), hands.stderr
+
+
+def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tmp_path: Path) -> None:
+    cell, led = tmp_path / "cell.toml", str(tmp_path / "led.mcap")
+    text = '[hands]\nframe = "webxr"\n[trackers.mocap]  # beside it\n'
+    cell.write_text(text)
+    recording(tmp_path / "led.mcap", held_by("mocap"), path_of("wam", 0).joints, Settings(), "webxr")
+    command = ["calibrate", "--from", led, "--config", str(cell)]
+    done = told(*command)
+    assert done.returncode == 0, done.stderr
+    assert "\n[trackers.mocap]\nbase_from_tracker = [" in done.stdout
+    np.testing.assert_allclose(load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002)
+    assert load(cell).hands == HandSettings(frame="webxr")
+    assert record_path(cell, "mocap").exists()
+    done = told(*command, "--check")
+    assert (done.returncode, done.stdout) == (0, "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"), (
+        done.stderr
+    )
+    done = told(*command, "--check", "--hand", "right")
+    assert (done.returncode, "cell.calibration.json does not exist" in done.stderr) == (1, True), done.stderr
+    record_path(cell).write_bytes(record_path(cell, "mocap").read_bytes().replace(b'"mocap"', b'"webxr"'))
+    done = told(*command, "--check")
+    assert done.returncode == 1
+    assert "hands are of two trackers, 'mocap' and 'webxr': give the hand that holds the tool by --hand" in done.stderr
+    assert told(*command, "--check", "--hand", "left").returncode == 0
+    cell.write_text(text.replace("mocap", "optitrack"))
+    done = told(*command)
+    assert (done.returncode, "hands/left is in frame 'mocap', which has no table" in done.stderr) == (1, True)
+    assert load(cell).hands == HandSettings(frame="webxr")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 import msgspec
 import tomlkit
@@ -33,29 +34,32 @@ class CalibrationRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def hand_settings(calibration: Calibration, frame: str) -> dict[str, Any]:
-    """The values of [hands] that a calibration gives. A frame without a name is not written."""
+    """The values of a tracker's table that a calibration gives. A frame without a name is not
+    written, nor that of `[trackers.NAME]`, which is NAME.
+    """
     x, y, z, *quaternion = calibration.base_from_tracker
     pose = [round(value, 4) for value in (x, y, z)] + [round(value, 6) for value in quaternion]
     return ({"frame": frame} if frame else {}) | {"base_from_tracker": pose}
 
 
-def lines(values: Mapping[str, Any]) -> str:
-    """The values of [hands] as lines of a TOML file."""
-    return "[hands]\n" + "".join(f"{name} = {_literal(value)}\n" for name, value in values.items())
+def lines(values: Mapping[str, Any], tracker: str = "") -> str:
+    """The values of [trackers.NAME], or without a tracker of [hands], as lines of a TOML file."""
+    table = f"[trackers.{tomlkit.key(tracker).as_string()}]" if tracker else "[hands]"
+    return f"{table}\n" + "".join(f"{name} = {_literal(value)}\n" for name, value in values.items())
 
 
 def _literal(value: Any) -> str:
     return str(tomlkit.item(value).as_string())
 
 
-def record_path(path: Path) -> Path:
+def record_path(path: Path, tracker: str = "") -> Path:
     """The path of the record beside a cell's settings."""
-    return path.with_suffix(".calibration.json")
+    return path.with_suffix(f".{quote(tracker, safe='')}.calibration.json" if tracker else ".calibration.json")
 
 
-def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord) -> Path:
-    """Write values of [hands] into a cell's settings, and the record beside them. Returns the path
-    of the earlier file, which is kept.
+def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, tracker: str = "") -> Path:
+    """Write values of [trackers.NAME], or without a tracker of [hands], into a cell's settings, and
+    the record beside them. Returns the path of the earlier file, which is kept.
 
     Comments and all other lines remain. The new text is validated before anything is written, and
     replaces the file at once. Raises CalibrationError, SettingsError, OSError.
@@ -64,20 +68,26 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord) -> P
     before, text = load(path), path.read_text(encoding="utf-8")
     try:
         document = tomlkit.parse(text)
-        section: Any = document.setdefault("hands", tomlkit.table())
+        section: Any = document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
+        section = section[tracker] if tracker else section
         for name, value in values.items():
             section[name] = value
         changed = tomlkit.dumps(document)
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
-        raise CalibrationError(f"{path} cannot be changed: {error}. Write into it:\n{lines(values)}") from None
+        raise CalibrationError(f"{path} cannot be changed: {error}. Write into it:\n{lines(values, tracker)}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
     wanted = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    if after != msgspec.structs.replace(before, hands=msgspec.structs.replace(before.hands, **wanted)):
-        raise CalibrationError(f"{path} cannot be changed without other settings. Write into it:\n{lines(values)}")
+    table: Any = before.trackers[tracker] if tracker else before.hands
+    replaced = msgspec.structs.replace(table, **wanted)
+    changes = {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
+    if after != msgspec.structs.replace(before, **changes):
+        raise CalibrationError(
+            f"{path} cannot be changed without other settings. Write into it:\n{lines(values, tracker)}"
+        )
     kept = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
     shutil.copy2(path, kept)
     _replace(path, changed.encode(), path.stat().st_mode)
-    _replace(record_path(path), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+    _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
     return kept
 
 
@@ -96,9 +106,11 @@ def _replace(path: Path, data: bytes, mode: int) -> None:
         raise
 
 
-def recorded(path: Path, settings: Settings) -> CalibrationRecord:
-    """The record of a calibration, with the pose in the settings. Raises CalibrationError."""
-    beside = record_path(path.resolve())
+def recorded(path: Path, settings: Settings, tracker: str = "") -> CalibrationRecord:
+    """The record of a tracker's calibration, with the pose in the settings. Raises
+    CalibrationError.
+    """
+    beside = record_path(path.resolve(), tracker)
     try:
         given = msgspec.json.decode(content(beside, LARGEST_CONFIGURATION))
         record = validated(given, CalibrationRecord)
@@ -109,7 +121,7 @@ def recorded(path: Path, settings: Settings) -> CalibrationRecord:
         ) from None
     except (OSError, UnusableError, msgspec.DecodeError, UnicodeDecodeError, InvalidError) as error:
         raise CalibrationError(f"{beside} cannot be read: {in_words(error, named=False)}") from None
-    pose = settings.hands.base_from_tracker
+    pose = settings.hands_in(tracker).base_from_tracker
     return msgspec.structs.replace(
         record, calibration=msgspec.structs.replace(record.calibration, base_from_tracker=pose)
     )

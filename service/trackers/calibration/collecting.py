@@ -171,8 +171,8 @@ class LiveLed:
         samples = _lately(self._capture.samples[ENDINGS[side]], TOUCH_S)
         if len(samples) < LEAST_TOUCH_SAMPLES:
             raise CalibrationError(f"{len(samples)} samples of {ENDINGS[side]} in {TOUCH_S:g} s: is the hand seen?")
-        at = np.array([channels.POSE.decode(sample.payload).position for sample in samples])
-        at = in_metres(at, self._settings.hands)
+        poses = [channels.POSE.decode(sample.payload) for sample in samples]
+        at = in_metres(np.array([pose.position for pose in poses]), self._settings.hands_in(poses[-1].frame_id))
         moved_m = float(np.ptp(np.sort(at, axis=0)[len(at) // 10 : len(at) - len(at) // 10], axis=0).max())
         if moved_m > MAX_TOUCH_M:
             raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
@@ -192,6 +192,18 @@ def _lately(samples: Sequence[Sample], since_s: float | None) -> Sequence[Sample
         return samples
     since_ns = time.time_ns() - int(1e9 * since_s)
     return [sample for sample in samples if sample.arrived_ns >= since_ns]
+
+
+def tracker_of(hand: Track, settings: Settings) -> str:
+    """The tracker among `[trackers]` whose frame the hand is in; empty: the tracker of `[hands]`,
+    whose frame may be a new one. Raises CalibrationError if that could be either.
+    """
+    if settings.trackers and hand.frame not in settings.tracker_frames:
+        raise CalibrationError(
+            f"{hand.name} is in frame {hand.frame!r}, which has no table in the settings: add [trackers.{hand.frame}], "
+            f"or, if it is that of [hands] (now {settings.hands.frame!r}), set [hands] frame = {hand.frame!r}"
+        )
+    return hand.frame if hand.frame in settings.trackers else ""
 
 
 def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, list[str]]:
@@ -241,7 +253,8 @@ def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
 
 
 def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int) -> SolvedHand:
-    """The calibration by the hand of a side; without one, by the hand that moves with the tool.
+    """The calibration by the hand of a side; without one, by the hand that moves with the tool. It
+    is that of this hand's tracker; the other hand may have another one.
 
     Raises CalibrationError, which names the other hand if that one moves with the tool.
     """
@@ -251,8 +264,9 @@ def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None
         if (track := led.hands.get(one)) is None:
             continue
         try:
-            held, remarks = held_tool(track, led.tool, settings.hands)
-            calibration = solve_held(held, corners, **more)
+            hands = settings.hands_in(tracker_of(track, settings))
+            held, remarks = held_tool(track, led.tool, hands)
+            calibration = solve_held(held, corners, section=settings.tracker_section(track.frame), **more)
         except CalibrationError as error:
             errors[one] = error
         else:

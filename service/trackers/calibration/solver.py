@@ -138,12 +138,13 @@ def bench_corners(settings: Settings) -> Vector:
 
 class _Problem(NamedTuple):
     """Positions of a hand (N, 3) [m], and the function that gives the tool's positions (N, 3) and
-    rotations at a delay [s]. `times_s` (N,) are those of a hand that holds the tool; None: the
-    samples are touches of known points.
+    rotations at a delay [s]. `section` is the tracker's table in the settings. `times_s` (N,) are
+    those of a hand that holds the tool; None: the samples are touches of known points.
     """
 
     hand: Vector
     tool_at: Callable[[float], tuple[Vector, Rotation]]
+    section: str
     times_s: Vector | None = None
 
     @property
@@ -152,10 +153,13 @@ class _Problem(NamedTuple):
         return self.times_s is not None
 
 
-def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SAMPLES) -> Calibration:
+def solve_held(
+    held: HeldTool, corners: Vector, *, section: str = "[hands]", max_samples: int = MAX_FIT_SAMPLES
+) -> Calibration:
     """The calibration from a hand that holds the tool while it is led.
 
-    `corners` (C, 3) are those of the bench [m]. Raises CalibrationError.
+    `corners` (C, 3) are those of the bench [m]; `section` is the table in the settings that an
+    error names. Raises CalibrationError.
     """
     if min(len(held.hand), len(held.tool)) < MIN_SAMPLES:
         raise CalibrationError(
@@ -178,7 +182,7 @@ def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SA
             x, y, z, *quaternion = (np.interp(at_s, held.tool_s, values) for values in poses)
             return np.stack([x, y, z], axis=1), Rotation.from_quat(np.stack(quaternion, axis=1))
 
-        return _Problem(held.hand[rows], tool_at, times_s)
+        return _Problem(held.hand[rows], tool_at, section, times_s)
 
     first = _robust(problem(rows))
     is_near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
@@ -187,20 +191,21 @@ def solve_held(held: HeldTool, corners: Vector, *, max_samples: int = MAX_FIT_SA
     return _refined(found, first, corners, hint)
 
 
-def solve_points(hand: Vector, base: Vector, corners: Vector) -> Calibration:
+def solve_points(hand: Vector, base: Vector, corners: Vector, *, section: str = "[hands]") -> Calibration:
     """The calibration from positions of a hand (N, 3) [m] at known points (N, 3) [m] of frame
-    `base`. `corners` (C, 3) are those of the bench [m]. Raises CalibrationError.
+    `base`. `corners` (C, 3) are those of the bench [m]; `section` is the table in the settings that
+    an error names. Raises CalibrationError.
     """
     if len(hand) < MIN_POINTS:
         raise CalibrationError(f"{len(hand)} points given; {MIN_POINTS} or more needed, 8 recommended")
     upright = Rotation.identity(len(base))
     _check_extent(coverage(base, upright.as_quat()))
-    first = _robust(_Problem(hand, lambda _: (base, upright)))
+    first = _robust(_Problem(hand, lambda _: (base, upright), section))
     near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
     if near.sum() < MIN_POINTS:
         near[:] = True
     hand, base, upright = hand[near], base[near], Rotation.identity(int(near.sum()))
-    return _refined(_Problem(hand, lambda _: (base, upright)), first, corners, "")
+    return _refined(_Problem(hand, lambda _: (base, upright), section), first, corners, "")
 
 
 def _degrees(cover: Coverage) -> str:
@@ -251,7 +256,7 @@ def _robust(problem: _Problem) -> _Fit:
     """The robust rigid map. Raises CalibrationError if there is none, with the likely cause."""
     delay_s, matrix, centre = _affine(problem) if problem.is_held else _similar(problem)
     _check_motion(problem, delay_s, matrix, centre)
-    _check_scale(matrix)
+    _check_scale(matrix, problem.section)
     fit = _rigid(problem, matrix, centre, delay_s)
     if np.linalg.det(matrix) < 0:
         flip = np.array([1.0, 1.0, -1.0])
@@ -260,7 +265,8 @@ def _robust(problem: _Problem) -> _Fit:
             raise CalibrationError(
                 f"the tracker's axes are mirrored (left-handed): the residual is {1e3 * np.median(fit.off):.0f} mm, "
                 f"and {1e3 * np.median(mirrored.off):.0f} mm with one axis reversed. base_from_tracker cannot express "
-                "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change [hands] axes"
+                "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change "
+                f"{problem.section} axes"
             )
     return fit
 
@@ -320,7 +326,7 @@ def _check_motion(problem: _Problem, delay_s: float, matrix: Vector, centre: Vec
         )
 
 
-def _check_scale(matrix: Vector) -> None:
+def _check_scale(matrix: Vector, section: str) -> None:
     """Raise CalibrationError if the tracker's positions are not in metres."""
     scale = max(float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9)  # the widest direction has the least error
     if 1 / MAX_SCALE_ERROR < scale < MAX_SCALE_ERROR:
@@ -330,9 +336,9 @@ def _check_scale(matrix: Vector) -> None:
         unit = ""
     found = f"the hand moves {1 / scale:.3g} times as far as the tool"
     if unit in ("mm", "cm"):
-        raise CalibrationError(f'{found}: the tracker looks to publish {unit}. Set [hands] unit = "{unit}"')
+        raise CalibrationError(f'{found}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"')
     looks = f": the tracker looks to publish {unit}" if unit else ""
-    raise CalibrationError(f"{found}{looks}. Let it publish metres, or correct [hands] unit")
+    raise CalibrationError(f"{found}{looks}. Let it publish metres, or correct {section} unit")
 
 
 def _rigid(problem: _Problem, matrix: Vector, centre: Vector, delay_s: float) -> _Fit:
