@@ -194,8 +194,8 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
-    _check_dates(own)
-    _check_dates(authority)
+    check_dates(own)
+    check_dates(authority)
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
@@ -203,7 +203,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     return {"transport/link/tls": settings}  # replaces any other TLS settings
 
 
-def _check_dates(path: Path) -> None:
+def check_dates(path: Path) -> None:
     """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason.
     Without the package cryptography, which the client alone does not need, nothing is checked.
     """
