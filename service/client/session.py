@@ -103,6 +103,12 @@ def open_session(
     return tried(opened, None if timeout_s is None and not listen else 0.0)
 
 
+def check_open(session: zenoh.Session) -> None:
+    """Raise UnreachableError for a session that was closed."""
+    if session.is_closed():
+        raise UnreachableError("the connection was closed in this program: open a new one")
+
+
 def _refused(endpoints: Sequence[str]) -> bool:
     """True if the system refuses a connection to every endpoint: nothing listens there."""
     for endpoint in endpoints:

@@ -185,7 +185,7 @@ def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch
 
 
 def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hand between the two distances keeps the clutch pressed, but only if it has pinched itself."""
+    """Between the two distances, a hand keeps the clutch pressed only if it has pinched itself."""
     monkeypatch.setattr(browser_hands, "MAX_PINCH_GAP_S", 0.5)
     pressed: list[bool] = []
     pinched, between = 0.01, 0.03  # [m]
@@ -232,8 +232,8 @@ STATUS: dict[str, Any] = {
     **dict.fromkeys(("tick", "rate_hz", "missed", "hand_distance_m", "hand_limit_m_s"), 1),
     **dict.fromkeys(("realtime", "memory_locked"), True),
     **dict.fromkeys(("flags", "places", "endpoints"), ()),
-    **dict.fromkeys(("rejected", "hand_age_ms", "scribe"), {}),
-    **dict.fromkeys(("lateness_us", "work_us", "latency_ms"), {"p50": 0, "p99": 0, "max": 0}),
+    **{name: {} for name in ("rejected", "hand_age_ms", "scribe")},
+    **{name: {"p50": 0, "p99": 0, "max": 0} for name in ("lateness_us", "work_us", "latency_ms")},
 }
 STRANGE: dict[str, bytes] = {  # anybody may publish a status in an open network
     "no JSON": b"\xff" * 100,
