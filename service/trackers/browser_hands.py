@@ -34,7 +34,6 @@ MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
 PAGE_STATUS_S = 0.1  # interval of the status
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
-HOLD = "hold"
 NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
 SILENT = f"This page has sent nothing for {PAGE_SILENCE_S:g} s."
 
@@ -115,7 +114,7 @@ class BrowserHands:
                 if message.data not in ORDERS:
                     return await web_server.close(page, 400, f"Refused: {' or '.join(ORDERS)} needed as text")
                 orders = {name: order for name, order in orders.items() if not order.done()}
-                if not orders or (message.data == HOLD and HOLD not in orders):
+                if not orders or (message.data == "hold" and "hold" not in orders):
                     orders[message.data] = asyncio.create_task(self._order(page, message.data))
             else:
                 return None  # it left, or sent what is no message, for which aiohttp has closed it

@@ -90,7 +90,7 @@ def server_certificate(folder: Path) -> ServerCertificate:
     return ServerCertificate(context, frozenset(host.lower() for host in hosts))
 
 
-class Connection(web.RequestHandler):
+class PageConnection(web.RequestHandler):
     """A connection of a browser. It is closed if what was written to it is not read in time. A
     request that cannot be parsed is answered, and is no error of this program.
     """
@@ -102,8 +102,8 @@ class Connection(web.RequestHandler):
         """Note each byte that waits to be read, not only many of them."""
         super().connection_made(transport)
         assert isinstance(transport, asyncio.Transport)
-        transport.set_write_buffer_limits(high=0)
         self._written_to = transport  # aiohttp forgets its own one before that has been closed
+        transport.set_write_buffer_limits(high=1, low=0)  # by TLS, a limit of 0 would pause for ever
 
     def pause_writing(self) -> None:
         """Something waits to be read."""
@@ -162,7 +162,7 @@ class WebServer:
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
-        self._idle: dict[Connection, None] = {}  # connections on which no request has arrived yet, the oldest first
+        self._idle: dict[web.RequestHandler, None] = {}  # connections on which no request has arrived yet, the oldest first
         self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
         self._application.add_routes(routes)
         self._application.cleanup_ctx.extend(around)
@@ -179,7 +179,7 @@ class WebServer:
         runner = web.AppRunner(self._application, handler_cancellation=True, shutdown_timeout=0.1)
         await runner.setup()
 
-        def connection() -> Connection:
+        def connection() -> PageConnection:
             assert runner.server is not None
             return self._connection(runner.server)
 
@@ -202,19 +202,20 @@ class WebServer:
         """True for the token of this run."""
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
-    def _connection(self, server: web.Server[web.Request]) -> Connection:
+    def _connection(self, server: web.Server) -> PageConnection:
         """A new connection; it is closed if no request arrives in time. If there are too many, the
         one that has sent no request for longest is closed.
         """
         loop = asyncio.get_running_loop()
-        new = Connection(server, loop=loop, access_log=None, keepalive_timeout=FROZEN_S)
+        unlogged: Any = None  # aiohttp's annotation lacks it
+        new = PageConnection(server, loop=loop, access_log=unlogged, keepalive_timeout=FROZEN_S)
         self._idle[new] = None
         if len(server.connections) >= MAX_CONNECTIONS:
             self._close_idle(next(iter(self._idle)))
         loop.call_later(FROZEN_S, self._close_idle, new)
         return new
 
-    def _close_idle(self, connection: Connection) -> None:
+    def _close_idle(self, connection: web.RequestHandler) -> None:
         if connection in self._idle:
             del self._idle[connection]
             connection.force_close()

@@ -195,7 +195,7 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "too large": (lambda cell: cell.hands(left=[10**400, 0, 0]), "left: .* given; x y z"),
     "without end": (lambda cell: cell.hands(left=itertools.count()), "more than 7 numbers"),  # type: ignore[arg-type]
     "many": (lambda cell: cell.hands(left=[0.0] * 100_000), "left: 100000 numbers given; x y z"),
-    "a table": (lambda cell: cell.hands(left=np.eye(3)), "left: array.* given; x y z"),
+    "a table": (lambda cell: cell.hands(left=np.eye(3)), "left: array.* given; x y z"),  # type: ignore[arg-type]
     "seconds": (lambda cell: cell.hands(left=(1, 2, 3), stamp_ns=1.7e9), "stamp_ns: 1700000000.0 given; whole nanos"),  # type: ignore[arg-type]
     "a time in words": (lambda cell: cell.gripper(0.5, stamp_ns="now"), "stamp_ns: 'now' given; whole"),  # type: ignore[arg-type]
     "before 1970": (lambda cell: cell.tool((1, 2, 3), stamp_ns=-1), "stamp_ns: -1 given; whole nanoseconds"),
@@ -225,12 +225,14 @@ def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(listener: zenoh.
         Tracker(cell.session, "bench", timeout_s=10) as tracker,
         Follower(cell.session, ("a", "b"), "bench") as follower,
     ):
-        for position in ((0, 0), (0, 0, 0, 0), "abc", None, 5, [[0, 0, 0]], ("x", "y", "z")):
+        positions: tuple[Any, ...] = ((0, 0), (0, 0, 0, 0), "abc", None, 5, [[0, 0, 0]], ("x", "y", "z"))
+        for position in positions:
             with pytest.raises(ValueError, match="left hand: .* given; a position x y z"):
-                tracker.publish("left", position)  # type: ignore[arg-type]
-        for position, velocity in (([1], [1, 2]), ([1, 2], [1]), ("ab", "cd"), ([1, 2, 3], [1, 2, 3])):
+                tracker.publish("left", position)
+        joints: tuple[Any, ...] = (([1], [1, 2]), ([1, 2], [1]), ("ab", "cd"), ([1, 2, 3], [1, 2, 3]))
+        for position, velocity in joints:
             with pytest.raises(ValueError, match="given; positions and velocities of 2 joints needed"):
-                follower.tell(position, velocity)  # type: ignore[arg-type]
+                follower.tell(position, velocity)
         tracker.publish("left", np.zeros(3), np.array([0, 0, 0, 1.0]), stamp_ns=np.int64(5))  # type: ignore[arg-type]
         follower.tell(np.zeros(2), ())  # type: ignore[arg-type]
 

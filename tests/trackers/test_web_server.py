@@ -274,8 +274,8 @@ def test_strange_statuses_and_replies_leave_pages_their_status_and_an_answer() -
                 is_done, text = carried_out(client, name)
                 assert (is_done, text.startswith(f"{name} was NOT carried out: ")) == (False, True), (reply, text)
         for one in queryables:
-            one.undeclare()
-        session.close()
+            one.undeclare()  # type: ignore[no-untyped-call]
+        session.close()  # type: ignore[no-untyped-call]
         assert carried_out(client, "hold")[0] is False
 
 
