@@ -162,7 +162,7 @@ class WebServer:
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
-        self._idle: dict[web.RequestHandler, None] = {}  # connections on which no request has arrived yet, the oldest first
+        self._idle: dict[web.RequestHandler, None] = {}  # connections without a request yet, the oldest first
         self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
         self._application.add_routes(routes)
         self._application.cleanup_ctx.extend(around)

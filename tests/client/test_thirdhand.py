@@ -227,7 +227,7 @@ def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(listener: zenoh.
     ):
         positions: tuple[Any, ...] = ((0, 0), (0, 0, 0, 0), "abc", None, 5, [[0, 0, 0]], ("x", "y", "z"))
         for position in positions:
-            with pytest.raises(ValueError, match="left hand: .* given; a position x y z"):
+            with pytest.raises(ValueError, match=r"left hand: .* given; a position x y z"):
                 tracker.publish("left", position)
         joints: tuple[Any, ...] = (([1], [1, 2]), ([1, 2], [1]), ("ab", "cd"), ([1, 2, 3], [1, 2, 3]))
         for position, velocity in joints:
