@@ -22,7 +22,14 @@ from service.files.shipped import ARMS, cell_of
 from service.process.progress import say
 from service.settings.config import Settings
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
-from service.trackers.calibration.cell_file import CalibrationRecord, hand_settings, lines, recorded, write
+from service.trackers.calibration.cell_file import (
+    CalibrationRecord,
+    hand_settings,
+    lines,
+    real_path,
+    recorded,
+    write,
+)
 from service.trackers.calibration.collecting import (
     LedTracks,
     LiveLed,
@@ -51,8 +58,10 @@ def calibrate(args: argparse.Namespace) -> int:
     """Calibrate, check, or both. Exit code 0; 1 if the check finds a hand too far away."""
     given = points_given(args)
     file = Path(args.config) if args.config and args.config not in ARMS else None
-    settings = cell_of(args.config) if args.config else None
     only_check = args.check and not (args.held or args.points)
+    if file is not None and not only_check:
+        real_path(file)  # before the arm is led in vain
+    settings = cell_of(args.config) if args.config else None
     if only_check and file is None:
         raise UsageError("--check compares with the last calibration of a cell: give its settings by --config FILE")
     if args.recording is not None:
@@ -229,7 +238,7 @@ def _shower() -> Callable[[str], None]:
 
     def show(line: str) -> None:
         now_s = time.monotonic()
-        if sys.stderr.isatty() or now_s - shown_s[0] >= HINT_S:
+        if (sys.stderr and sys.stderr.isatty()) or now_s - shown_s[0] >= HINT_S:
             shown_s[0] = now_s
             say(line)
 

@@ -8,12 +8,12 @@ import sys
 
 
 class EnterPressed:
-    """A function that is True once for each Enter. Standard input is ignored if it has ended or
-    belongs to another process group; `listens` is False from then on.
+    """A function that is True once for each Enter. Standard input is ignored if it is closed, has
+    ended or belongs to another process group; `listens` is False from then on.
     """
 
     def __init__(self) -> None:
-        self.listens = True
+        self.listens = sys.stdin is not None  # the system may start a program without one
 
     def __call__(self) -> bool:
         try:

@@ -28,7 +28,7 @@ from service.client import Client
 from service.contract.explain import in_words
 from service.contract.incidents import ORDERS
 from service.trackers.cell_view import Latest, carried_out
-from service.trackers.web_server import HTML, INLINE, JSON, Address, WebServer, answer, filled, write
+from service.trackers.web_server import HTML, INLINE, JSON, Address, WebServer, answer, filled
 
 STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which viewers request the stream
 PIECE = 64 * 1024  # bytes of a file that are passed on at once
@@ -166,7 +166,7 @@ class LivePage:
                         begun.headers[name] = value
                 await begun.prepare(request)
                 async for piece in pieces(reply):
-                    await write(begun, piece)
+                    await begun.write(piece)
         except (aiohttp.ClientError, OSError) as error:  # a TimeoutError too
             if not begun.prepared:
                 return answer(502, f"{to} does not answer: {in_words(error, named=False)}")

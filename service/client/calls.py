@@ -10,7 +10,7 @@ import zenoh
 
 from service.client.presence import living, why_silent
 from service.client.replies import decoded
-from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, tried
+from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, check_open, tried
 from service.contract import channels, requests
 from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
@@ -97,6 +97,7 @@ class Client:
             raise RefusedError(f"the answer on {self._key(suffix)} is {error}") from None
 
     def _answer(self, suffix: str, request: Any) -> bytes:
+        check_open(self._session)
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")

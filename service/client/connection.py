@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import reprlib
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ import zenoh
 
 from service.client.calls import Client
 from service.client.client_settings import client_settings
-from service.client.streams import UNTURNED, Watch, publisher, wait_until_heard
+from service.client.session import check_open
+from service.client.streams import UNTURNED, Watch, checked_frame, checked_stamp, publisher, wait_until_heard
 from service.contract import cdr, markers
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
 from service.contract.requests import NORM_TOLERANCE, Reply, ViaPoint
@@ -78,10 +81,12 @@ class Connection(Client, AbstractContextManager["Connection"]):
         poses = {f"hands/{side}": _pose(side, pose) for side, pose in given.items() if pose is not None}
         if not poses:
             raise ValueError("no hand given; left, right or both needed")
+        checked_frame(frame_id)
         self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
 
     def tool(self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE) -> None:
         """Publish the measured pose of the tool, for demonstrations."""
+        checked_frame(frame_id)
         self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
 
     def gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
@@ -104,7 +109,10 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
         """Publish all objects on the bench, for viewers and recordings."""
-        scene = tuple(objects)
+        try:
+            scene = tuple(objects)
+        except TypeError:
+            raise ValueError(f"objects: {reprlib.repr(objects)} given; SceneObjects needed") from None
         for one in scene:
             if not isinstance(one, SceneObject):
                 raise ValueError(f"object {one!r} given; a SceneObject needed")
@@ -148,6 +156,9 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Publish messages that are encoded for a stamp [ns]; None: the time when all of them are
         heard. With a time before that wait, later samples would seem to arrive too early.
         """
+        if stamp_ns is not None:
+            stamp_ns = checked_stamp(stamp_ns)
+        check_open(self._session)
         publishers = [self._heard(suffix) for suffix in messages]
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
         for one, encode in zip(publishers, messages.values(), strict=True):
@@ -191,11 +202,18 @@ def _position(what: str, given: Sequence[float]) -> Vector3:
 def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
     """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
     try:
-        numbers = tuple(float(value) for value in given)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what}: {given!r} given; {FORMS[counts[-1]]} needed") from None
+        if isinstance(given, str | bytes | bytearray | Mapping | Set):  # their members are in no order, or no numbers
+            raise TypeError
+        values = tuple(itertools.islice(given, counts[-1] + 1))
+        if any(isinstance(value, str | bytes) for value in values):
+            raise TypeError
+        numbers = tuple(map(float, values))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; {FORMS[counts[-1]]} needed") from None
     if len(numbers) not in counts:
-        raise ValueError(f"{what}: {len(numbers)} numbers given; {FORMS[counts[-1]]} needed")
+        most = f"more than {counts[-1]}" if len(numbers) > counts[-1] else len(numbers)
+        count = len(given) if hasattr(given, "__len__") else most
+        raise ValueError(f"{what}: {count} numbers given; {FORMS[counts[-1]]} needed")
     if not finite(numbers):
         raise ValueError(f"{what}: {list(numbers)} given; finite numbers needed")
     return numbers

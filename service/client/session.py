@@ -103,6 +103,12 @@ def open_session(
     return tried(opened, None if timeout_s is None and not listen else 0.0)
 
 
+def check_open(session: zenoh.Session) -> None:
+    """Raise UnreachableError for a session that was closed."""
+    if session.is_closed():
+        raise UnreachableError("the connection was closed in this program: open a new one")
+
+
 def _refused(endpoints: Sequence[str]) -> bool:
     """True if the system refuses a connection to every endpoint: nothing listens there."""
     for endpoint in endpoints:
@@ -194,8 +200,8 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
-    _check_dates(own)
-    _check_dates(authority)
+    check_dates(own)
+    check_dates(authority)
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
@@ -203,7 +209,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     return {"transport/link/tls": settings}  # replaces any other TLS settings
 
 
-def _check_dates(path: Path) -> None:
+def check_dates(path: Path) -> None:
     """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason.
     Without the package cryptography, which the client alone does not need, nothing is checked.
     """

@@ -6,6 +6,9 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
+import reprlib
+import struct
 import threading
 import time
 from collections import deque
@@ -16,7 +19,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from service.client.replies import decoded
-from service.client.session import UnreachableError, tried
+from service.client.session import UnreachableError, check_open, tried
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from service.contract.records import SIDES
@@ -28,6 +31,8 @@ MAX_QUEUED = 256  # received messages, half a second of commands at 500 Hz
 CTRL_C_S = 0.5  # a wait is interrupted this often, since on Windows Ctrl-C does not end one
 WATCHABLE = tuple(channel.key for channel in channels.CHANNELS if channel.direction in ("in", "out"))
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
+MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
+MAX_FRAME_LETTERS = 64
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -42,7 +47,10 @@ def no_room_to_brake(tick_s: float) -> str:
 
 
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
-    """A publisher on one channel of a cell; messages that cannot be sent at once are dropped."""
+    """A publisher on one channel of a cell; messages that cannot be sent at once are dropped.
+    Raises UnreachableError if the session was closed.
+    """
+    check_open(session)
     return session.declare_publisher(
         channels.key(cell, suffix),
         encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
@@ -70,6 +78,25 @@ def _unheard(publishers: Iterable[zenoh.Publisher]) -> list[str]:
     return [str(one.key_expr) for one in publishers if not one.matching_status.matching]  # type: ignore[attr-defined]
 
 
+def checked_stamp(stamp_ns: Any) -> int:
+    """A stamp [ns since 1970] that a message can carry. Raises ValueError."""
+    try:
+        found = operator.index(stamp_ns)
+    except TypeError:
+        found = -1
+    if not 0 <= found < MAX_STAMP_NS:
+        needed = "whole nanoseconds since 1970 needed, like time.time_ns()"
+        raise ValueError(f"stamp_ns: {reprlib.repr(stamp_ns)} given; {needed}")
+    return found
+
+
+def checked_frame(frame_id: Any) -> None:
+    """Raise ValueError for what is no name of a frame."""
+    if not isinstance(frame_id, str) or len(frame_id) > MAX_FRAME_LETTERS or not frame_id.isprintable():
+        needed = f"a name of up to {MAX_FRAME_LETTERS} printable letters needed, or an empty one"
+        raise ValueError(f"frame_id: {reprlib.repr(frame_id)} given; {needed}")
+
+
 class Tracker(AbstractContextManager["Tracker"]):
     """A publisher of a cell's hand poses; a context.
 
@@ -78,6 +105,7 @@ class Tracker(AbstractContextManager["Tracker"]):
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
+        self._session = session
         self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
         try:
             wait_until_heard(*self._publishers.values(), timeout_s=timeout_s)
@@ -97,12 +125,24 @@ class Tracker(AbstractContextManager["Tracker"]):
         """Publish the pose of one hand, `left` or `right`: position [m], quaternion x y z w.
 
         `stamp_ns` is the time of measurement [ns since 1970]; None: now. Stamps of a hand must
-        increase. Raises ValueError for another hand.
+        increase. Raises ValueError for another hand, and for what cannot be encoded; values are not
+        checked here, but by the daemon.
         """
         if side not in self._publishers:
             raise ValueError(f"hand {side!r} given; {' or '.join(SIDES)} accepted")
-        pose = PoseStamped(time.time_ns() if stamp_ns is None else stamp_ns, frame_id, position, orientation)
-        self._publishers[side].put(cdr.encode_pose(pose))
+        check_open(self._session)
+        checked_frame(frame_id)
+        pose = PoseStamped(
+            time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns), frame_id, position, orientation
+        )
+        try:
+            message = cdr.encode_pose(pose)
+        except (struct.error, TypeError, OverflowError):
+            raise ValueError(
+                f"{side} hand: {reprlib.repr(position)} and {reprlib.repr(orientation)} given; a position x y z [m] "
+                "and a quaternion x y z w needed"
+            ) from None
+        self._publishers[side].put(message)
 
     def heard(self) -> bool:
         """True if both hands have a subscriber."""
@@ -122,13 +162,17 @@ class _Received(AbstractContextManager[Any]):
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
         self.rejected, self.reason = 0, ""
-        self._came = threading.Condition()
+        self._came, self._is_closed = threading.Condition(), False
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
+        check_open(session)
         self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
 
     def close(self) -> None:
         """End the subscription."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        with self._came:
+            self._is_closed = True
+            self._came.notify_all()
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
         """The value of a message. Raises ValueError."""
@@ -155,7 +199,8 @@ class Watch(_Received, Iterator[Any]):
     `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
     of SceneObject, `clutch` a bool, `gripper/wish` a closure from 0 to 1, and `status` a Status.
 
-    It waits for the next message. After `timeout_s` [s] without one it yields None; None: never.
+    It waits for the next message. After `timeout_s` [s] without one it yields None; None: never. It
+    ends once it, or its connection, is closed.
     A slow loop gets the newest 256 messages. Messages that cannot be decoded are skipped:
     `rejected` counts them, and `reason` is the cause of the last one. Raises ValueError for a
     channel that carries no messages.
@@ -166,13 +211,15 @@ class Watch(_Received, Iterator[Any]):
             raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
         decode = channels.BY_KEY[suffix].codec.decode
         self._decode = functools.partial(decoded, kind=Status) if suffix == "status" else decode
-        self._timeout_s = timeout_s
+        self._timeout_s, self._session = timeout_s, session
         super().__init__(session, cell, suffix)
 
     def __next__(self) -> Any:
         end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
         with self._came:
             while not self._queue:
+                if self._is_closed or self._session.is_closed():
+                    raise StopIteration
                 if (left_s := end_s - time.monotonic()) <= 0:
                     return None
                 self._came.wait(min(left_s, CTRL_C_S))
@@ -206,7 +253,7 @@ class Follower(_Received):
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
-        self._names = tuple(names)
+        self._names, self._session = tuple(names), session
         self._state = publisher(session, cell, "joints/state", express=True)
         super().__init__(session, cell, "joints/command")
 
@@ -227,9 +274,22 @@ class Follower(_Received):
         return commands
 
     def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
-        """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now."""
-        now_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        self._state.put(cdr.encode_joints(JointState(now_ns, self._names, tuple(position), tuple(velocity))))
+        """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now. Raises
+        ValueError for what is not one number a joint, or none as velocities.
+        """
+        check_open(self._session)
+        now_ns = time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns)
+        state = JointState(now_ns, self._names, tuple(position), tuple(velocity))
+        try:
+            if len(state.position) != len(self._names) or len(state.velocity) not in (0, len(self._names)):
+                raise TypeError
+            message = cdr.encode_joints(state)
+        except (struct.error, TypeError, OverflowError):
+            raise ValueError(
+                f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and velocities of "
+                f"{len(self._names)} joints needed"
+            ) from None
+        self._state.put(message)
 
     def close(self) -> None:
         """End the subscription and the publisher."""

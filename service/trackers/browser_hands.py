@@ -14,6 +14,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from aiohttp import WSMsgType, web
 
@@ -26,10 +27,10 @@ from service.trackers.hand_message import PageHands, decode_hands, is_ping, pong
 from service.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
-MAX_PAGE_MESSAGE_BYTES = 256
 PAGE_SILENCE_S = 10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
 MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
+MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
 PAGE_STATUS_S = 0.1  # interval of the status
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
@@ -61,6 +62,8 @@ class BrowserHands:
         self._owned_s = 0.0
         self.published = self.lost = self.delayed = 0  # messages of hands: published, missing between others, dropped
         self._number: int | None = None
+        # each page may wait for two orders; the hold of one must not wait for those of others
+        self._ordering = ThreadPoolExecutor(2 * MAX_PAGES, thread_name_prefix="order")
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
         """Serve a page until it leaves, or is refused."""
@@ -68,25 +71,29 @@ class BrowserHands:
             return await web_server.refused(request, 403, NO_TOKEN)
         if len(self._pages) >= MAX_PAGES:
             return await web_server.refused(request, 429, FULL)
-        page = web.WebSocketResponse(max_msg_size=MAX_PAGE_MESSAGE_BYTES, compress=False, timeout=1.0)
+        page = web_server.page_socket()
         if not page.can_prepare(request).ok:
             return web_server.answer(426, "A websocket is needed here.")
         self._pages.add(page)
-        orders: set[asyncio.Task[None]] = set()
         try:
             await page.prepare(request)
-            telling = asyncio.create_task(self._tell(page, request.transport))
+            telling = asyncio.create_task(self._tell(page))
             try:
-                await self._receive(page, orders)
+                await self._receive(page)
             finally:
                 telling.cancel()
         finally:
             self._pages.discard(page)
             if self._owner is page:
                 self._owner = None
+                self._release()
         return page
 
-    async def _receive(self, page: web.WebSocketResponse, orders: set[asyncio.Task[None]]) -> None:
+    async def _receive(self, page: web.WebSocketResponse) -> None:
+        """Take in messages until the page leaves. While an order waits for its answer, others are
+        ignored, except for a hold.
+        """
+        orders: dict[str, asyncio.Task[None]] = {}
         while True:
             try:
                 message = await page.receive(PAGE_SILENCE_S)
@@ -106,9 +113,9 @@ class BrowserHands:
             elif message.type == WSMsgType.TEXT:
                 if message.data not in ORDERS:
                     return await web_server.close(page, 400, f"Refused: {' or '.join(ORDERS)} needed as text")
-                if not orders:  # a page waits for the answer to its last order
-                    orders.add(order := asyncio.create_task(self._order(page, message.data)))
-                    order.add_done_callback(orders.discard)
+                orders = {name: order for name, order in orders.items() if not order.done()}
+                if not orders or (message.data == "hold" and "hold" not in orders):
+                    orders[message.data] = asyncio.create_task(self._order(page, message.data))
             else:
                 return None  # it left, or sent what is no message, for which aiohttp has closed it
 
@@ -119,8 +126,11 @@ class BrowserHands:
             if self._owner is not None and now_s - self._owned_s < OWNER_S:
                 return False
             self._owner, self._number = page, None
+            self._release()
         if self._number is not None:
             self.lost += (hands.number - self._number - 1) & 0xFFFF
+        if now_s - self._owned_s > MAX_PINCH_GAP_S:
+            self._release()
         self._number, self._owned_s = hands.number, now_s
         if time.time_ns() - hands.stamp_ns > 1e9 * MAX_HELD_UP_S:
             self.delayed += 1
@@ -135,22 +145,21 @@ class BrowserHands:
         self.published += 1
         return True
 
-    async def _tell(self, page: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
+    def _release(self) -> None:
+        """End a pinch: one of another page, or from before a pause, presses no clutch."""
+        if self._pinches is not None:
+            self._pinches.release()
+
+    async def _tell(self, page: web.WebSocketResponse) -> None:
         """Send the status until the page leaves. A page that does not read it is disconnected."""
         with contextlib.suppress(ConnectionError):
             while True:
-                status = json.dumps({"status": self._latest.summary(), "objects": self._latest.objects()})
-                try:
-                    async with asyncio.timeout(web_server.FROZEN_S):
-                        await page.send_str(status)
-                except TimeoutError:
-                    if transport is not None:
-                        transport.abort()
-                    return
+                await page.send_str(json.dumps({"status": self._latest.summary(), "objects": self._latest.objects()}))
                 await asyncio.sleep(PAGE_STATUS_S)
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
         """Carry out an order, even if the page disconnects meanwhile."""
-        is_done, text = await asyncio.to_thread(carried_out, self._client, order)
+        loop = asyncio.get_running_loop()
+        is_done, text = await loop.run_in_executor(self._ordering, carried_out, self._client, order)
         with contextlib.suppress(ConnectionError):
             await page.send_str(json.dumps({"answer": text, "done": is_done}))

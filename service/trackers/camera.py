@@ -99,10 +99,15 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
     video file; ends with the file. Raises CameraError.
     """
     cv2 = _module("cv2")
-    device = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    device = cv2.VideoCapture()
     try:
-        if not device.isOpened():
-            raise CameraError(f"no camera {source} can be opened; the number of a camera that no program uses needed")
+        is_open = False
+        with contextlib.suppress(cv2.error, ValueError):  # of a number or a name that it cannot pass on
+            is_open = device.open(int(source) if source.isdecimal() else source)
+        if not is_open:
+            raise CameraError(
+                f"no camera {source} can be opened; the number of a camera that no program uses needed, or a video file"
+            )
         device.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not one that waited
         any_read = False
         while (read := device.read())[0]:

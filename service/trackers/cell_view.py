@@ -15,9 +15,10 @@ from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.incidents import ORDERS, in_brief, title
 from service.contract.messages import BASE, SceneObject, WireError
-from service.contract.requests import Status
+from service.contract.requests import Reply, Status
 from service.trackers.web_server import Address
 
+MAX_STATUS_BYTES = 262_144  # a daemon's has 3 to 10 kB, and more with many via-points
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 SHOWN_FIELDS = (
     *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief"),
@@ -37,6 +38,8 @@ class Latest:
         ]
 
     def _take(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_STATUS_BYTES:
+            return
         with contextlib.suppress(RefusedError):
             self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
 
@@ -55,8 +58,11 @@ class Latest:
     def stream(self) -> Address:
         """The server of the live view; it changes when the scribe is started again."""
         live = self._status.scribe.get("live") if self._status else None
-        parts = urlsplit(str(live or "").removeprefix("rerun+"))
-        return Address(parts.hostname or "127.0.0.1", parts.port or 0)
+        try:
+            parts = urlsplit(str(live or "").removeprefix("rerun+"))
+            return Address(parts.hostname or "127.0.0.1", parts.port or 0)
+        except ValueError:  # any program on the network may publish a status
+            return Address("127.0.0.1", 0)
 
     def summary(self) -> dict[str, Any]:
         """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
@@ -81,9 +87,9 @@ class Latest:
 def carried_out(client: Client, order: str) -> tuple[bool, str]:
     """True if the daemon carried out hold, resume or reset, and its answer in words."""
     try:
-        reply = client.ask(order)
+        reply: Reply = getattr(client, order)()
     except ExplainedError as error:
         return False, f"{order} was NOT carried out: {error}"
-    now = in_brief(reply.get("mode", ""), reply.get("reason", "")).replace("_", " ")
-    note = f"; {reply['note']}" if reply.get("note") else ""
-    return True, f"{order} carried out at tick {reply['tick']}; mode then: {now}{note}"
+    now = in_brief(reply.mode, reply.reason).replace("_", " ")
+    note = f"; {reply.note}" if reply.note else ""
+    return True, f"{order} carried out at tick {reply.tick}; mode then: {now}{note}"

@@ -91,6 +91,8 @@ def decode_hands(data: bytes, now_ns: int) -> PageHands:
 def _hand(side: str, values: list[float]) -> PageHand:
     if not finite(tuple(values[:11])):
         raise WireError(f"{side} hand: a number that is not finite")
+    if values[10] < 0.0:
+        raise WireError(f"{side} hand: a distance of {values[10]:g} m, 0 or more accepted")
     x, y, z, w = values[3:7]
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if abs(norm - 1.0) > UNIT_TOLERANCE:

@@ -29,6 +29,12 @@ class Pinches:
             if side is not None
         }
 
+    def release(self) -> None:
+        """End a pinch, and publish that the clutch is released if it was pressed."""
+        if self._is_pressed:
+            self._is_pressed = False
+            self._publishers["clutch"].put(cdr.encode_bool(False))
+
     def publish(self, distances_m: Mapping[str, float], stamp_ns: int) -> None:
         """Publish by the distances [m] of thumb and index tip of the hands that are seen, by side.
         A hand that is not seen does not press the clutch, and leaves the gripper as it is.

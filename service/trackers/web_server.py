@@ -2,14 +2,14 @@
 
 It answers requests from its own pages only: `Host` must name this machine, and `Origin`, where a
 browser sends it, must be the same host and port. What changes something also needs the token of
-the server. Bodies are short, connections without a request are closed, every answer has the headers
-that keep a browser from fetching anything elsewhere, and every refusal says why.
+the server. Bodies are short; connections without a request, and those on which nothing is read, are
+closed, and there are not many at once. Every answer has the headers that keep a browser from
+fetching anything elsewhere, and every refusal says why.
 """
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import hmac
 import ipaddress
 import re
@@ -23,9 +23,11 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 from cryptography import x509
 
-from service.client import CERTIFICATE, KEY
+from service.client import CERTIFICATE, KEY, UnreachableError
+from service.client.session import check_dates
 from service.contract.explain import ExplainedError, in_words
 
 HTML = "text/html; charset=utf-8"
@@ -33,7 +35,10 @@ JSON = "application/json"
 INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 MAX_BODY_BYTES = 4096  # of a request
 FROZEN_S = 30.0  # a browser that sends no request, or reads no answer, for this long is disconnected
+MAX_CONNECTIONS = 256  # at once: some for each page; a process may often open 1024 files
+UNREADABLE = "This is no request by HTTP"
 FOREIGN = "This page answers at this machine's own address only, and only to itself."
+MAX_PAGE_MESSAGE_BYTES = 256  # of a websocket
 CLOSE_CODE = 4000  # a websocket is refused with this close code plus the status of HTTP
 MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, section 5.5
 
@@ -56,7 +61,7 @@ class ServerCertificate(NamedTuple):
 
 
 def server_certificate(folder: Path) -> ServerCertificate:
-    """The certificate and key in a folder. Raises ExplainedError."""
+    """The certificate and key in a folder. Raises ExplainedError, also for one that has expired."""
     certificate, key = folder / CERTIFICATE, folder / KEY
 
     def locked() -> str:
@@ -74,11 +79,67 @@ def server_certificate(folder: Path) -> ServerCertificate:
             "PEM needed, as in the folder `headset` that `thirdhand certificates` makes"
         ) from None
     try:
+        check_dates(certificate)
+    except UnreachableError as error:
+        raise ExplainedError(f"cannot serve with it: {error}") from None
+    try:
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         raise ExplainedError(f"{certificate} names no host: a certificate for this machine's address needed") from None
     hosts = [*names.get_values_for_type(x509.DNSName), *map(str, names.get_values_for_type(x509.IPAddress))]
     return ServerCertificate(context, frozenset(host.lower() for host in hosts))
+
+
+class PageConnection(web.RequestHandler):
+    """A connection of a browser. It is closed if what was written to it is not read in time. A
+    request that cannot be parsed is answered, and is no error of this program.
+    """
+
+    transport: asyncio.Transport | None
+    _unread: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Note each byte that waits to be read, not only many of them."""
+        super().connection_made(transport)
+        assert isinstance(transport, asyncio.Transport)
+        self._written_to = transport  # aiohttp forgets its own one before that has been closed
+        transport.set_write_buffer_limits(high=1, low=0)  # by TLS, a limit of 0 would pause for ever
+
+    def pause_writing(self) -> None:
+        """Something waits to be read."""
+        super().pause_writing()
+        self._unread = asyncio.get_running_loop().call_later(FROZEN_S, self._written_to.abort)
+
+    def resume_writing(self) -> None:
+        """All has been read."""
+        super().resume_writing()
+        self._end_timer()
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        """The connection has ended."""
+        self._end_timer()
+        super().connection_lost(exc)
+
+    def _end_timer(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
+            self._unread = None
+
+    def log_exception(self, *args: Any, exc_info: Any = None, **more: Any) -> None:
+        """Log an error of this program, but none of a request."""
+        if not isinstance(exc_info, HttpProcessingError | web.RequestPayloadError):
+            super().log_exception(*args, exc_info=exc_info, **more)
+
+    def handle_error(
+        self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
+    ) -> web.StreamResponse:
+        """The answer to a request that cannot be parsed, or in which this program failed."""
+        found = super().handle_error(request, status, exc, message)
+        if not isinstance(exc, HttpProcessingError):
+            return found
+        response = answer(status, f"{UNREADABLE}: {(message or type(exc).__name__).splitlines()[0].rstrip(':')}")
+        response.force_close()
+        return response
 
 
 class WebServer:
@@ -101,7 +162,7 @@ class WebServer:
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
-        self._idle: set[web.RequestHandler] = set()  # connections on which no request has arrived yet
+        self._idle: dict[web.RequestHandler, None] = {}  # connections without a request yet, the oldest first
         self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
         self._application.add_routes(routes)
         self._application.cleanup_ctx.extend(around)
@@ -115,18 +176,17 @@ class WebServer:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, lambda *_: self.end())
-        runner = web.AppRunner(
-            self._application,
-            access_log=None,
-            handler_cancellation=True,
-            keepalive_timeout=FROZEN_S,
-            shutdown_timeout=0.1,
-        )
+        runner = web.AppRunner(self._application, handler_cancellation=True, shutdown_timeout=0.1)
         await runner.setup()
+
+        def connection() -> PageConnection:
+            assert runner.server is not None
+            return self._connection(runner.server)
+
         self._host, server, tls = listen.host, None, self._certificate
         try:
             server = await loop.create_server(
-                functools.partial(self._connection, runner),
+                connection,
                 *listen,
                 ssl=tls.context if tls else None,
                 ssl_handshake_timeout=FROZEN_S if tls else None,
@@ -142,22 +202,27 @@ class WebServer:
         """True for the token of this run."""
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
-    def _connection(self, runner: web.AppRunner) -> web.RequestHandler:
-        """A new connection; it is closed if no request arrives in time."""
-        assert runner.server is not None
-        connection = runner.server()
-        self._idle.add(connection)
-        asyncio.get_running_loop().call_later(FROZEN_S, self._close_idle, connection)
-        return connection
+    def _connection(self, server: web.Server) -> PageConnection:
+        """A new connection; it is closed if no request arrives in time. If there are too many, the
+        one that has sent no request for longest is closed.
+        """
+        loop = asyncio.get_running_loop()
+        unlogged: Any = None  # aiohttp's annotation lacks it
+        new = PageConnection(server, loop=loop, access_log=unlogged, keepalive_timeout=FROZEN_S)
+        self._idle[new] = None
+        if len(server.connections) >= MAX_CONNECTIONS:
+            self._close_idle(next(iter(self._idle)))
+        loop.call_later(FROZEN_S, self._close_idle, new)
+        return new
 
     def _close_idle(self, connection: web.RequestHandler) -> None:
         if connection in self._idle:
-            self._idle.remove(connection)
+            del self._idle[connection]
             connection.force_close()
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
-        self._idle.discard(request.protocol)
+        self._idle.pop(request.protocol, None)
         if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
             return await refused(request, 403, FOREIGN)
         try:
@@ -167,6 +232,8 @@ class WebServer:
             return await refused(request, 408, f"The request was not complete within {FROZEN_S:g} s.")
         except web.HTTPRequestEntityTooLarge:
             return await refused(request, 413, f"A body of at most {MAX_BODY_BYTES} bytes is accepted.")
+        except web.RequestPayloadError:
+            return await refused(request, 400, f"{UNREADABLE}: its body cannot be decoded.")
         try:
             response: web.StreamResponse = await handler(request)
         except web.HTTPException as error:
@@ -203,13 +270,20 @@ def answer(
     return web.Response(status=status, body=text.encode(errors="replace"), headers=headers)
 
 
+def page_socket() -> web.WebSocketResponse:
+    """A websocket of a page. Messages of more bytes than a page sends close it."""
+    return web.WebSocketResponse(max_msg_size=MAX_PAGE_MESSAGE_BYTES, compress=False, timeout=1.0)
+
+
 async def refused(request: web.Request, status: int, reason: str) -> web.StreamResponse:
     """The refusal of a request. A websocket is opened and closed with CLOSE_CODE + `status`: a page
     cannot read the answer to a handshake that fails.
     """
-    socket = web.WebSocketResponse()
+    socket = page_socket()
     if not socket.can_prepare(request).ok:
-        return answer(status, reason)
+        response = answer(status, reason)
+        response.force_close()
+        return response
     await socket.prepare(request)
     await close(socket, status, reason)
     return socket
@@ -219,12 +293,6 @@ async def close(socket: web.WebSocketResponse, status: int, reason: str) -> None
     """Close a websocket with CLOSE_CODE + `status` and a reason, which may be cut at its end."""
     message = reason.encode()[:MAX_CLOSE_REASON_BYTES].decode(errors="ignore").encode()
     await socket.close(code=CLOSE_CODE + status, message=message)
-
-
-async def write(response: web.StreamResponse, piece: bytes) -> None:
-    """Write a piece of an answer. Raises TimeoutError for a browser that does not read it."""
-    async with asyncio.timeout(FROZEN_S):
-        await response.write(piece)
 
 
 def filled(path: Path, /, **fields: str) -> str:

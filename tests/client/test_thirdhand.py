@@ -13,10 +13,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 
-from service.client import Connection, SceneObject, UnreachableError, Watch, endpoints, open_session, publisher
+from service.client import (
+    Connection,
+    Follower,
+    SceneObject,
+    Tracker,
+    UnreachableError,
+    Watch,
+    connect,
+    endpoints,
+    open_session,
+    publisher,
+)
 from service.client.streams import wait_until_heard
 from service.contract import channels
 from service.contract.messages import JointState, PoseStamped
@@ -175,6 +187,24 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "no object": (lambda cell: cell.objects([("a", "box")]), "a SceneObject needed"),  # type: ignore[list-item]
     "a channel": (lambda cell: cell.watch("tool/targets"), "channel 'tool/targets' given; one of hands/left, .*status"),
     "a request": (lambda cell: cell.watch("hold"), "channel 'hold' given"),
+    "digits": (lambda cell: cell.hands(left="123"), "left: '123' given; x y z"),  # type: ignore[arg-type]
+    "texts of digits": (lambda cell: cell.hands(left=["1", "2", "3"]), "left: .* given; x y z"),  # type: ignore[list-item]
+    "bytes": (lambda cell: cell.tool(b"123"), "tool: b'123' given; x y z"),
+    "without order": (lambda cell: cell.hands(left={1.0, 2.0, 3.0}), "left: .* given; x y z"),  # type: ignore[arg-type]
+    "by name": (lambda cell: cell.hands(left={1: 1, 2: 2, 3: 3}), "left: .* given; x y z"),  # type: ignore[arg-type]
+    "too large": (lambda cell: cell.hands(left=[10**400, 0, 0]), "left: .* given; x y z"),
+    "without end": (lambda cell: cell.hands(left=itertools.count()), "more than 7 numbers"),  # type: ignore[arg-type]
+    "many": (lambda cell: cell.hands(left=[0.0] * 100_000), "left: 100000 numbers given; x y z"),
+    "a table": (lambda cell: cell.hands(left=np.eye(3)), "left: array.* given; x y z"),  # type: ignore[arg-type]
+    "seconds": (lambda cell: cell.hands(left=(1, 2, 3), stamp_ns=1.7e9), "stamp_ns: 1700000000.0 given; whole nanos"),  # type: ignore[arg-type]
+    "a time in words": (lambda cell: cell.gripper(0.5, stamp_ns="now"), "stamp_ns: 'now' given; whole"),  # type: ignore[arg-type]
+    "before 1970": (lambda cell: cell.tool((1, 2, 3), stamp_ns=-1), "stamp_ns: -1 given; whole nanoseconds"),
+    "after 2038": (lambda cell: cell.tool((1, 2, 3), stamp_ns=2**62), "stamp_ns: .* given; whole nanoseconds"),
+    "a frame by number": (lambda cell: cell.hands(left=(1, 2, 3), frame_id=5), "frame_id: 5 given; a name"),  # type: ignore[arg-type]
+    "a frame with an end": (lambda cell: cell.tool((1, 2, 3), frame_id="a\0b"), "frame_id: .* given; a name"),
+    "half a letter": (lambda cell: cell.hands(left=(1, 2, 3), frame_id="\ud800"), "frame_id: .* given; a name"),
+    "a long frame": (lambda cell: cell.hands(left=(1, 2, 3), frame_id="a" * 65), "frame_id: .* up to 64 printable"),
+    "objects that are none": (lambda cell: cell.objects(None), "objects: None given; SceneObjects needed"),  # type: ignore[arg-type]
     "a place": (lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)), "left: 2 numbers given; x"),
 }  # fmt: skip
 
@@ -186,6 +216,61 @@ def test_a_wrong_value_is_refused_before_anything_is_sent(
     """At once: nobody listens, for which a valid call would wait."""
     with pytest.raises(ValueError, match=error):
         call(cell)
+
+
+def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(listener: zenoh.Session, cell: Connection) -> None:
+    with (
+        Watch(listener, "bench", "hands/left"),
+        Watch(listener, "bench", "hands/right"),
+        Tracker(cell.session, "bench", timeout_s=10) as tracker,
+        Follower(cell.session, ("a", "b"), "bench") as follower,
+    ):
+        positions: tuple[Any, ...] = ((0, 0), (0, 0, 0, 0), "abc", None, 5, [[0, 0, 0]], ("x", "y", "z"))
+        for position in positions:
+            with pytest.raises(ValueError, match=r"left hand: .* given; a position x y z"):
+                tracker.publish("left", position)
+        joints: tuple[Any, ...] = (([1], [1, 2]), ([1, 2], [1]), ("ab", "cd"), ([1, 2, 3], [1, 2, 3]))
+        for position, velocity in joints:
+            with pytest.raises(ValueError, match="given; positions and velocities of 2 joints needed"):
+                follower.tell(position, velocity)
+        tracker.publish("left", np.zeros(3), np.array([0, 0, 0, 1.0]), stamp_ns=np.int64(5))  # type: ignore[arg-type]
+        follower.tell(np.zeros(2), ())  # type: ignore[arg-type]
+
+
+def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Session) -> None:
+    with (
+        Watch(listener, "bench", "hands/left"),
+        Watch(listener, "bench", "hands/right"),
+        connect(endpoints(listener)[0], cell="bench") as cell,
+    ):
+        cell.hands(left=(0, 0, 0))
+        tracker, follower = Tracker(cell.session, "bench", timeout_s=10), Follower(cell.session, ("a",), "bench")
+        seen: list[list[Any]] = []
+        watches = [cell.watch("tool/target"), cell.watch("status", timeout_s=60)]
+        loops = [threading.Thread(target=lambda one=one: seen.append(list(one)), daemon=True) for one in watches]
+        for loop in loops:
+            loop.start()
+        alone = cell.watch("tool/pose")
+        alone.close()
+        assert list(alone) == []
+        cell.close()
+        for loop in loops:
+            loop.join(10)
+        assert seen == [[], []]
+        calls: tuple[Callable[[], object], ...] = (
+            lambda: cell.hands(left=(0, 0, 0)),
+            lambda: cell.tool((0, 0, 0)),
+            lambda: cell.clutch(True),
+            cell.hold,
+            cell.status,
+            cell.places,
+            lambda: cell.watch("status"),
+            lambda: tracker.publish("left", (0, 0, 0)),
+            lambda: follower.tell([0.0], [0.0]),
+        )
+        for call in calls:
+            with pytest.raises(UnreachableError, match="the connection was closed in this program: open a new one"):
+                call()
 
 
 def test_what_nobody_hears_is_refused(cell: Connection, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,10 @@ command over Zenoh, whose settings a daemon then maps with.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
+import os
+import re
 import subprocess
 import sys
 import threading
@@ -28,6 +31,7 @@ from service.files.mcap_file import whole_file
 from service.files.shipped import cell_of
 from service.files.track import Track
 from service.settings.config import HandSettings, Settings, TrackerSettings, load
+from service.trackers.calibration import cell_file
 from service.trackers.calibration.cell_file import (
     CalibrationRecord,
     hand_settings,
@@ -208,6 +212,26 @@ def test_what_cannot_be_calibrated_is_refused_with_the_likely_cause(
         solve_held(spoil(held_by(kind)), CORNERS)
 
 
+@pytest.mark.parametrize("far_m", [1e2, 1e6, 1e20, 1e300, -1e308])
+def test_a_single_position_far_away_costs_nothing(far_m: float) -> None:
+    good = held_by("mocap")
+    far = good.hand.copy()
+    far[len(far) // 2, 1] = far_m
+    found, expected = (
+        solved(led_of(good._replace(hand=hand), "left"), Settings(), CORNERS, "left") for hand in (far, good.hand)
+    )
+    assert error_m(found.calibration) < 1.2 * error_m(expected.calibration) + 1e-4
+    assert any("1 of " in remark and "far from all others" in remark for remark in found.remarks)
+    assert not expected.remarks
+
+
+@pytest.mark.parametrize("far_m", [1e20, 1e300, -1e308])
+def test_a_hand_far_away_is_refused(far_m: float) -> None:
+    good = held_by("mocap")
+    with pytest.raises(CalibrationError, match=r"of the hand and .* of the arm|does not move with the tool"):
+        solved(led_of(good._replace(hand=np.full_like(good.hand, far_m)), "left"), Settings(), CORNERS, "left")
+
+
 def test_points_that_show_nothing_are_refused() -> None:
     hand, base = touched(path_of("wam", 0), 8, KINDS["mocap"], np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="3 points given; 4 or more needed, 8 recommended"):
@@ -286,7 +310,10 @@ def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
     poses = hand.poses.copy()
     poses[::7, 1] = np.nan
     clean, remarks = held_tool(hand._replace(poses=poses), tool, tracker)
-    assert remarks == [f"{len(poses[::7])} of {len(poses)} positions of hands/right are not finite and not used"]
+    assert remarks == [
+        f"{len(poses[::7])} of {len(poses)} positions of hands/right are not finite, or far from all "
+        "others, and not used"
+    ]
     assert 1e3 * error_m(solve_held(clean, CORNERS)) < 1.5
     gap = (held.tool_s < 10) | (held.tool_s > 14)
     clean, _ = held_tool(hand, tool.at(gap), tracker)
@@ -421,6 +448,63 @@ def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path
     record_path(path).write_text('{"date": 3}')
     with pytest.raises(CalibrationError, match=r"cell\.calibration\.json cannot be read: .*"):
         recorded(path, load(path))
+
+
+@pytest.mark.parametrize("end", ["\r\n", "\n"])
+def test_the_ends_of_lines_remain(end: str, tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_bytes(KEPT.replace("\n", end).encode())
+    kept = write(path, hand_settings(FOUND, "webxr"), RECORD)
+    assert kept.read_bytes() == KEPT.replace("\n", end).encode()
+    changed = path.read_bytes().decode()
+    assert changed.startswith(KEPT.replace("\n", end))
+    assert changed.count(end) == changed.count("\n") == KEPT.count("\n") + 4
+
+
+def changed_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another program writes the file after it was read."""
+    real = cell_file.tomlkit.dumps
+    path.write_text("rate_hz = 200\n")
+    monkeypatch.setattr(cell_file.tomlkit, "dumps", lambda one: (path.write_text("rate_hz = 250\n"), real(one))[1])
+
+
+NOT_WRITTEN: dict[str, tuple[Callable[[Path, pytest.MonkeyPatch], object], str]] = {
+    "changed meanwhile": (changed_meanwhile, "cell.toml was changed by another program meanwhile"),
+    "read-only": (lambda path, _: (path.touch(), path.chmod(0o444)), "cell.toml cannot be written"),
+    "a folder": (lambda path, _: path.mkdir(), "cell.toml cannot be written"),
+    "a pipe": (lambda path, _: os.mkfifo(path), "cell.toml cannot be written"),
+    "a link to nothing": (lambda path, _: path.symlink_to("nothing.toml"), "cannot read configuration .*cell.toml"),
+    "a link to itself": (lambda path, _: path.symlink_to("cell.toml"), "cannot read .*cell.toml"),
+    "a full disk": (
+        lambda path, patch: (path.touch(), patch.setattr(cell_file.os, "fsync", no_room)),
+        "No space left on device",
+    ),
+}
+
+
+def no_room(_: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(("prepare", "words"), NOT_WRITTEN.values(), ids=NOT_WRITTEN)
+def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
+    prepare: Callable[[Path, pytest.MonkeyPatch], object],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = tmp_path / "cell.toml"
+    prepare(path, monkeypatch)
+    before = path.read_text() if path.is_file() else ""
+    with pytest.raises(CalibrationError, match=rf"(?s){words}.* Write into .*base_from_tracker = \[1.2, -0.1"):
+        write(path, hand_settings(FOUND, "webxr"), RECORD)
+    if path.is_file():
+        assert path.read_text().replace("250", "200") == before
+    assert not list(tmp_path.glob(".*"))
+    if path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222:  # said before the arm is led
+        done = told("calibrate", "--held", "--config", str(path), "--from", str(tmp_path / "none.mcap"))
+        assert done.returncode == 1
+        assert re.search(words, done.stderr)
 
 
 # --- the command ----------------------------------------------------------------------------------

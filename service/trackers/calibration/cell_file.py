@@ -61,11 +61,15 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
     """Write values of [trackers.NAME], or without a tracker of [hands], into a cell's settings, and
     the record beside them. Returns the path of the earlier file, which is kept.
 
-    Comments and all other lines remain. The new text is validated before anything is written, and
-    replaces the file at once. Raises CalibrationError, SettingsError, OSError.
+    Comments and all other lines remain, with their ends. The new text is validated before anything
+    is written, and replaces the file at once, unless somebody else has changed it meanwhile. Raises
+    CalibrationError, SettingsError.
     """
-    path = path.resolve()  # a link remains a link
-    before, text = load(path), path.read_text(encoding="utf-8")
+    try:
+        path = real_path(path)
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}. Write into it:\n{lines(values)}") from None
+    before, text = load(path), content(path, LARGEST_CONFIGURATION).decode()
     try:
         document = tomlkit.parse(text)
         section: Any = document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
@@ -73,6 +77,8 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
         for name, value in values.items():
             section[name] = value
         changed = tomlkit.dumps(document)
+        if "\r\n" in text and text.count("\r\n") == text.count("\n"):
+            changed = changed.replace("\r\n", "\n").replace("\n", "\r\n")
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
         raise CalibrationError(f"{path} cannot be changed: {error}. Write into it:\n{lines(values, tracker)}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
@@ -85,10 +91,36 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
             f"{path} cannot be changed without other settings. Write into it:\n{lines(values, tracker)}"
         )
     kept = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
+<<<<<<< HEAD
     shutil.copy2(path, kept)
     _replace(path, changed.encode(), path.stat().st_mode)
     _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+=======
+    try:
+        shutil.copy2(path, kept)
+        if kept.read_bytes() != text.encode():
+            kept.unlink()
+            raise CalibrationError(f"{path} was changed by another program meanwhile. Write into it:\n{lines(values)}")
+        _replace(path, changed.encode(), path.stat().st_mode)
+        _replace(record_path(path), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+    except OSError as error:
+        raise CalibrationError(f"{in_words(error)}. Write into {path}:\n{lines(values)}") from None
+>>>>>>> daae9ddf3caa36bb93321b0868e158b18d4b41a4
     return kept
+
+
+def real_path(path: Path) -> Path:
+    """The path of the file that a link leads to, so that the link remains. Raises CalibrationError
+    for a file that cannot be written.
+    """
+    try:
+        found = path.resolve(strict=True)
+    except (OSError, RuntimeError) as error:  # a RuntimeError for links in a circle
+        raise CalibrationError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
+    is_writable = found.is_file() and found.stat().st_mode & 0o222 and os.access(found.parent, os.W_OK)
+    if not (is_writable and os.access(found, os.W_OK)):
+        raise CalibrationError(f"{path} cannot be written: a file that this user may change, in such a folder, needed")
+    return found
 
 
 def _replace(path: Path, data: bytes, mode: int) -> None:

@@ -42,6 +42,9 @@ LEAST_LED_S = 15.0  # the tool is led at least this long
 LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at half of that
 LEAST_LED_M, LEAST_TURNED_RAD = 0.10, math.radians(40)  # and at least this far, in each direction
 LED_POLL_S = 0.05
+LARGEST_POSITION = 1e9  # in any unit; squares of larger numbers overflow
+FAR_RATIO = 100.0  # positions are left out if they are this many times as far from the median as half of them
+MIN_MEDIAN_OFF = 0.05  # in the tracker's unit: a hand that rested for most of the time may still move by 5 m
 TOUCH_S = 0.5  # a touch is the median over this time
 MAX_TOUCH_M = 0.015  # during a touch, the hand moves at most this far
 LEAST_TOUCH_SAMPLES = 5
@@ -222,9 +225,12 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
         hand_ns, tool_ns = hand.logged_ns, tool.logged_ns
         whose = hand.name if hand_is_foreign else JOINT_STATES
         remarks.append(f"the stamps of {whose} are of another clock: times of arrival are used")
-    finite = np.asarray(np.isfinite(hand.poses[:, :3]).all(axis=1))
+    finite = _plausible(hand.poses[:, :3])
     if not finite.all():
-        remarks.append(f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite and not used")
+        remarks.append(
+            f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite, or far from all others, "
+            "and not used"
+        )
     tool_ns, tool_rows = np.unique(tool_ns, return_index=True)
     sound = np.isfinite(tool.poses[tool_rows]).all(axis=1)
     tool_ns, tool_rows = tool_ns[sound], tool_rows[sound]
@@ -243,6 +249,17 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
         tool.poses[tool_rows, 3:],
     )
     return held, remarks
+
+
+def _plausible(positions: Vector) -> NDArray[np.bool_]:
+    """True for each position (N, 3) that is finite and not FAR_RATIO times as far from their median
+    as half of them are: one such position would outweigh all others in the fit.
+    """
+    sound = np.asarray((np.abs(positions) < LARGEST_POSITION).all(axis=1))
+    if sound.any():
+        off = np.linalg.norm(np.where(sound[:, None], positions, 0.0) - np.median(positions[sound], axis=0), axis=1)
+        sound &= off <= FAR_RATIO * max(float(np.median(off[sound])), MIN_MEDIAN_OFF)
+    return sound
 
 
 def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
