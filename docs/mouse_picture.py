@@ -32,7 +32,12 @@ def main(path: Path = PICTURE) -> None:
             watchdog.start()
             try:
                 assert demo.stderr is not None
-                url = next(found[0] for line in demo.stderr if (found := re.search(r"http://\S+", line)))
+                said = ""
+                while not (found := re.search(r"http://\S+", said)):
+                    said += (line := demo.stderr.readline())
+                    if not line:
+                        raise SystemExit(said)  # it has ended
+                url = found[0]
                 threading.Thread(target=demo.stderr.read, daemon=True).start()
                 with chromium.opened(url, folder, size=(1000, 700), timeout_s=TIMEOUT_S) as tab:
                     tab.until("typeof hands !== 'undefined' && !!hands.left && places().length > 0")

@@ -37,7 +37,7 @@ PAGE_STATUS_S = 0.1  # interval of the status
 BY_HANDS = {f"{order} by hands": order for order in ("hold", "resume")}
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
-NO_HANDS = "resume was NOT carried out: the hands of this page are not followed."
+NOT_FOLLOWED = "resume was NOT carried out: the hands of this page are not followed."
 NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
 SILENT = f"This page has sent nothing for {PAGE_SILENCE_S:g} s."
 
@@ -158,7 +158,7 @@ class BrowserHands:
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
         """Carry out an order, even if the page disconnects meanwhile."""
         if order == "resume by hands" and self._owner is not page:
-            is_done, text = False, NO_HANDS
+            is_done, text = False, NOT_FOLLOWED
         elif order in BY_HANDS:
             is_done, text = await asyncio.to_thread(carried_out, self._client, BY_HANDS[order], self._name)
         else:

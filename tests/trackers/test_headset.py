@@ -91,7 +91,7 @@ def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_ri
         with headset.worn(served.url, tmp_path) as tab:
             tab.ask(MOVING)
             send_more(tab, 20)
-            # Stamps are as precise as half of the quickest round trip: 0.6 ms where the machine is idle.
+            # Stamps are as precise as half of the quickest round trip: 0.6 ms on an idle machine.
             tab.until(f"link.isReady && link.clock_ms < {MAX_STAMP_ERROR_MS}")
             precise_ms = tab.ask("performance.timeOrigin + performance.now()")
             send_more(tab, 150)
@@ -290,7 +290,7 @@ def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_
         daemon.until(lambda now: now["mode"] == "hold" and now["reason"] == "operator", TIMEOUT_S)
         tab.until("link.summary.headline === 'hold: operator request' && raisedPinch.isOffered")
         assert "pinch with both hands" in tab.until("board.text")
-        # Neither hands that pinch at work, nor one that does raised, nor two that do not, end the hold.
+        # Pinching at work, with one hand raised, or raised without a pinch ends no hold.
         for path, pinch in ((at_work, 1), (one_raised, 1), (raised, 0)):
             tab.ask(f"{path}; pinched({pinch})")
             send_more(tab, 10)

@@ -19,7 +19,9 @@ CLOSURES = [(0.10, 0.0), (0.08, 0.0), (0.05, 0.5), (0.02, 1.0), (0.0, 1.0)]
 
 
 def said(pinches: Pinches, distances_m: dict[str, float], watch: Watch) -> Any:
-    """What is heard of the distances, published again until it is: a message that cannot be sent at once is dropped."""
+    """What is heard of the distances. They are published again until it is heard: a message that
+    cannot be sent at once is dropped.
+    """
     for attempt in range(20):
         pinches.publish(distances_m, attempt)
         if (value := next(watch)) is not None:
