@@ -32,13 +32,15 @@ class Client:
         self._cell = cell
         self._timeout_s = timeout_s
 
-    def hold(self) -> Reply:
-        """Stop the arm, which then holds; returns once that is in force."""
-        return self._typed("hold", None, Reply)
+    def hold(self, by: str = "") -> Reply:
+        """Stop the arm, which then holds; returns once that is in force. `by` names who holds."""
+        return self._typed("hold", {"by": by} if by else None, Reply)
 
-    def resume(self) -> Reply:
-        """End an operator's hold; returns once that is in force."""
-        return self._typed("resume", None, Reply)
+    def resume(self, by: str = "") -> Reply:
+        """End an operator's hold; returns once that is in force. With a name, it is refused while
+        anybody else holds.
+        """
+        return self._typed("resume", {"by": by} if by else None, Reply)
 
     def reset(self) -> Reply:
         """End a fault; returns once that is in force."""

@@ -97,7 +97,15 @@ class StageRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The empty request of hold, resume and reset."""
+    """The empty request of status and reset."""
+
+
+class HoldRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold, or end a hold. With `by`, the name of who holds, a resume ends that hold, and is
+    refused if the arm is held by anybody else. Without, it ends all holds.
+    """
+
+    by: Name | Literal[""] = ""
 
 
 class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):

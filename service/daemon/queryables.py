@@ -22,6 +22,7 @@ from service.contract.records import Mode
 from service.contract.requests import (
     Add,
     Clear,
+    HoldRequest,
     List,
     Nothing,
     Remove,
@@ -55,7 +56,7 @@ TOGETHER = (*ORDER_KEYS, "status")  # all waiting requests on one of these keys 
 COMPUTED = "teaching"  # name of the queue of requests for which the skill worker computes
 
 
-Order = Callable[[str], Reply | RequestError]  # executes hold, resume or reset
+Order = Callable[[str, str], Reply | RequestError]  # executes hold, resume or reset, for the one who holds
 
 
 class Requested(Protocol):
@@ -160,6 +161,8 @@ class Queryables:
         failed: Callable[[str], None],
     ) -> None:
         self.inbox: deque[PendingEvent] = deque()
+        self._held_by: set[str] = set()  # names of those whose hold is in force; empty for one without a name
+        self._ordering = threading.Lock()  # each of hold and resume has its own thread
         self._settings = settings
         self._skill, self._in_force = skill, in_force(skill)
         self._skill_worker = skill_worker
@@ -253,17 +256,17 @@ class Queryables:
                 return Reply(int(self._frame()["tick"]), self._in_force)
             case Add() | Remove() | Clear():
                 return self._teach(request)
-            case Nothing():
-                if isinstance(reply := order(suffix), RequestError):
+            case Nothing() | HoldRequest():
+                if isinstance(reply := order(suffix, getattr(request, "by", "")), RequestError):
                     raise reply
                 return reply
         raise RequestError(f"requests on {suffix} are not supported")
 
-    def _order(self, suffix: str) -> Reply | RequestError:
+    def _order(self, suffix: str, by: str = "") -> Reply | RequestError:
         """The reply to hold, resume or reset with the resulting mode, or the error."""
         before, _ = outcome(self._frame())
         try:
-            tick = self._through_the_loop(order(suffix))
+            tick = self._taken(self._ordered(suffix, by))
         except RequestError as error:
             return error
         mode, reason = outcome(self._frame())
@@ -284,10 +287,30 @@ class Queryables:
         mode, reason = outcome(self._frame())
         return Reply(tick, mode=word(mode), reason=word(reason))
 
+    def _ordered(self, suffix: str, by: str) -> PendingEvent:
+        """The event of an order, on its way to the loop. Raises RequestError for the resume of one
+        who holds while others hold too.
+        """
+        pending = PendingEvent(order(suffix))
+        with self._ordering:  # so that no hold arrives between the check and the event
+            if suffix == "hold":
+                self._held_by.add(by)
+            elif suffix == "resume":
+                if by and self._held_by != {by}:
+                    who = "somebody else holds the arm too" if by in self._held_by else f"{by!r} does not hold the arm"
+                    raise RequestError(f"$.by: {who}; a resume without `by` needed, which ends all holds")
+                self._held_by.clear()
+            self.inbox.append(pending)
+        return pending
+
     def _through_the_loop(self, event: Event) -> int:
         """Send an event through the loop; returns the tick that took it, after its frame."""
         pending = PendingEvent(event)
         self.inbox.append(pending)
+        return self._taken(pending)
+
+    def _taken(self, pending: PendingEvent) -> int:
+        """The tick that took an event, after its frame."""
         tick, end = pending.wait(), time.monotonic() + ADOPTION_TIMEOUT_S
         while int(self._frame()["tick"]) < tick and time.monotonic() < end:
             time.sleep(TICK_POLL_S)

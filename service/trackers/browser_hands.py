@@ -1,17 +1,21 @@
 """The websocket by which a page sends hands, and receives what the cell does.
 
-A page sends messages of hands and pings as bytes (`hand_message`), and orders as text, `hold`,
-`resume` or `reset`. It receives pongs as bytes, and as text ten times a second the status and the
-objects on the bench (`{"status": ..., "objects": ...}`), and the answers to its orders
-(`{"answer": ..., "done": ...}`). What is wrong closes the page's own websocket with a reason, and
-no other one.
+A page sends messages of hands and pings as bytes (`hand_message`), and orders as text: `hold`,
+`resume` or `reset` of its buttons, `hold by hands` or `resume by hands` of a sign. A resume by
+hands ends a hold by hands alone: the daemon refuses it while anybody else holds the arm. A page
+receives pongs as bytes, and as text ten times a second the status and the objects on the bench
+(`{"status": ..., "objects": ...}`), and the answers to its orders (`{"order": ..., "answer": ...,
+"done": ...}`). A message that is wrong closes the page's own websocket with a reason, and no other
+one.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
+import secrets
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -32,8 +36,10 @@ OWNER_S = 1.0  # after this time without hands of a page, another page may send 
 MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
 MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
 PAGE_STATUS_S = 0.1  # interval of the status
+BY_HANDS = {f"{order} by hands": order for order in ("hold", "resume")}
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
+NOT_FOLLOWED = "resume was NOT carried out: the hands of this page are not followed."
 NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
 SILENT = f"This page has sent nothing for {PAGE_SILENCE_S:g} s."
 
@@ -57,6 +63,7 @@ class BrowserHands:
     ) -> None:
         self._tracker, self._client, self._latest, self._frame = tracker, client, latest, frame
         self._has_token, self._pinches = has_token, pinches
+        self._name = f"hands {secrets.token_hex(4)}"  # of the person who holds by a sign
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
         self._owned_s = 0.0
@@ -111,10 +118,10 @@ class BrowserHands:
                 if not self._publish(page, hands):
                     return await web_server.close(page, 409, TAKEN)
             elif message.type == WSMsgType.TEXT:
-                if message.data not in ORDERS:
+                if message.data not in ORDERS and message.data not in BY_HANDS:
                     return await web_server.close(page, 400, f"Refused: {' or '.join(ORDERS)} needed as text")
                 orders = {name: order for name, order in orders.items() if not order.done()}
-                if not orders or (message.data == "hold" and "hold" not in orders):
+                if not orders or (message.data.startswith("hold") and message.data not in orders):
                     orders[message.data] = asyncio.create_task(self._order(page, message.data))
             else:
                 return None  # it left, or sent what is no message, for which aiohttp has closed it
@@ -159,7 +166,11 @@ class BrowserHands:
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
         """Carry out an order, even if the page disconnects meanwhile."""
-        loop = asyncio.get_running_loop()
-        is_done, text = await loop.run_in_executor(self._ordering, carried_out, self._client, order)
+        if order == "resume by hands" and self._owner is not page:
+            is_done, text = False, NOT_FOLLOWED
+        else:
+            name = self._name if order in BY_HANDS else ""
+            carry_out = functools.partial(carried_out, self._client, BY_HANDS.get(order, order), by=name)
+            is_done, text = await asyncio.get_running_loop().run_in_executor(self._ordering, carry_out)
         with contextlib.suppress(ConnectionError):
-            await page.send_str(json.dumps({"answer": text, "done": is_done}))
+            await page.send_str(json.dumps({"order": order, "answer": text, "done": is_done}))

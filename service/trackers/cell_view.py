@@ -84,10 +84,12 @@ class Latest:
         return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
-def carried_out(client: Client, order: str) -> tuple[bool, str]:
-    """True if the daemon carried out hold, resume or reset, and its answer in words."""
+def carried_out(client: Client, order: str, by: str = "") -> tuple[bool, str]:
+    """True if the daemon carried out hold, resume or reset, and its answer in words. `by` names who
+    holds, or ends its own hold.
+    """
     try:
-        reply: Reply = getattr(client, order)()
+        reply: Reply = getattr(client, order)(*([by] if by else []))
     except ExplainedError as error:
         return False, f"{order} was NOT carried out: {error}"
     now = in_brief(reply.mode, reply.reason).replace("_", " ")

@@ -12,9 +12,10 @@ from service.client import Client, Tracker
 from service.trackers.browser_hands import NO_TOKEN, BrowserHands
 from service.trackers.cell_view import Latest
 from service.trackers.pinch import Pinches
-from service.trackers.web_server import HTML, INLINE, ServerCertificate, WebServer, answer, filled
+from service.trackers.web_server import HTML, INLINE, JAVASCRIPT, ServerCertificate, WebServer, answer, filled
 
 PAGE_FOLDER = Path(__file__).parent
+WORKER = "link_worker.js"  # a thread of its own in the browser
 UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with its token."
 
 
@@ -44,7 +45,8 @@ class HandsPage:
     ) -> None:
         self._fields = {"cell": html.escape(cell), "frame": self.frame} | fields
         self.hands = BrowserHands(tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches)
-        routes = [web.get("/", self._front), web.get("/hands", self.hands.socket), *more]
+        own = [("/", self._front), (f"/{WORKER}", self._worker), ("/hands", self.hands.socket)]
+        routes = [*(web.get(path, handler) for path, handler in own), *more]
         self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 
     def has_token(self, given: str) -> bool:
@@ -52,9 +54,16 @@ class HandsPage:
         return self.server.has_token(given)
 
     async def _front(self, request: web.Request) -> web.Response:
+        parts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in self.scripts}
+        text = filled(PAGE_FOLDER / self.page, style=filled(PAGE_FOLDER / "page.css"), **parts, **self._fields)
+        return self._answer(request, text, HTML, f"{INLINE}; worker-src 'self'; frame-ancestors 'none'")
+
+    async def _worker(self, request: web.Request) -> web.Response:
+        return self._answer(request, filled(PAGE_FOLDER / WORKER), JAVASCRIPT, "frame-ancestors 'none'")
+
+    def _answer(self, request: web.Request, text: str, kind: str, policy: str) -> web.Response:
+        """A text for who has the token, which may connect to this server alone."""
         if not self.has_token(request.query.get("token", "")):
             return answer(403, NO_TOKEN)
         socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"
-        policy = f"connect-src 'self' {socket}; {INLINE}; frame-ancestors 'none'"
-        scripts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in self.scripts}
-        return answer(200, filled(PAGE_FOLDER / self.page, **self._fields, **scripts), kind=HTML, policy=policy)
+        return answer(200, text, kind=kind, policy=f"connect-src 'self' {socket}; {policy}")

@@ -12,4 +12,4 @@ FRAME = "webxr"  # x to the right, y up, -z ahead of where the headset was when 
 class HeadsetPage(HandsPage):
     """The page and its server."""
 
-    page, scripts, frame = "headset.html", ("link", "scene"), FRAME
+    page, scripts, frame = "headset.html", ("link", "controls", "scene"), FRAME

@@ -44,7 +44,7 @@ class PlayedTask:
 class MousePage(HandsPage):
     """The page and its server; with a `task`, the page shows it and can end it."""
 
-    page, scripts, frame = "mouse.html", ("link",), BASE
+    page, scripts, frame = "mouse.html", ("link", "controls"), BASE
 
     def __init__(
         self,

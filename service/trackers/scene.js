@@ -1,5 +1,5 @@
 "use strict";
-// Drawing with WebGL 2: balls, rods, rings, a grid and a board with text. Matrices are columns first.
+// Drawing with WebGL 2: balls, rods, rings, discs and a board with text. Matrices are column-major, as WebGL takes them.
 const Matrix = {
   multiply(a, b) {
     const out = new Float32Array(16);
@@ -8,8 +8,8 @@ const Matrix = {
         for (let k = 0; k < 4; k++) out[4 * c + r] += a[4 * k + r] * b[4 * c + k];
     return out;
   },
-  perspective(height_rad, aspect, near = .05, far = 30) {
-    const f = 1 / Math.tan(height_rad / 2), d = near - far;
+  perspective(view_rad, aspect, near = .05, far = 30) {
+    const f = 1 / Math.tan(view_rad / 2), d = near - far;
     return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / d, -1, 0, 0, 2 * far * near / d, 0];
   },
   columns: (x, y, z, at) => [...x, 0, ...y, 0, ...z, 0, ...at, 1],
@@ -25,11 +25,11 @@ const Matrix = {
   apply: (m, [x, y, z]) => [0, 1, 2].map(r => m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r]),
 };
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const less = (a, b) => a.map((value, i) => value - b[i]);
-const times = (a, scale) => a.map(value => value * scale);
-const plus = (a, b) => a.map((value, i) => value + b[i]);
-const size = a => Math.hypot(...a);
-const unit = a => times(a, 1 / (size(a) || 1));
+const subtract = (a, b) => a.map((value, i) => value - b[i]);
+const scale = (a, factor) => a.map(value => value * factor);
+const add = (a, b) => a.map((value, i) => value + b[i]);
+const norm = a => Math.hypot(...a);
+const normalize = a => scale(a, 1 / (norm(a) || 1));
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
 class Painter {
@@ -44,8 +44,7 @@ class Painter {
     }
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    this.at = name => gl.getUniformLocation(program, name);
-    this.uniforms = Object.fromEntries(["view", "model", "colour", "light", "isBoard"].map(name => [name, this.at(name)]));
+    this.uniforms = Object.fromEntries(["view", "model", "colour", "light", "isBoard"].map(name => [name, gl.getUniformLocation(program, name)]));
     const around = count => Array.from({length: count + 1}, (_, i) => 2 * Math.PI * i / count);
     // Points of each shape with their normals: a strip between neighbouring rows of a surface.
     this.ball = this.shape(around(8).map(a => a / 2), around(12), (a, b) => {
@@ -54,8 +53,8 @@ class Painter {
     });
     this.rod = this.shape([0, 1], around(8), (y, b) => [[Math.cos(b), y, Math.sin(b)], [Math.cos(b), 0, Math.sin(b)]]);
     this.ring = this.shape(around(32), around(6), (a, b) => {
-      const out = [Math.cos(a), 0, Math.sin(a)], n = plus(times(out, Math.cos(b)), [0, Math.sin(b), 0]);
-      return [plus(out, times(n, .06)), n];
+      const out = [Math.cos(a), 0, Math.sin(a)], n = add(scale(out, Math.cos(b)), [0, Math.sin(b), 0]);
+      return [add(out, scale(n, .06)), n];
     });
     this.disc = this.shape([0, 1], around(32), (r, b) => [[r * Math.cos(b), 0, r * Math.sin(b)], [0, 1, 0]]);
     this.square = this.shape([-1, 1], [-1, 1], (y, x) => [[x, y, 0], [(x + 1) / 2, (1 - y) / 2, 0]]);
@@ -87,7 +86,7 @@ class Painter {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(this.program);
     gl.uniformMatrix4fv(this.uniforms.view, false, view);
-    gl.uniform3fv(this.uniforms.light, unit(light));
+    gl.uniform3fv(this.uniforms.light, normalize(light));
   }
   draw(shape, model, colour, alpha = 1, isBoard = false) {
     const gl = this.gl;
@@ -101,19 +100,19 @@ class Painter {
     this.draw(this.ball, Matrix.columns([radius, 0, 0], [0, radius, 0], [0, 0, radius], at), colour, alpha);
   }
   drawRod(from, to, radius, colour, alpha) {
-    const along = less(to, from), side = unit(cross(along, Math.abs(unit(along)[1]) < .9 ? [0, 1, 0] : [1, 0, 0]));
-    const x = times(side, radius), z = times(unit(cross(side, along)), radius);
+    const along = subtract(to, from), side = normalize(cross(along, Math.abs(normalize(along)[1]) < .9 ? [0, 1, 0] : [1, 0, 0]));
+    const x = scale(side, radius), z = scale(normalize(cross(side, along)), radius);
     this.draw(this.rod, Matrix.columns(x, along, z, from), colour, alpha);
   }
   drawFlat(shape, at, radius, up, colour, alpha) {
-    const x = unit(cross(up, Math.abs(up[0]) < .9 ? [1, 0, 0] : [0, 1, 0])), z = cross(x, up);
-    this.draw(shape, Matrix.columns(times(x, radius), times(up, radius), times(z, radius), at), colour, alpha);
+    const x = normalize(cross(up, Math.abs(up[0]) < .9 ? [1, 0, 0] : [0, 1, 0])), z = cross(x, up);
+    this.draw(shape, Matrix.columns(scale(x, radius), scale(up, radius), scale(z, radius), at), colour, alpha);
   }
   // A board with the picture of a canvas: its centre, the eye that it faces, up, and its height.
   drawBoard(picture, at, eye, up, height) {
-    const gl = this.gl, z = unit(less(eye, at)), x = unit(cross(up, z)), y = cross(z, x);
-    if (this.shown !== picture.version) {
-      this.shown = picture.version;
+    const gl = this.gl, z = normalize(subtract(eye, at)), x = normalize(cross(up, z)), y = cross(z, x);
+    if (this.uploaded !== picture.version) {
+      this.uploaded = picture.version;
       gl.bindTexture(gl.TEXTURE_2D, this.texture);
       gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, true);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture.canvas);
@@ -121,7 +120,7 @@ class Painter {
     }
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     const width = height * picture.canvas.width / picture.canvas.height;
-    this.draw(this.square, Matrix.columns(times(x, width / 2), times(y, height / 2), z, at), [255, 255, 255], 1, true);
+    this.draw(this.square, Matrix.columns(scale(x, width / 2), scale(y, height / 2), z, at), [255, 255, 255], 1, true);
   }
   static VERTEX = `#version 300 es
     layout(location = 0) in vec3 point; layout(location = 1) in vec3 normal;

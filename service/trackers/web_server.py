@@ -32,6 +32,7 @@ from service.contract.explain import ExplainedError, in_words
 
 HTML = "text/html; charset=utf-8"
 JSON = "application/json"
+JAVASCRIPT = "text/javascript; charset=utf-8"
 INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 MAX_BODY_BYTES = 4096  # of a request
 FROZEN_S = 30.0  # a browser that sends no request, or reads no answer, for this long is disconnected

@@ -107,7 +107,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     left.set(
         xlabel="demonstrations", ylabel="rms error on held-out\ndemonstrations [mm]", xticks=counts, ylim=(0, None)
     )
-    left.legend(frameon=False)
+    below = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}  # the curves fill the axes
+    left.legend(**below)
     for name, style, label in (
         ("median", "o-", "median"),
         ("p95", "s--", "95th percentile"),
@@ -117,5 +118,5 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     right.axhline(1000 * GRASP_DISTANCE, color="black", ls="--", lw=0.8)
     right.set(xlabel="demonstrations", ylabel="largest error of the\nthree events [mm]", xticks=counts, ylim=(0, 33))
     right.set_title(f"new places up to 15 cm away, taught: {numbers['scenes']} scenes", fontsize=9)
-    right.legend(frameon=False, loc=(0.55, 0.66))
+    right.legend(**below, ncols=3)
     results.figure(figure)

@@ -337,6 +337,37 @@ def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
     assert cell.kinds() == ["hold"]
 
 
+OTHERS, NO_HOLD = "$.by: somebody else holds the arm too", "$.by: 'me' does not hold the arm"
+
+
+@pytest.mark.parametrize(
+    ("holds", "why"),
+    [
+        ([{"by": "me"}, {"by": "me"}], ""),
+        ([{"by": "me"}, {}], OTHERS),  # whoever gives no name is somebody else
+        ([{"by": "you"}, {"by": "me"}], OTHERS),
+        ([{"by": "you"}], NO_HOLD),
+        ([{}], NO_HOLD),
+        ([], NO_HOLD),
+    ],
+)
+def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(
+    cell: Cell, holds: list[dict[str, str]], why: str
+) -> None:
+    for hold in holds:
+        cell.client.ask("hold", hold)
+    mine = {"by": "me"}
+    if why:
+        assert cell.refusal("resume", mine).startswith(why)
+    else:
+        cell.client.ask("resume", mine)
+        assert cell.refusal("resume", mine).startswith(NO_HOLD)  # it has ended
+    assert cell.kinds() == ["hold"] * len(holds) + ["resume"] * (not why)
+    cell.client.ask("resume")  # ends the holds of all
+    cell.client.ask("hold", mine)
+    cell.client.ask("resume", mine)
+
+
 def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
     cell.running = False

@@ -29,6 +29,8 @@ KNUCKLES = ("wrist", "index-finger-phalanx-proximal", "pinky-finger-phalanx-prox
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "thirdhand-tests"
 # Runs ahead of the page: a headset with two hands. In each frame `path(seconds)`, if it is set,
 # moves them, and `truth` gets a row: time [ms since 1970], side, position [m], quaternion x y z w.
+# The time is that of the frame, for which a headset gives its poses: a busy machine reaches the
+# hands of a frame many milliseconds later.
 EMULATED = """
 ;(() => {
   const has = feature => !LACKING.includes(feature), quest = IWER.metaQuest3;
@@ -41,7 +43,7 @@ EMULATED = """
   for (const side of ["left", "right"]) {
     const hand = device.hands[side], onFrameStart = hand.onFrameStart.bind(hand);
     hand.onFrameStart = frame => {
-      const now = performance.now();
+      const now = frame.predictedDisplayTime;
       if (window.path) {
         window.begun ||= now;
         const {position, quaternion} = window.path((now - window.begun) / 1000)[side];
@@ -52,6 +54,13 @@ EMULATED = """
       onFrameStart(frame);
     };
   }
+  // Lets both hands pinch (1) or relax (0).
+  window.pinched = value => {
+    for (const hand of Object.values(device.hands)) {
+      hand.poseId = value ? "pinch" : "default";
+      hand.updatePinchValue(value);
+    }
+  };
   // What `iwer` keeps behind symbols: the offset of a space from its parent.
   const inside = one => String(one).includes("xr-space");
   window.offset = space => space[Object.getOwnPropertySymbols(space).find(inside)].offsetMatrix;

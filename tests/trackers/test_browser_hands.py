@@ -25,6 +25,7 @@ from service.contract.messages import WireError
 from service.trackers import browser_hands
 from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
 from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
+from service.trackers.hands_page import WORKER
 from service.trackers.headset_page import HeadsetPage
 from service.trackers.web_server import FOREIGN, server_certificate
 from support.cell import told
@@ -197,20 +198,22 @@ def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeyp
 def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
     async def scenario() -> None:
         async with serving_page(page) as at, aiohttp.ClientSession(f"http://{at}") as session:
-            async with session.get("/") as answer:
-                assert (answer.status, await answer.text()) == (403, NO_TOKEN)
-            async with session.get("/", params={"token": page.server.token}) as answer:
-                text = await answer.text()
-                assert answer.status == 200
-                assert page.server.token not in text
-                assert "__" not in text
-                assert "https:" not in text.replace('"https:"', "")
-                policy = answer.headers["Content-Security-Policy"].split("; ")
-                assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{at}"]
+            for part in ("/", f"/{WORKER}"):
+                async with session.get(part) as answer:
+                    assert (answer.status, await answer.text()) == (403, NO_TOKEN)
+                async with session.get(part, params={"token": page.server.token}) as answer:
+                    text = await answer.text()
+                    assert answer.status == 200
+                    assert page.server.token not in text
+                    assert "__" not in text
+                    assert "https:" not in text.replace('"https:"', "")
+                    policy = answer.headers["Content-Security-Policy"].split("; ")
+                    assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{at}"]
             async with session.get("/hands", params={"token": page.server.token}) as answer:
                 assert answer.status == 426
-            async with session.get("/", headers={"Host": "rebound.example"}) as answer:
-                assert (answer.status, await answer.text()) == (403, FOREIGN)
+            for part in ("/", f"/{WORKER}"):
+                async with session.get(part, headers={"Host": "rebound.example"}) as answer:
+                    assert (answer.status, await answer.text()) == (403, FOREIGN)
 
     with page_of_hands() as (page, _):
         asyncio.run(scenario())

@@ -19,7 +19,7 @@ import zenoh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.client import endpoints, open_session
+from service.client import Client, endpoints, open_session
 from service.contract.messages import PoseStamped
 from service.daemon.launch import free_port
 from support import headset
@@ -29,6 +29,7 @@ from support.page_hands import Heard
 
 pytestmark = pytest.mark.skipif(bool(lacks := headset.lacking()), reason=lacks)
 TIMEOUT_S = 60.0
+MAX_STAMP_ERROR_MS = 5.0
 Array = NDArray[np.float64]
 # Hands that move and turn in all directions, at up to 0.3 m/s and 1.4 rad/s.
 MOVING = """path = t => {
@@ -90,22 +91,22 @@ def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_ri
         with headset.worn(served.url, tmp_path) as tab:
             tab.ask(MOVING)
             send_more(tab, 20)
-            tab.ask("truth.length = 0")  # clocks have been compared meanwhile
-            time.sleep(0.3)
-            for side in ("left", "right"):
-                heard.poses[side].clear()
+            # Stamps are as precise as half of the quickest round trip: 0.6 ms on an idle machine.
+            tab.until(f"link.isReady && link.clock_ms < {MAX_STAMP_ERROR_MS}")
+            precise_ms = tab.ask("performance.timeOrigin + performance.now()")
             send_more(tab, 150)
-            poses = {side: heard.poses[side][2:] for side in ("left", "right")}
-            for side, some in poses.items():
+            bound_ms = tab.ask("link.clock_ms")
+            for side, poses in heard.poses.items():
+                some = [pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS]
                 off_m, off_rad, late_s = compared(tab, some, side)
                 errors = np.array([1e3 * off_m.max(), np.degrees(off_rad.max())])
-                figures = [*errors.tolist(), float(1e3 * np.median(late_s)), float(1e3 * np.abs(late_s).max())]
-                record_property(f"{side}: mm, degrees, stamp's median and largest error in ms", figures)
+                figures = [*errors.tolist(), *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(), bound_ms]
+                record_property(f"{side}: mm, degrees, stamp's error and its bound in ms", figures)
                 assert len(some) > 100
                 assert {pose.frame_id for pose in some} == {"webxr"}
                 assert off_m.max() < 0.001
                 assert off_rad.max() < np.radians(0.1)
-                assert abs(np.median(late_s)) < 0.2  # below 1 ms unless the machine is busy
+                assert 1e3 * np.abs(late_s).max() < MAX_STAMP_ERROR_MS
                 assert (np.diff([pose.stamp_ns for pose in some]) > 0).all()
         served.end()
         assert served.counts()[0] >= 170
@@ -128,6 +129,7 @@ def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
         assert len(heard.poses["left"]) == before["left"]
         tab.ask("device.hands.right.connected = false")
         tab.until("!seen.right")
+        time.sleep(0.3)
         count = sent(tab)
         time.sleep(0.5)
         assert sent(tab) == count
@@ -178,7 +180,7 @@ def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
             tab.ask(STILL)
             send_more(tab, 10)
             network.flows.clear()
-            tab.until("link.dropped > 10")
+            tab.until("link.dropped > 10")  # no more is sent from the first one on
             stalled = sent(tab)
             time.sleep(0.5)
             assert sent(tab) == stalled
@@ -267,13 +269,15 @@ def test_recentring_renames_the_frame_and_an_anchor_makes_it_harmless(
             assert newest().frame_id == "webxr1"
 
 
-def test_a_daemon_follows_the_hands_of_a_headset_until_they_are_raised(tmp_path: Path) -> None:
+def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_there(tmp_path: Path) -> None:
+    at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
+    raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up
+    one_raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]", 1)
     with (
         serving(tmp_path, "--arm", "assumed", "--rate", "100", network=LISTENING + CELL) as daemon,
         headset.serving_hands(daemon.endpoint, tmp_path) as served,
         headset.worn(served.url, tmp_path, without=("anchors",)) as tab,
     ):
-        at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
         tab.ask(at_work)
         status = daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
         palm = json.loads(tab.ask("JSON.stringify(palm(seen.left, 'left').position)"))
@@ -281,12 +285,32 @@ def test_a_daemon_follows_the_hands_of_a_headset_until_they_are_raised(tmp_path:
         assert (x - 1.45, y, z + 0.75) == pytest.approx((palm[2], palm[0], palm[1]), abs=0.005)
         assert status["sources"]["left"]["frame"] == "webxr"
         tab.until("link.summary.headline === 'follow'")
-        assert tab.ask("held.isArmed") is True  # hands at work gave no sign
-        tab.ask(at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]"))  # fingers up
-        status = daemon.until(lambda now: now["mode"] == "hold" and now["reason"] == "operator", TIMEOUT_S)
-        tab.until("link.summary.headline === 'hold: operator request'")
-        tab.ask(at_work)
-        tab.until("held.isArmed")
+        assert tab.ask("flatHands.isArmed") is True  # hands at work gave no sign
+        tab.ask(raised)
+        daemon.until(lambda now: now["mode"] == "hold" and now["reason"] == "operator", TIMEOUT_S)
+        tab.until("link.summary.headline === 'hold: operator request' && raisedPinch.isOffered")
+        assert "pinch with both hands" in tab.until("board.text")
+        # Pinching at work, with one hand raised, or raised without a pinch ends no hold.
+        for path, pinch in ((at_work, 1), (one_raised, 1), (raised, 0)):
+            tab.ask(f"{path}; pinched({pinch})")
+            send_more(tab, 10)
+            time.sleep(1.5)
+            assert tab.ask("raisedPinch.isOffered && raisedPinch.share === 0")
+        tab.ask(f"{raised}; pinched(1)")
+        daemon.until(lambda now: now["reason"] != "operator", TIMEOUT_S)
+        tab.until("!raisedPinch.isOffered")
+        tab.ask(f"{at_work}; pinched(0)")
+        tab.until("flatHands.isArmed")
+        daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
+        # Somebody else holds too: the pinch does not end that hold.
+        tab.ask(raised)
+        tab.until("raisedPinch.isOffered")
+        Client(daemon.session).hold()
+        tab.ask("pinched(1)")
+        assert "somebody else holds the arm too" in tab.until("refused")
+        assert daemon.until(lambda now: True)["reason"] == "operator"
+        tab.ask(f"{at_work}; pinched(0)")
+        tab.until("flatHands.isArmed")
         tab.ask("document.getElementById('resume').click()")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
         tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")

@@ -190,7 +190,7 @@ def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None
     stale = "history.replaceState(null, '', '?token=guessed')"
     with chromium.opened(url, tmp_path, size=(1200, 800), timeout_s=TIMEOUT_S) as tab:
         tab.until("typeof link !== 'undefined'")
-        tab.ask(f"{stale}; link.socket.close()")
+        tab.ask(f"{stale}; link.connect()")
         tab.until(f"at('why').textContent === {json.dumps(NO_TOKEN)}")
 
 

@@ -65,10 +65,11 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
     is written, and replaces the file at once, unless somebody else has changed it meanwhile. Raises
     CalibrationError, SettingsError.
     """
+    by_hand = f"Write into it:\n{lines(values, tracker)}"
     try:
         path = real_path(path)
     except CalibrationError as error:
-        raise CalibrationError(f"{error}. Write into it:\n{lines(values)}") from None
+        raise CalibrationError(f"{error}. {by_hand}") from None
     before, text = load(path), content(path, LARGEST_CONFIGURATION).decode()
     try:
         document = tomlkit.parse(text)
@@ -80,32 +81,24 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
         if "\r\n" in text and text.count("\r\n") == text.count("\n"):
             changed = changed.replace("\r\n", "\n").replace("\n", "\r\n")
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
-        raise CalibrationError(f"{path} cannot be changed: {error}. Write into it:\n{lines(values, tracker)}") from None
+        raise CalibrationError(f"{path} cannot be changed: {error}. {by_hand}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
     wanted = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     table: Any = before.trackers[tracker] if tracker else before.hands
     replaced = msgspec.structs.replace(table, **wanted)
     changes = {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
     if after != msgspec.structs.replace(before, **changes):
-        raise CalibrationError(
-            f"{path} cannot be changed without other settings. Write into it:\n{lines(values, tracker)}"
-        )
+        raise CalibrationError(f"{path} cannot be changed without other settings. {by_hand}")
     kept = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
-<<<<<<< HEAD
-    shutil.copy2(path, kept)
-    _replace(path, changed.encode(), path.stat().st_mode)
-    _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
-=======
     try:
         shutil.copy2(path, kept)
         if kept.read_bytes() != text.encode():
             kept.unlink()
-            raise CalibrationError(f"{path} was changed by another program meanwhile. Write into it:\n{lines(values)}")
+            raise CalibrationError(f"{path} was changed by another program meanwhile. {by_hand}")
         _replace(path, changed.encode(), path.stat().st_mode)
-        _replace(record_path(path), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+        _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
     except OSError as error:
-        raise CalibrationError(f"{in_words(error)}. Write into {path}:\n{lines(values)}") from None
->>>>>>> daae9ddf3caa36bb93321b0868e158b18d4b41a4
+        raise CalibrationError(f"{in_words(error)}. {by_hand}") from None
     return kept
 
 
