@@ -152,7 +152,7 @@ def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch
     given: list[str] = []
     slow = threading.Event()
 
-    def order(_: Client, name: str) -> tuple[bool, str]:
+    def order(_: Client, name: str, by: str = "") -> tuple[bool, str]:
         given.append(name)
         return (True, name) if name == "hold" else (slow.wait(20), name)
 
