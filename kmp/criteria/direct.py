@@ -10,7 +10,8 @@ kernel's vector k(s) and matrix K, r = `noise`, q = `spread` and d = `deviation`
     scatter      S_n ~ (1 - a) sum_m w_nm e_m e_m^T + a |e|^2 I
     weights      w_nm ~ exp(-|s_n - s_m|^2 / (2 l^2))
 
-S is scaled so that the mean of its traces is 3; e are the residuals without each point's group,
+S is scaled so that the mean of its traces is 3. A point that is less trusted has the factor f_n on
+its scatter, f_n S_n, and a group that is not judged has residuals that no choice counts. e are the residuals without each point's group,
 |e|^2 the mean of their squared coordinates, a the share that is the same everywhere, l = `local`,
 and the w_nm add up to 1. ell, r and p are those with the smallest residuals, of (K + r I)^-1; q is
 the least one under which the residuals are about as likely as under any. With C_1 the covariance
@@ -86,6 +87,8 @@ class DirectSelection:
     scales: Scales
     isotropic: bool = False  # True if S is a multiple of I at each point, which costs a ninth of the time
     joint: bool = False  # True if the prior mean is chosen with the kernel, not after it
+    factors: Array | None = None  # (N,) f_n; None if all are 1
+    judged: NDArray[np.bool_] | None = None  # (N,) True for points whose residuals count; None if all do
 
     @cached_property
     def _constant(self) -> Array:
@@ -98,6 +101,10 @@ class DirectSelection:
     @cached_property
     def _targets(self) -> dict[tuple[float | None, int], Array]:
         return {}
+
+    @cached_property
+    def _counted(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.group), bool) if self.judged is None else self.judged
 
     def best_mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
         """The root mean square residual and the parameters of the best mean.
@@ -124,7 +131,7 @@ class DirectSelection:
         for ell in ells.tolist():
             for noise, by_ridge in zip(_NOISES.tolist(), self._residuals(ell, _NOISES, ridges), strict=True):
                 for ridge, residuals in zip(ridges, by_ridge, strict=True):
-                    yield rms(residuals), Parameters(ell, noise, 1.0, 1.0, ridge)
+                    yield rms(residuals[self._counted]), Parameters(ell, noise, 1.0, 1.0, ridge)
 
     def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
         """The parameters that predict held-out groups best, with this ell or one of the scales.
@@ -137,7 +144,7 @@ class DirectSelection:
         unscaled = unscaled._replace(spread=spread)
         residuals = self.residuals(unscaled.ell, unscaled.noise, unscaled.ridge)
         squares, floors = [], []
-        groups = np.unique(self.group)
+        groups = np.unique(self.group[self._counted])
         for number in groups.tolist():
             mine = self.group == number
             found = self.primitive(unscaled, residuals, without=number).predict(self.inputs[mine])
@@ -154,9 +161,16 @@ class DirectSelection:
     def _residuals(self, ell: float, noises: Array, ridges: Sequence[float | None]) -> Array:
         """The residuals (J, R, N, 3) for noises (J,) and prior means of these ridges (R,)."""
         kernel, shape = np.exp(-ell * self._squares), (len(noises), len(self.group), len(ridges), 3)
-        found = held_out_residuals(
-            kernel, noises, self.group, lambda number: np.hstack([self._target(ridge, number) for ridge in ridges])
-        )
+
+        def targets(number: int) -> Array:
+            return np.hstack([self._target(ridge, number) for ridge in ridges])
+
+        if self.factors is None:
+            found = held_out_residuals(kernel, noises, self.group, targets)
+        else:  # K + r F = F^1/2 (F^-1/2 K F^-1/2 + r I) F^1/2
+            roots = np.sqrt(self.factors)[:, None]
+            white = kernel / (roots * roots.T)
+            found = roots * held_out_residuals(white, noises, self.group, lambda number: targets(number) / roots)
         return np.asarray(found.reshape(shape).swapaxes(1, 2))
 
     def _target(self, ridge: float | None, without: int) -> Array:
@@ -196,7 +210,8 @@ class DirectSelection:
         if self.isotropic:
             local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         local = (1 - _SHARED) * local + _SHARED * max((known**2).mean(), 1e-12) * np.eye(3)
-        return np.asarray(local / (np.trace(local, axis1=1, axis2=2).mean() / 3))
+        scatter = local / (np.trace(local, axis1=1, axis2=2).mean() / 3)
+        return np.asarray(scatter if self.factors is None else scatter * self.factors[kept, None, None])
 
     def _spread(self, ell: float, residuals: Array) -> float:
         """The least q under which the residuals are about as likely as under any, at any scale.
@@ -206,10 +221,10 @@ class DirectSelection:
         scatter = self._scatter(residuals, np.ones(len(self.group), bool))
         if self.isotropic:
             scatter = scatter[:, :1, :1]
-        costs = []
+        counted, costs = self._counted, []
         for covariance in held_out_covariances(np.exp(-ell * self._squares), scatter, _SPREADS, self.group):
-            covariances = covariance * np.eye(3) if self.isotropic else covariance
-            scale = mahalanobis(residuals, covariances).mean() / 3
+            covariances = (covariance * np.eye(3) if self.isotropic else covariance)[counted]
+            scale = mahalanobis(residuals[counted], covariances).mean() / 3
             costs.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariances)[1].mean()))
         return float(preferred(_SPREADS.tolist(), costs, min(costs) + _AS_LIKELY_NAT))
 

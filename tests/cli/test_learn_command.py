@@ -14,6 +14,7 @@ from service.learning.skill_file import decoded
 from sim.scene import Scene
 from sim.teach import demonstrations
 from support.cell import thirdhand, told
+from support.fine_motion import fine
 from support.paths import RECORDINGS
 
 
@@ -64,6 +65,23 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     assert "contradict others" in done.stderr
     assert "unsafe: " not in done.stdout
     assert not out.exists()
+
+
+def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_path: Path) -> None:
+    """Fine motion of one hand, which a noisy tracker hardly tells."""
+    takes = [tmp_path / f"fine-{seed}.mcap" for seed in range(4)]
+    for seed, path in enumerate(takes):
+        write_demonstration(path, fine(seed, 0.003))
+    out = tmp_path / "skill.npz"
+    for option, says in (
+        ((), "it is not served: nobody has accepted its residual risk: 1"),
+        (("--accept-residual-risk", "Ada"), "its residual risk is accepted by Ada"),
+    ):
+        done = told("learn", *map(str, takes), "--output", str(out), "--points", "80", *option)
+        assert done.returncode == 0, done.stderr
+        assert "residual risk: 1" in done.stdout
+        assert says in done.stderr
+        assert ("accepted by Ada: 1" in decoded(out.read_bytes(), origin="skill").residual_risk) == bool(option)
 
 
 def test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read(tmp_path: Path) -> None:

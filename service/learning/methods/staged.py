@@ -13,6 +13,7 @@ Held-out predictions use the belief that the filter has along the take, and the 
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,12 +30,14 @@ from service.core.skill.staged import Placed, StagedKMP
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration, lag
 from service.learning.division import NEAR, Encoded, along_all, ordered, recognised, task_of, via_points_never_reached
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
 from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import POSITIONS, refit
-from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, persons_of
+from service.learning.methods.weights import WEIGHTS, chosen
+from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, persons_of
 from service.learning.regions import blocks_of
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
@@ -57,6 +60,7 @@ class Hyperparameters(NamedTuple):
 
     ell: float  # of the kernel, whose inputs are shares
     noise: float  # variance of a sample / variance of the kernel
+    weight: float = 1.0  # of a new take, see `weights`
 
 
 ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
@@ -64,45 +68,62 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 class Samples(NamedTuple):
     """The samples that are learned from: inputs (N, 2 + K), outputs (N, OUTPUTS), and the numbers
-    (N,) of their demonstrations.
+    (N,) of their demonstrations, of which the first `new` are held out and judged.
     """
 
     encoded: Sequence[Encoded]
     inputs: Vector
     outputs: Vector
     owner: Indices
+    new: int
 
     @classmethod
-    def of(cls, encoded: Sequence[Encoded]) -> Self:
-        """The samples of demonstrations."""
+    def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
+        """The samples of demonstrations; the first `new` ones are no earlier ones."""
         count = len(encoded[0].stages)
-        each = [one.rows(max(LEAST_SAMPLES, SAMPLES_LEARNED // len(encoded))) for one in encoded]
+        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
+        each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
         shares, labels, outputs = (
             np.concatenate([values[rows] for values, rows in zip(column, each, strict=True)])
             for column in zip(*((one.along, one.labels, one.wanted) for one in encoded), strict=True)
         )
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
-        return cls(encoded, inputs_of(shares, labels, count), outputs, owner)
+        return cls(encoded, inputs_of(shares, labels, count), outputs, owner, new)
 
-    def best(self) -> Hyperparameters:
-        """The hyper-parameters with the least error of held-out demonstrations, if each segment of
-        the tool had the mean length.
+    def best(self, weight: float = 1.0) -> Hyperparameters:
+        """The hyper-parameters of this weight with the least error of held-out demonstrations, if
+        each segment of the tool had the mean length.
         """
         lengths = [np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in self.encoded]
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
-        errors_m = {}
-        for ell in ELLS:
-            residuals = held_out_residuals(
-                np.exp(-ell * squares), np.array(NOISES), self.owner, lambda _: self.outputs - PRIOR
+        is_new, errors_m = self.owner < self.new, {}
+        if math.isinf(weight):
+            squares, is_new, targets, owner = (
+                squares[np.ix_(is_new, is_new)],
+                is_new[is_new],
+                (self.outputs - PRIOR)[is_new],
+                self.owner[is_new],
             )
-            for noise, missed in zip(NOISES, residuals, strict=True):
-                errors_m[Hyperparameters(ell, noise)] = rms(missed[:, 1:] + missed[:, :1] * float(np.mean(lengths)))
+        else:
+            targets, owner = self.outputs - PRIOR, self.owner
+        roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None] if weight != 1.0 else 1.0
+        for ell in ELLS:
+            # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
+            kernel = np.exp(-ell * squares) / (roots * np.transpose(roots))
+            residuals = held_out_residuals(kernel, np.array(NOISES), owner, lambda _: targets / roots)
+            for noise, missed in zip(NOISES, (roots * residuals)[:, is_new], strict=True):
+                errors_m[Hyperparameters(ell, noise, weight)] = rms(
+                    missed[:, 1:] + missed[:, :1] * float(np.mean(lengths))
+                )
         return min(errors_m, key=errors_m.__getitem__)
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
         """The KMP of all demonstrations but these, adapted to where the tool is known to be."""
+        if math.isinf(parameters.weight):
+            without = [*without, *range(self.new, len(self.encoded))]
         kept = ~np.isin(self.owner, without)
-        covariance = np.tile(parameters.noise * np.eye(OUTPUTS), (int(kept.sum()), 1, 1))
+        weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
+        covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
         primitive = KMP.fit(
             self.inputs[kept],
             Gaussians(self.outputs[kept], covariance),
@@ -208,26 +229,41 @@ class Staged:
         task, _ = task_of(demonstrations)
         return None if task is None else cls(options, task)
 
-    def fit(self, takes: Sequence[Take], progress: Progress) -> Fitted:
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
         """The model of the task, its gate on the hands' distance from their segments, and its
         predictions of held-out takes.
 
         Raises SkillError if the tool never came near a via-point.
         """
-        demonstrations, names = [take.demonstration for take in takes], [take.name for take in takes]
+        takes, demonstrations = taught.new, [take.demonstration for take in taught.all]
+        names = [take.name for take in taught.all]
         remarks = via_points_never_reached(self.task, demonstrations, names)
         progress(f"learning between the via-points {', '.join(self.task.names)}")
-        delay, each_s = delay_of(demonstrations)
-        encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
-        samples, off, blocks = Samples.of(encoded), _off_m(encoded), blocks_of(persons_of(takes))
-        parameters = samples.best()
-        predictions: dict[int, _Prediction] = {}
-        for block in blocks:
-            progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
-            primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
-            for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
-                predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
+        delay, _ = delay_of(demonstrations[: len(takes)])
+        encoded = [Encoded.of(self.task, one, delay_of([one])[0].mean_s) for one in demonstrations]
+        samples, off, blocks = Samples.of(encoded, len(takes)), _off_m(encoded), blocks_of(persons_of(takes))
+
+        def predicted(parameters: Hyperparameters) -> dict[int, _Prediction]:
+            found = {}
+            for block in blocks:
+                progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
+                primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
+                for h in block:
+                    placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
+                    found[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
+            return found
+
+        weights, parameters = None, samples.best()
+        predictions = predicted(parameters)
+        if taught.earlier:
+            tried = {1.0: parameters, **{weight: samples.best(weight) for weight in WEIGHTS[1:]}}
+            by_weight = {1.0: predictions, **{weight: predicted(tried[weight]) for weight in WEIGHTS[1:]}}
+            errors_m = {
+                weight: rms(np.concatenate([one.errors for one in found.values()]))
+                for weight, found in by_weight.items()
+            }
+            weight, weights = chosen(errors_m)
+            parameters, predictions = tried[weight], by_weight[weight]
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
@@ -246,7 +282,7 @@ class Staged:
         reached = np.concatenate([one.gate_m for one in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
-        return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks)
+        return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks, weights=weights)
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
