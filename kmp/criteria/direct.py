@@ -10,12 +10,12 @@ kernel's vector k(s) and matrix K, r = `noise`, q = `spread` and d = `deviation`
     scatter      S_n ~ (1 - a) sum_m w_nm e_m e_m^T + a |e|^2 I
     weights      w_nm ~ exp(-|s_n - s_m|^2 / (2 l^2))
 
-S is scaled so that the mean of its traces is 3. A point that is less trusted has the factor f_n on
-its scatter, f_n S_n, and a group that is not judged has residuals that no choice counts. e are the residuals without each point's group,
+S is scaled so that the mean of its traces is 3; e are the residuals without each point's group,
 |e|^2 the mean of their squared coordinates, a the share that is the same everywhere, l = `local`,
-and the w_nm add up to 1. ell, r and p are those with the smallest residuals, of (K + r I)^-1; q is
-the least one under which the residuals are about as likely as under any. With C_1 the covariance
-for d = 1, H groups and sigma = `Scales.noise`,
+and the w_nm add up to 1. A point with a factor f_n has f_n S_n for S_n, and the weight 1 / f_n in
+p. Residuals of points that are not judged enter no choice. ell, r and p are those with the smallest
+residuals, of (K + r I)^-1; q is the least one under which the residuals are about as likely as
+under any. With C_1 the covariance for d = 1, H groups and sigma = `Scales.noise`,
 
     d^2 = max((H + 1) / (H - 1) mean(e^T C_1^-1 e), mean(trace(sigma^2 C_1^-1))) / 3
 
@@ -92,7 +92,12 @@ class DirectSelection:
 
     @cached_property
     def _constant(self) -> Array:
-        return np.asarray(self.outputs.mean(axis=0))
+        return np.asarray(np.average(self.outputs, axis=0, weights=self._weights))
+
+    @property
+    def _weights(self) -> Array | None:
+        """The points' weights (N,) in a prior mean; None if they are equal."""
+        return None if self.factors is None else 1.0 / self.factors
 
     @cached_property
     def _squares(self) -> Array:
@@ -229,18 +234,23 @@ class DirectSelection:
         return float(preferred(_SPREADS.tolist(), costs, min(costs) + _AS_LIKELY_NAT))
 
     def _affine(self, ridge: float, kept: NDArray[np.bool_]) -> AffineMean:
-        return ridge_mean(self.inputs[kept], self.outputs[kept], ridge, max_gain=self.scales.max_gain)
+        weights = None if self._weights is None else self._weights[kept]
+        return ridge_mean(self.inputs[kept], self.outputs[kept], ridge, max_gain=self.scales.max_gain, weights=weights)
 
 
-def ridge_mean(inputs: Array, outputs: Array, ridge: float, *, max_gain: float) -> AffineMean:
-    """The affine mean of outputs (N, O) over inputs (N, I) by ridge regression.
+def ridge_mean(
+    inputs: Array, outputs: Array, ridge: float, *, max_gain: float, weights: Array | None = None
+) -> AffineMean:
+    """The affine mean of outputs (N, O) over inputs (N, I) by ridge regression, with the weights W
+    (N,) of the points, 1 unless they are given.
 
-    A = Y^T X (X^T X + N ridge^2 I)^-1 for centred X and Y, with the singular values of A limited to
-    `max_gain`.
+    A = Y^T W X (X^T W X + tr(W) ridge^2 I)^-1 for centred X and Y, with the singular values of A
+    limited to `max_gain`.
     """
-    centre, middle = inputs.mean(axis=0), outputs.mean(axis=0)
-    off = inputs - centre
-    square = off.T @ off + len(inputs) * ridge**2 * np.eye(inputs.shape[1])
-    u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (outputs - middle)).T, full_matrices=False)
+    centre, middle = (np.average(part, axis=0, weights=weights) for part in (inputs, outputs))
+    off, total = inputs - centre, len(inputs) if weights is None else float(weights.sum())
+    weighed = off if weights is None else weights[:, None] * off
+    square = weighed.T @ off + total * ridge**2 * np.eye(inputs.shape[1])
+    u, gains, v = np.linalg.svd(np.linalg.solve(square, weighed.T @ (outputs - middle)).T, full_matrices=False)
     matrix = (u * np.minimum(gains, max_gain)) @ v
     return AffineMean(matrix, middle - matrix @ centre)

@@ -79,7 +79,7 @@ def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_their
     assert sorted(row.name for row in both.demonstrations) == ["a", "b", "c", "d"]
     assert both.weights_mm[both.weight] < both.weights_mm["1"]
     assert both.delay_s is not None
-    with pytest.raises(SkillError, match=r"demonstration 1 has the via-points \(none\): start, .* needed, as in the"):
+    with pytest.raises(SkillError, match=r"demonstration 1 has the via-points \(none\): stage 1, .* needed, as in the"):
         learn([one._replace(places=()) for one in mine[:2]], refined=skill)
 
 

@@ -8,7 +8,7 @@ is given, the inputs are the positions, and the tool's lag is removed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -84,13 +84,13 @@ class HandInputs:
     def fit(self, taught: Taught, progress: Progress) -> Fitted:
         """The model of the chosen kind of inputs, and its predictions of held-out takes.
 
-        If a skill is refined, the kind is chosen with equal weights of all takes, and then the
-        weight of the new ones.
+        If a skill is refined, the weight of the new takes is chosen with the kind.
         """
         takes, earlier = taught.new, taught.earlier
         remarks = [self.why_not_staged] if self.why_not_staged else []
         points, ell = self.options.points, self.options.ell
-        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(taught, points, progress)
+        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, points, progress)
+        kind = found.kind
         if kind.alone is not None:
             remarks.append(
                 f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
@@ -98,11 +98,7 @@ class HandInputs:
             )
         inputs = [take.hands if ell is not None else kind.of(take.demonstration) for take in takes]
         before = [kind.of(take.demonstration) for take in earlier]
-        weight, weights = 1.0, None
-        if earlier:
-            progress(f"choosing the weight of {len(takes)} new demonstrations against {len(earlier)} earlier ones")
-            errors_m = {one: _weighted(kind, taught, one, points).best_mean(may_be_linear=True)[0] for one in WEIGHTS}
-            weight, weights = chosen(errors_m)
+        weight, weights = chosen(found.by_weight_m)
         if math.isinf(weight):
             earlier, before = [], []
         progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
@@ -127,9 +123,9 @@ class HandInputs:
             gate,
             conductor=kind.alone,
             taken=kind.name,
-            tried_m=tried_m,
+            tried_m=found.tried_m,
             remarks=remarks,
-            weights=weights,
+            weights=weights if taught.earlier else None,
         )
 
 
@@ -181,11 +177,24 @@ def refit(
     return lambda without: choice.primitive(parameters, residuals, without=without)
 
 
-def _chosen(taught: Taught, points: int, progress: Progress) -> tuple[Inputs, dict[str, float]]:
-    """The simplest kind of inputs that is as good as any, and the error [m] of each kind."""
-    kinds, tried_m = candidates([take.demonstration for take in taught.all]), dict[str, float]()
+class Chosen(NamedTuple):
+    """A kind of inputs, the error [m] of each kind, and that of this one with each weight."""
+
+    kind: Inputs
+    tried_m: Mapping[str, float]
+    by_weight_m: Mapping[float, float]
+
+
+def _chosen(taught: Taught, points: int, progress: Progress) -> Chosen:
+    """The simplest kind of inputs that is as good as any, each with its best weight."""
+    kinds, weights = candidates([take.demonstration for take in taught.all]), WEIGHTS if taught.earlier else WEIGHTS[:1]
+    errors_m: dict[str, dict[float, float]] = {}
     for kind in kinds:
         progress(f"trying {kind.name}")
-        tried_m[kind.name] = _weighted(kind, taught, 1.0, points).best_mean(may_be_linear=True)[0]
+        errors_m[kind.name] = {
+            weight: _weighted(kind, taught, weight, points).best_mean(may_be_linear=True)[0] for weight in weights
+        }
+    tried_m = {name: min(by_weight.values()) for name, by_weight in errors_m.items()}
     least_m = min(tried_m.values())
-    return preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M)), tried_m
+    kind = preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
+    return Chosen(kind, tried_m, errors_m[kind.name])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
@@ -51,6 +51,7 @@ UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
 MOST_DELAY_S = 0.6  # a teacher's delay is at most this long
+DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, MOST_DELAY_S)  # candidates for the delay of few takes, which refine a skill
 WITHOUT_PLACES = "without places"  # in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
 
@@ -212,6 +213,39 @@ class _Prediction(NamedTuple):
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
 
 
+def _predictions(
+    task: Task, samples: Samples, parameters: Hyperparameters, off: Vector, blocks: Sequence[list[int]], delay_s: float
+) -> dict[int, _Prediction]:
+    """The predictions of the new demonstrations, each without its block."""
+    found = {}
+    for block in blocks:
+        primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
+        for h in block:
+            placed = Placed.of(task, samples.encoded[h].at, off, primitive, np.empty((0, 6)))
+            found[h] = _Prediction.of(samples.encoded[h], placed, delay_s)
+    return found
+
+
+def _error_m(predictions: Mapping[int, _Prediction]) -> float:
+    """The root mean square error [m] of predictions."""
+    return rms(np.concatenate([one.errors for one in predictions.values()]))
+
+
+def held_out_delay(task: Task, demonstrations: Sequence[Demonstration], blocks: Sequence[list[int]]) -> Delay:
+    """The delay of DELAYS_S that predicts demonstrations best which are held out in blocks; its
+    deviation is that of the delays that are best for each.
+    """
+    squares = []
+    for delay_s in DELAYS_S:
+        encoded = [Encoded.of(task, one, delay_s) for one in demonstrations]
+        samples = Samples.of(encoded, len(encoded))
+        found = _predictions(task, samples, samples.best(), _off_m(encoded), blocks, delay_s)
+        squares.append([float((found[h].errors ** 2).sum(axis=1).mean()) for h in range(len(demonstrations))])
+    candidates_s = np.array(DELAYS_S)
+    best_s = candidates_s[np.mean(squares, axis=1).argmin()]
+    return Delay(float(best_s), float(np.std(candidates_s[np.argmin(squares, axis=0)])))
+
+
 @dataclass(frozen=True)
 class Staged:
     """The method with its options, for a task."""
@@ -239,31 +273,19 @@ class Staged:
         names = [take.name for take in taught.all]
         remarks = via_points_never_reached(self.task, demonstrations, names)
         progress(f"learning between the via-points {', '.join(self.task.names)}")
-        delay, _ = delay_of(demonstrations[: len(takes)])
-        encoded = [Encoded.of(self.task, one, delay_of([one])[0].mean_s) for one in demonstrations]
-        samples, off, blocks = Samples.of(encoded, len(takes)), _off_m(encoded), blocks_of(persons_of(takes))
-
-        def predicted(parameters: Hyperparameters) -> dict[int, _Prediction]:
-            found = {}
-            for block in blocks:
-                progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
-                primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
-                for h in block:
-                    placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
-                    found[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
-            return found
-
-        weights, parameters = None, samples.best()
-        predictions = predicted(parameters)
+        blocks = blocks_of(persons_of(takes))
+        delay, each_s = delay_of(demonstrations)
         if taught.earlier:
-            tried = {1.0: parameters, **{weight: samples.best(weight) for weight in WEIGHTS[1:]}}
-            by_weight = {1.0: predictions, **{weight: predicted(tried[weight]) for weight in WEIGHTS[1:]}}
-            errors_m = {
-                weight: rms(np.concatenate([one.errors for one in found.values()]))
-                for weight, found in by_weight.items()
-            }
-            weight, weights = chosen(errors_m)
-            parameters, predictions = tried[weight], by_weight[weight]
+            progress(f"choosing the delay over {len(takes)} new demonstrations")
+            delay = held_out_delay(self.task, demonstrations[: len(takes)], blocks)
+            each_s[: len(takes)] = [delay.mean_s] * len(takes)
+        encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
+        samples, off = Samples.of(encoded, len(takes)), _off_m(encoded)
+        progress(f"holding out {len(takes)} demonstrations")
+        tried = [samples.best(weight) for weight in (WEIGHTS if taught.earlier else WEIGHTS[:1])]
+        found = {one.weight: _predictions(self.task, samples, one, off, blocks, delay.mean_s) for one in tried}
+        weight, weights = chosen({one: _error_m(predictions) for one, predictions in found.items()})
+        parameters, predictions = next(one for one in tried if one.weight == weight), found[weight]
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
@@ -282,6 +304,7 @@ class Staged:
         reached = np.concatenate([one.gate_m for one in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
+        weights = weights if taught.earlier else None
         return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks, weights=weights)
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
