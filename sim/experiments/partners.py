@@ -132,8 +132,9 @@ def part(one: Part) -> Found:
     named = bool(shown[0].demonstration.places)
     found = Found({}, {})
     if one.task not in TASK_KINDS:
-        found = found._replace(moved=RigidMap.of(shown, Settings().reach))
-        shown, asked = ([found.moved.moved(take) for take in takes] for takes in (shown, asked))
+        into_reach = RigidMap.of(shown, Settings().reach)
+        found = found._replace(moved=into_reach)
+        shown, asked = (list(map(into_reach.moved, some)) for some in (shown, asked))
     for told in [False] * (one.task not in TASK_KINDS) + [True] * named:
         for name, rival in RIVALS.items():
             said = left_out_by(rival, shown, asked, told=told)
@@ -259,7 +260,7 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
             "unsafe": sum(bool(one.unsafe) for one in figures),
             "says": [*figures[0].unsafe, *figures[0].warnings] if figures else [],
         }
-    more = {"moved": [part.moved for part in found]} if found[0].moved else {}
+    more: dict[str, Any] = {"moved": [part.moved for part in found]} if found[0].moved else {}
     if own := [part.own for part in found if part.own]:
         weights = [fold.figures.weight for fold in own if fold.figures]
         more["own_takes"] = summary([one for fold in own for one in fold.accepted if one]) | {

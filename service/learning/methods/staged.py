@@ -304,8 +304,15 @@ class Staged:
         reached = np.concatenate([one.gate_m for one in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
-        weights = weights if taught.earlier else None
-        return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks, weights=weights)
+        return Fitted(
+            model,
+            in_order,
+            gate,
+            delay,
+            baselines=baselines,
+            remarks=remarks,
+            weights=weights if taught.earlier else None,
+        )
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
