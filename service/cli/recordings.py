@@ -28,7 +28,7 @@ from service.files.shipped import cell_of
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.learning.records import Evidence
-from service.learning.residual_risk import LONGEST_NAME, OPTION, ResidualRisk
+from service.learning.residual_risk import LONGEST_NAME, OPTION
 from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
@@ -164,7 +164,8 @@ def learn(args: argparse.Namespace) -> int:
         print(
             f"its residual risk is accepted by {printable(figures.accepted_by)}"
             if figures.accepted_by
-            else f"it is not served: {ResidualRisk.of(skill.figures).refusal}",
+            else "it is not served until somebody accepts its residual risk, named above: learn it again with "
+            f"{OPTION} NAME",
             file=sys.stderr,
         )
     return 0

@@ -130,8 +130,7 @@ RULES = (
     ),
     Rule(
         lambda s: s.all.error_mm > NOTED_MM and not _is_unexplained(s),
-        "held-out demonstrations are missed by {s.all.error_mm:.0f} mm: where the hands are tells little of where the "
-        f"tool is; up to {RESIDUAL_MM:.0f} mm accepted",
+        f"held-out demonstrations are missed by {{s.all.error_mm:.0f}} mm, up to {RESIDUAL_MM:.0f} mm accepted",
         severity=lambda s: "residual" if s.all.error_mm > RESIDUAL_MM else "warning",
         remedy=": more demonstrations, or named via-points (record --places), help",
     ),

@@ -75,7 +75,7 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
         write_demonstration(path, fine(seed, 0.003))
     out = tmp_path / "skill.npz"
     for option, says in (
-        ((), "it is not served: nobody has accepted its residual risk: 1"),
+        ((), "it is not served until somebody accepts its residual risk, named above"),
         (("--accept-residual-risk", "Ada"), "its residual risk is accepted by Ada"),
     ):
         done = told("learn", *map(str, takes), "--output", str(out), "--points", "80", *option)

@@ -24,7 +24,7 @@ from service.settings.config import Reach
 from sim.experiments.people.left_out import LeftOut
 from sim.experiments.results import Array
 
-SHARE = 0.02  # of the tool's samples that may be less deep
+SHALLOW_SHARE = 0.02  # of the tool's samples that may be less deep
 GRID_M = 0.05  # distance of the centres that are tried
 SAMPLES = 20  # of a take
 
@@ -69,7 +69,7 @@ class RigidMap(NamedTuple):
         for turns in range(4):
             at = RigidMap(turns, tuple(mean.tolist()), (0.0,) * 3)
             off = at.positions(tool)
-            depths = [float(np.quantile(depth_m(off + centre, reach), SHARE)) for centre in grid]
+            depths = [float(np.quantile(depth_m(off + centre, reach), SHALLOW_SHARE)) for centre in grid]
             deepest = int(np.argmax(depths))
             found = at._replace(centre=tuple(np.round(grid[deepest], 3).tolist()))
             best = max(best, (depths[deepest], found), key=lambda one: one[0])
