@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -71,7 +72,7 @@ def page() -> str:
     why = staleness("sensitivity", result, tree()) if measured else ""
     state = f"{len(measured)} of {len(known)} numbers have been measured; no session reads {unread} of these."
     if why:
-        state += f" *Measured with an earlier version: {why}.*"
+        state = textwrap.fill(f"{state} *Measured with an earlier version: {why}.*", 100, break_long_words=False)
     head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
     return head + "".join(
         part

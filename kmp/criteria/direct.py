@@ -12,9 +12,10 @@ kernel's vector k(s) and matrix K, r = `noise`, q = `spread` and d = `deviation`
 
 S is scaled so that the mean of its traces is 3; e are the residuals without each point's group,
 |e|^2 the mean of their squared coordinates, a the share that is the same everywhere, l = `local`,
-and the w_nm add up to 1. ell, r and p are those with the smallest residuals, of (K + r I)^-1; q is
-the least one under which the residuals are about as likely as under any. With C_1 the covariance
-for d = 1, H groups and sigma = `Scales.noise`,
+and the w_nm add up to 1. A point with a factor f_n has f_n S_n for S_n, and the weight 1 / f_n in
+p. Residuals of points that are not judged enter no choice. ell, r and p are those with the smallest
+residuals, of (K + r I)^-1; q is the least one under which the residuals are about as likely as
+under any. With C_1 the covariance for d = 1, H groups and sigma = `Scales.noise`,
 
     d^2 = max((H + 1) / (H - 1) mean(e^T C_1^-1 e), mean(trace(sigma^2 C_1^-1))) / 3
 
@@ -86,10 +87,17 @@ class DirectSelection:
     scales: Scales
     isotropic: bool = False  # True if S is a multiple of I at each point, which costs a ninth of the time
     joint: bool = False  # True if the prior mean is chosen with the kernel, not after it
+    factors: Array | None = None  # (N,) f_n; None if all are 1
+    judged: NDArray[np.bool_] | None = None  # (N,) True for points whose residuals count; None if all do
 
     @cached_property
     def _constant(self) -> Array:
-        return np.asarray(self.outputs.mean(axis=0))
+        return np.asarray(np.average(self.outputs, axis=0, weights=self._weights))
+
+    @property
+    def _weights(self) -> Array | None:
+        """The points' weights (N,) in a prior mean; None if they are equal."""
+        return None if self.factors is None else 1.0 / self.factors
 
     @cached_property
     def _squares(self) -> Array:
@@ -98,6 +106,10 @@ class DirectSelection:
     @cached_property
     def _targets(self) -> dict[tuple[float | None, int], Array]:
         return {}
+
+    @cached_property
+    def _counted(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.group), bool) if self.judged is None else self.judged
 
     def best_mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
         """The root mean square residual and the parameters of the best mean.
@@ -124,7 +136,7 @@ class DirectSelection:
         for ell in ells.tolist():
             for noise, by_ridge in zip(_NOISES.tolist(), self._residuals(ell, _NOISES, ridges), strict=True):
                 for ridge, residuals in zip(ridges, by_ridge, strict=True):
-                    yield rms(residuals), Parameters(ell, noise, 1.0, 1.0, ridge)
+                    yield rms(residuals[self._counted]), Parameters(ell, noise, 1.0, 1.0, ridge)
 
     def parameters(self, ell: float | None = None, *, may_be_linear: bool = False) -> Parameters:
         """The parameters that predict held-out groups best, with this ell or one of the scales.
@@ -137,7 +149,7 @@ class DirectSelection:
         unscaled = unscaled._replace(spread=spread)
         residuals = self.residuals(unscaled.ell, unscaled.noise, unscaled.ridge)
         squares, floors = [], []
-        groups = np.unique(self.group)
+        groups = np.unique(self.group[self._counted])
         for number in groups.tolist():
             mine = self.group == number
             found = self.primitive(unscaled, residuals, without=number).predict(self.inputs[mine])
@@ -154,9 +166,16 @@ class DirectSelection:
     def _residuals(self, ell: float, noises: Array, ridges: Sequence[float | None]) -> Array:
         """The residuals (J, R, N, 3) for noises (J,) and prior means of these ridges (R,)."""
         kernel, shape = np.exp(-ell * self._squares), (len(noises), len(self.group), len(ridges), 3)
-        found = held_out_residuals(
-            kernel, noises, self.group, lambda number: np.hstack([self._target(ridge, number) for ridge in ridges])
-        )
+
+        def targets(number: int) -> Array:
+            return np.hstack([self._target(ridge, number) for ridge in ridges])
+
+        if self.factors is None:
+            found = held_out_residuals(kernel, noises, self.group, targets)
+        else:  # K + r F = F^1/2 (F^-1/2 K F^-1/2 + r I) F^1/2
+            roots = np.sqrt(self.factors)[:, None]
+            white = kernel / (roots * roots.T)
+            found = roots * held_out_residuals(white, noises, self.group, lambda number: targets(number) / roots)
         return np.asarray(found.reshape(shape).swapaxes(1, 2))
 
     def _target(self, ridge: float | None, without: int) -> Array:
@@ -196,7 +215,8 @@ class DirectSelection:
         if self.isotropic:
             local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         local = (1 - _SHARED) * local + _SHARED * max((known**2).mean(), 1e-12) * np.eye(3)
-        return np.asarray(local / (np.trace(local, axis1=1, axis2=2).mean() / 3))
+        scatter = local / (np.trace(local, axis1=1, axis2=2).mean() / 3)
+        return np.asarray(scatter if self.factors is None else scatter * self.factors[kept, None, None])
 
     def _spread(self, ell: float, residuals: Array) -> float:
         """The least q under which the residuals are about as likely as under any, at any scale.
@@ -206,26 +226,31 @@ class DirectSelection:
         scatter = self._scatter(residuals, np.ones(len(self.group), bool))
         if self.isotropic:
             scatter = scatter[:, :1, :1]
-        costs = []
+        counted, costs = self._counted, []
         for covariance in held_out_covariances(np.exp(-ell * self._squares), scatter, _SPREADS, self.group):
-            covariances = covariance * np.eye(3) if self.isotropic else covariance
-            scale = mahalanobis(residuals, covariances).mean() / 3
+            covariances = (covariance * np.eye(3) if self.isotropic else covariance)[counted]
+            scale = mahalanobis(residuals[counted], covariances).mean() / 3
             costs.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariances)[1].mean()))
         return float(preferred(_SPREADS.tolist(), costs, min(costs) + _AS_LIKELY_NAT))
 
     def _affine(self, ridge: float, kept: NDArray[np.bool_]) -> AffineMean:
-        return ridge_mean(self.inputs[kept], self.outputs[kept], ridge, max_gain=self.scales.max_gain)
+        weights = None if self._weights is None else self._weights[kept]
+        return ridge_mean(self.inputs[kept], self.outputs[kept], ridge, max_gain=self.scales.max_gain, weights=weights)
 
 
-def ridge_mean(inputs: Array, outputs: Array, ridge: float, *, max_gain: float) -> AffineMean:
-    """The affine mean of outputs (N, O) over inputs (N, I) by ridge regression.
+def ridge_mean(
+    inputs: Array, outputs: Array, ridge: float, *, max_gain: float, weights: Array | None = None
+) -> AffineMean:
+    """The affine mean of outputs (N, O) over inputs (N, I) by ridge regression, with the weights W
+    (N,) of the points, 1 unless they are given.
 
-    A = Y^T X (X^T X + N ridge^2 I)^-1 for centred X and Y, with the singular values of A limited to
-    `max_gain`.
+    A = Y^T W X (X^T W X + tr(W) ridge^2 I)^-1 for centred X and Y, with the singular values of A
+    limited to `max_gain`.
     """
-    centre, middle = inputs.mean(axis=0), outputs.mean(axis=0)
-    off = inputs - centre
-    square = off.T @ off + len(inputs) * ridge**2 * np.eye(inputs.shape[1])
-    u, gains, v = np.linalg.svd(np.linalg.solve(square, off.T @ (outputs - middle)).T, full_matrices=False)
+    centre, middle = (np.average(part, axis=0, weights=weights) for part in (inputs, outputs))
+    off, total = inputs - centre, len(inputs) if weights is None else float(weights.sum())
+    weighed = off if weights is None else weights[:, None] * off
+    square = weighed.T @ off + total * ridge**2 * np.eye(inputs.shape[1])
+    u, gains, v = np.linalg.svd(np.linalg.solve(square, weighed.T @ (outputs - middle)).T, full_matrices=False)
     matrix = (u * np.minimum(gains, max_gain)) @ v
     return AffineMean(matrix, middle - matrix @ centre)

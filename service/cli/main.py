@@ -21,6 +21,7 @@ from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.contract.roles import DAEMON, ROLES
+from service.learning.residual_risk import OPTION
 from service.process import interrupt
 from service.process.progress import say
 from service.settings.file_content import SettingsError, UnreadableError
@@ -211,8 +212,10 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "learn",
         "Learns a skill from demonstrations and judges it by held-out ones: each is left out once and predicted "
-        "from the others. An unsafe skill is not written, and the exit code is 1.",
-        "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png",
+        "from the others. An unsafe skill is not written, and the exit code is 1. A skill with a residual risk is "
+        "written, but the daemon serves it only if somebody has accepted that.",
+        "thirdhand learn recordings/demonstration-[1-5].mcap --output soldering.npz --plot soldering.png\n"
+        "  thirdhand learn --from soldering.npz mine-[1-3].mcap --output mine.npz",
     )
     demonstrations = (
         "demonstrations with hands/left, hands/right and tool/pose or the arm's joints/state: MCAP, .db3, a bag's "
@@ -228,6 +231,11 @@ def parser() -> argparse.ArgumentParser:
         )
     option(c, "--output", "FILE", "write the skill to this .npz file", required=True)
     option(c, "--plot", "FILE", "draw the held-out errors to this .png file")
+    refine = (
+        "refine the skill in this .npz file: learn from its demonstrations and these, which are of those who will work "
+        "with it and count as much more as predicts them best; about three are enough"
+    )
+    option(c, "--from", "FILE", refine, dest="refined")
     c.add_argument("--name", help="the name of the skill (default: the name of the file)")
     option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM_HELP}")
     places = (
@@ -235,6 +243,11 @@ def parser() -> argparse.ArgumentParser:
         "skill is then learned between these via-points and follows them when they move"
     )
     option(c, "--places", "FILE", places)
+    accept = (
+        "accept the residual risk of the skill, if it has one, in the name of this person, who takes responsibility "
+        "for it; skill, daemon and status name both"
+    )
+    option(c, OPTION, "NAME", accept)
     count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
     option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
     ell = "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)"

@@ -7,16 +7,17 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 
 from kmp import AffineMean
-from service.cli.usage import check_writable, places_in, reached
+from service.cli.usage import UsageError, check_writable, places_in, reached
 from service.client import Client, Tracker
 from service.contract import cdr
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.messages import WireError
-from service.contract.printable import printable_lines
+from service.contract.printable import printable, printable_lines
 from service.contract.requests import Status
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.mcap_file import ends_early
@@ -27,9 +28,13 @@ from service.files.shipped import cell_of
 from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.learning.records import Evidence
+from service.learning.residual_risk import LONGEST_NAME, OPTION
+from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
+from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
+from service.settings.file_content import UnusableError, content
 
 COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 
@@ -94,13 +99,27 @@ def replay(args: argparse.Namespace) -> int:
     return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
 
 
+def _refined(path: Path) -> StoredSkill:
+    """The skill in a file, whose demonstrations can be read. Raises SkillError."""
+    try:
+        skill = decoded(content(path, LARGEST_FILE), origin=str(path))
+    except (OSError, UnusableError) as error:
+        raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
+    stored_demonstrations(skill)  # before the new ones are read
+    return skill
+
+
 def learn(args: argparse.Namespace) -> int:
     """Learn a skill; exit code 0 once it is written. An unsafe skill is not written."""
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
+    accepted_by = (args.accept_residual_risk or "").strip()
+    if len(accepted_by) > LONGEST_NAME:
+        raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
     if args.demonstrations[0].exists():  # else its reader reports the missing file
         check_count([path.stem for path in args.demonstrations], args.components)
+    refined = _refined(args.refined) if args.refined else None
     settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()
@@ -123,6 +142,8 @@ def learn(args: argparse.Namespace) -> int:
             penalty=args.penalty,
             seed=args.seed,
             reach=settings.reach if settings else None,
+            accepted_by=accepted_by,
+            refined=refined,
             progress=doing,
             show=evidence.append,
         )
@@ -139,4 +160,12 @@ def learn(args: argparse.Namespace) -> int:
         f"{args.output}: {len(primitive.inputs)} reference points{over}; it holds as far_from_demonstrations "
         f"where {skill.model.measure} is above {1000 * skill.threshold:.0f} mm"
     )
+    if figures.residual:
+        print(
+            f"its residual risk is accepted by {printable(figures.accepted_by)}"
+            if figures.accepted_by
+            else "it is not served until somebody accepts its residual risk, named above: learn it again with "
+            f"{OPTION} NAME",
+            file=sys.stderr,
+        )
     return 0

@@ -123,6 +123,7 @@ def rows(now: Status) -> dict[str, str]:
         "what to do": now.remedy,
         **{flag: f"{what_happened(flag)}. What to do: {what_to_do(flag)}" for flag in now.flags if flag != STUCK},
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
+        "residual risk": now.residual_risk,
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
         "scheduling": granted,
         "left hand": _where(now, "left"),

@@ -232,6 +232,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     threshold_m: float = 0.0  # limit of that deviation
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none
+    residual_risk: str = ""  # of the skill, and who accepted it; empty: none
 
     @property
     def needed(self) -> tuple[str, ...]:

@@ -378,9 +378,13 @@ class Daemon:
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
     """The skill in a file, with the via-points that were taught to it before.
 
-    Raises SkillError, also if the arm does not reach most of the skill's tool positions.
+    Raises SkillError, also if the arm does not reach most of the skill's tool positions, or if
+    nobody accepted the skill's residual risk.
     """
     skill, saved = skill_of(path), SavedViaPoints(settings)
+    skill.check_accepted()
+    if skill.residual_risk:
+        log.warning("residual risk of skill %r, %s", skill.name, skill.residual_risk)
 
     def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
         if points == skill.via_points:

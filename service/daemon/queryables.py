@@ -333,7 +333,8 @@ class Queryables:
         finally:
             draft.unlink(missing_ok=True)
         before, self._skill, self._in_force = self._skill, skill, in_force(skill)
-        return Reply(tick, self._in_force, (*filter(None, (remark, found.text)), *warnings_of(before, skill)))
+        risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
+        return Reply(tick, self._in_force, (*filter(None, (remark, risk, found.text)), *warnings_of(before, skill)))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
@@ -344,6 +345,7 @@ class Queryables:
             names = ", ".join(found) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder; its skills: {names}")
         skill, remark = self._skill_worker.load(path), ""
+        skill.check_accepted()
         if saved := self._saved.read(skill):
             points, tolerance = saved
             skill, remark = self._skill_worker.adapt(skill, points, tolerance=tolerance), self._saved.remark

@@ -62,6 +62,7 @@ class CellStatus(NamedTuple):
             flags=tuple(map(word, flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
+            residual_risk=skill.residual_risk,
             hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
             places=tuple(point.name for point in skill.via_points),
             rejected=_by_cause(sources),

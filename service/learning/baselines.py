@@ -27,6 +27,15 @@ def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
     }
 
 
+def constant_errors(takes: Sequence[Take]) -> list[Vector]:
+    """The errors (T, 3) [m] of each take by the mean position of the tool in other persons' takes;
+    empty if there is one person only.
+    """
+    if len({take.person for take in takes}) < 2:
+        return []
+    return held_out_errors(takes, lambda hands, tool, queries: tool.mean(axis=0))
+
+
 def linear(hands: Vector, tool: Vector, queries: Vector) -> Vector:
     """The tool (M, 3) [m] for hands `queries` (M, 6), by the affine function that fits hands (T, 6)
     and tool (T, 3) best.

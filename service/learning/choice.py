@@ -40,18 +40,36 @@ def selection_of(
     persons: NDArray[np.intp] | None = None,
     isotropic: bool = False,
     rich: bool = False,
+    earlier: int = 0,
+    factor: float = 1.0,
 ) -> DirectSelection:
     """About `points` reference points of demonstrations, each inputs (T, I) and tool (T, 3) [m], in
     groups by `persons` (H,); None if each is by another person.
 
-    Those of `rich` inputs are even in time, and their prior mean is chosen with the kernel.
+    Those of `rich` inputs are even in time, and their prior mean is chosen with the kernel. The
+    last `earlier` pairs are of a skill that is refined: their points have this `factor` on their
+    noise, and are not judged.
     """
-    each = max(LEAST_POINTS, points // len(pairs))
-    parts = [(even_in_time if rich else thinned)(inputs, tool, each) for inputs, tool in pairs]
+    counts = shared_counts(points, len(pairs) - earlier, earlier, LEAST_POINTS)
+    parts = [(even_in_time if rich else thinned)(*pair, each) for pair, each in zip(pairs, counts, strict=True)]
     numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     group = np.repeat(numbers, [len(one) for one, _ in parts])
-    return DirectSelection(inputs, outputs, group, RICH_SCALES if rich else POSITION_SCALES, isotropic, joint=rich)
+    scales = RICH_SCALES if rich else POSITION_SCALES
+    if not earlier:
+        return DirectSelection(inputs, outputs, group, scales, isotropic, joint=rich)
+    is_new = np.repeat(np.arange(len(pairs)) < len(pairs) - earlier, [len(one) for one, _ in parts])
+    factors = np.where(is_new, 1.0, factor)
+    return DirectSelection(inputs, outputs, group, scales, isotropic, rich, factors, is_new)
+
+
+def shared_counts(count: int, new: int, earlier: int, least: int) -> list[int]:
+    """The numbers of points of each new and each earlier take, of about `count` in all and at least
+    `least` each: with earlier takes, half of them are for the new ones.
+    """
+    if not earlier:
+        return [max(least, count // new)] * new
+    return [max(least, count // 2 // new)] * new + [max(least, count // 2 // earlier)] * earlier
 
 
 def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:

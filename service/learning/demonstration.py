@@ -81,6 +81,13 @@ class Demonstration(NamedTuple):
         return one._replace(begins=tuple(sorted({-(-begin // step) for begin in self.begins})))
 
 
+class NamedDemonstration(NamedTuple):
+    """A demonstration with its name in the figures."""
+
+    name: str
+    demonstration: Demonstration
+
+
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     """The hash with which a skill names the demonstrations that it was learned from."""
     parts = (

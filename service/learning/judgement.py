@@ -14,7 +14,7 @@ from service.core.frame import Vector
 from service.core.skill.model import LEVELS, Regions
 from service.core.skill.skill import is_reachable
 from service.learning.ambiguity import COMPARED, contradictions, lengths
-from service.learning.baselines import baselines
+from service.learning.baselines import baselines, constant_errors
 from service.learning.records import Figures, Fitted, HeldOut, Pose, Row, TimedErrors, persons_of
 from service.learning.regions import calibrated, calibrated_without, timed_errors
 from service.learning.takes import Division, conductor_of
@@ -34,8 +34,13 @@ class Judgement(NamedTuple):
     inside: Vector
 
 
-def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach) -> Judgement:
-    """The judgement of a model and pose that were learned from takes."""
+def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, accepted_by: str = "") -> Judgement:
+    """The judgement of a model and pose that were learned from takes; `accepted_by` is the person
+    who accepts its residual risks.
+
+    With the errors e of held-out takes and d those of the mean position of the other persons' tool,
+    the explained share of the variance is 1 - Σ |e|² / Σ |d|².
+    """
     takes, held_out, gate, delay = division.takes, fitted.held_out, fitted.gate, fitted.delay
     persons = persons_of(takes)
     timed = [one.timed or timed_errors(one) for one in held_out]
@@ -76,10 +81,13 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach) -> Judg
         one_beside=100 * gate.caught.one_beside,
         ambiguous=100 * contradicting.share,
         beyond_reach=100 * _share_beyond(held_out, reach),
+        explained=_explained(held_out, constant_errors(takes)),
         orientation_error_deg=pose.turn_error_deg,
         gripper_right=pose.gripper_right,
         tried_mm={name: 1000 * error_m for name, error_m in fitted.tried_m.items()},
         taken=fitted.taken if fitted.tried_m else "",
+        weight=fitted.weights.taken if fitted.weights else "",
+        weights_mm={name: 1000 * error_m for name, error_m in fitted.weights.tried_m.items()} if fitted.weights else {},
         by_person=len(np.unique(persons)) < len(takes),
         delay_s=delay.mean_s if delay else None,
         delay_std_s=delay.std_s if delay else 0.0,
@@ -94,9 +102,15 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach) -> Judg
         float(np.median([row.error_mm for row in rows])),
     )
     found = [*verdicts(subject), *pose.verdicts]
-    warnings, unsafe = ([one.text for one in found if one.severity == kind] for kind in ("warning", "unsafe"))
+    warnings, residual, unsafe = (
+        tuple(one.text for one in found if one.severity == kind) for kind in ("warning", "residual", "unsafe")
+    )
     figures = msgspec.structs.replace(
-        figures, warnings=(*division.remarks, *fitted.remarks, *warnings), unsafe=tuple(unsafe)
+        figures,
+        warnings=(*division.remarks, *fitted.remarks, *warnings),
+        residual=residual,
+        accepted_by=accepted_by if residual else "",
+        unsafe=unsafe,
     )
     inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
     return Judgement(figures, calibrated(timed, persons), inside)
@@ -106,6 +120,18 @@ def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:
     """The share of the tool's positions that are out of the arm's reach."""
     some = (one.take.position[:: max(1, len(one.errors) // COMPARED)] for one in held_out)
     return float(np.mean([not is_reachable(at, reach) for positions in some for at in positions]))
+
+
+def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float | None:
+    """The share [%] of the tool's variance that is explained, given the errors (T, 3) [m] of a
+    constant prediction of each take; None if there are none.
+    """
+    if not constant:
+        return None
+    missed, varies = (
+        float(sum((errors**2).sum() for errors in each)) for each in ([one.errors for one in held_out], constant)
+    )
+    return 100 * (1 - missed / varies) if varies > 0.0 else None
 
 
 def _row(

@@ -11,9 +11,10 @@ from collections.abc import Callable, Sequence
 from service.learning.demonstration import Demonstration
 from service.learning.judgement import judged
 from service.learning.pose import learned_pose
-from service.learning.records import Evidence, Fitted, Options, Pose, Progress
+from service.learning.records import Evidence, Fitted, Options, Pose, Progress, Taught
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.store import stored
+from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.takes import Division, divided
 from service.settings.config import Reach
 
@@ -30,6 +31,8 @@ def learn(
     spread_m: float = 0.01,
     seed: int = 0,
     reach: Reach | None = None,
+    accepted_by: str = "",
+    refined: StoredSkill | None = None,
     progress: Progress = lambda line: None,
     show: Callable[[Evidence], None] = lambda evidence: None,
 ) -> StoredSkill:
@@ -43,14 +46,18 @@ def learn(
     * `spread_m`: added to the standard deviation of a mixture's reference [m].
     * `seed`: seed of the mixture.
     * `reach`: reach of the arm, in which the tool's path should be.
+    * `accepted_by`: person who accepts the residual risks of the skill; empty for nobody.
+    * `refined`: skill that is refined by the demonstrations. Those in its file are learned from as
+      well; only the new ones, and those of the same persons, are held out and judged.
     * `progress`: called with a line of text before each step.
     * `show`: called with the basis of the figures.
 
     Raises SkillError if nothing can be learned.
     """
-    division = divided(demonstrations, names, Options(points, ell, components, penalty, spread_m, seed))
+    options = Options(points, ell, components, penalty, spread_m, seed)
+    division = divided(demonstrations, names, options, stored_demonstrations(refined) if refined else ())
     fitted, pose = _fitted(division, progress)
-    judgement = judged(division, fitted, pose, reach or Reach())
+    judgement = judged(division, fitted, pose, reach or Reach(), accepted_by=accepted_by)
     skill = stored(name, division, fitted, pose, judgement)
     show(Evidence(skill, judgement.figures, fitted.held_out, judgement.inside))
     return skill
@@ -62,7 +69,7 @@ def _fitted(division: Division, progress: Progress) -> tuple[Fitted, Pose]:
     Raises SkillError if nothing can be learned.
     """
     try:
-        fitted = division.method.fit(division.takes, progress)
+        fitted = division.method.fit(Taught(division.takes, division.earlier), progress)
         return fitted, learned_pose(
             fitted.held_out,
             points=division.options.points,
@@ -72,5 +79,5 @@ def _fitted(division: Division, progress: Progress) -> tuple[Fitted, Pose]:
     except SkillError as error:
         raise SkillError("; ".join([str(error), *division.repeats])) from None
     except ValueError as error:
-        count = sum(len(take.hands) for take in division.takes)
+        count = sum(len(take.hands) for take in (*division.takes, *division.earlier))
         raise SkillError(f"cannot learn from {count} samples: {error}") from None

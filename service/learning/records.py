@@ -20,6 +20,7 @@ from service.learning.gate import Gate
 from service.learning.skill_file import StoredSkill
 
 Progress = Callable[[str], None]
+Severity = Literal["warning", "residual", "unsafe"]
 
 
 class Options(NamedTuple):
@@ -58,6 +59,31 @@ class Take(NamedTuple):
 def persons_of(takes: Sequence[Take]) -> NDArray[np.intp]:
     """The numbers (H,) of the takes' persons."""
     return np.array([take.person for take in takes], np.intp)
+
+
+class Taught(NamedTuple):
+    """The takes that a skill is learned from.
+
+    The `new` ones are all that is held out and judged. The `earlier` ones are those of a skill that
+    is refined; there are none if a skill is learned anew. Their persons have other numbers.
+    """
+
+    new: Sequence[Take]
+    earlier: Sequence[Take] = ()
+
+    @property
+    def all(self) -> Sequence[Take]:
+        """All takes, the new ones first."""
+        return [*self.new, *self.earlier]
+
+
+class Weights(NamedTuple):
+    """The weight of new takes against earlier ones, by name, and the held-out error [m] of the new
+    ones with each weight that was tried.
+    """
+
+    taken: str
+    tried_m: Mapping[str, float]
 
 
 class TimedErrors(NamedTuple):
@@ -126,12 +152,15 @@ class Fitted(NamedTuple):
     tried_m: Mapping[str, float] = {}  # held-out error of each kind of inputs
     baselines: Mapping[str, Sequence[Vector]] = {}  # errors (T, 3) [m] of each take by simpler predictions
     remarks: Sequence[str] = ()
+    weights: Weights | None = None  # None if the skill refines no other
 
 
 class Verdict(NamedTuple):
-    """A finding about a skill: a warning, or a reason not to use it."""
+    """A finding about a skill: a warning; a residual risk, which somebody must accept before the
+    skill is served; or a reason not to use it.
+    """
 
-    severity: Literal["warning", "unsafe"]
+    severity: Severity
     text: str
 
 
@@ -172,12 +201,17 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     one_beside: float  # the same with one hand displaced by 30 cm
     ambiguous: float  # share of the samples that contradict another: same hands, other tool
     beyond_reach: float  # share of the tool's path
+    explained: float | None = None  # share of the tool's variance that held-out predictions explain, see `judged`
     orientation_error_deg: float | None = None  # held out, root mean square; None if it was not learned
     gripper_right: float | None = None  # share of held-out samples
     warnings: tuple[str, ...] = ()
+    residual: tuple[str, ...] = ()  # residual risks: the skill is not served unless somebody accepts them
+    accepted_by: str = ""  # who accepted them; empty if nobody did, or there are none
     unsafe: tuple[str, ...] = ()  # reasons not to use the skill
     tried_mm: dict[str, float] = {}  # held-out error of each kind of inputs
     taken: str = ""  # the kind of inputs that was chosen
+    weight: str = ""  # of a new take against one of the skill that is refined; empty if none is
+    weights_mm: dict[str, float] = {}  # held-out error of the new takes with each weight
     by_person: bool = False  # true if all demonstrations of a person were held out at once
     delay_s: float | None = None  # the teacher's delay; None if it was not learned
     delay_std_s: float = 0.0  # its standard deviation over the demonstrations

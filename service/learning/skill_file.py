@@ -30,6 +30,7 @@ from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
+from service.learning.residual_risk import ResidualRisk
 
 POSED = 4  # format of a skill with an orientation or a gripper; other skills have their model's formats
 FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
@@ -64,8 +65,10 @@ PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weig
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
 OTHERS = ("format", "units", "name", "learned_from", "places", "figures", "conductor", "turned", "checksum", "names")
+DEMONSTRATIONS = "demonstrations"
 KNOWN = {
     *ALL_RANGES,
+    DEMONSTRATIONS,
     *OTHERS,
     "replaced",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
@@ -88,12 +91,18 @@ class StoredSkill(Skill):
     """A skill with its figures and its file, which the loop does not need."""
 
     figures: str = field(default="", repr=False)  # JSON of `Figures`; empty if the skill was not judged
+    demonstrations: bytes = field(default=b"", repr=False)  # see `stored_demonstrations`; empty: not in the file
     file: bytes = field(default=b"", repr=False)  # bytes as stored and recorded
 
     @cached_property
     def tool_positions(self) -> NDArray[np.float64]:
         """The tool's positions (M, 3) [m] at the skill's reference points or via-points."""
         return self.mean(self.hands, self.model.names)
+
+    def check_accepted(self) -> None:
+        """Raise SkillError if the skill has residual risks that nobody accepted."""
+        if refusal := ResidualRisk.of(self.figures).refusal:
+            raise SkillError(f"skill {self.name!r} is not served: {refusal}")
 
     def for_loop(self) -> Skill:
         """The skill without figures and file."""
@@ -122,6 +131,8 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         arrays[REGIONS] = np.array([*skill.regions[:2], *skill.regions.radii])
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
+    if skill.demonstrations:
+        arrays[DEMONSTRATIONS] = np.frombuffer(skill.demonstrations, np.uint8)
     arrays |= skill.model.own_arrays()
     if skill.turn:
         arrays |= {TURN + name: array for name, array in to_arrays(skill.turn.primitive).items()}
@@ -171,10 +182,12 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
             turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
             gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
             figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
+            demonstrations=arrays[DEMONSTRATIONS].tobytes() if DEMONSTRATIONS in arrays else b"",
             file=bytes(data),
             digest=_digest(data),
             conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
             regions=_regions(arrays[REGIONS].tolist()) if REGIONS in arrays else NORMAL,
+            residual_risk=ResidualRisk.of(str(arrays.get("figures", ""))).accepted,
         )
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
@@ -227,6 +240,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     for name in ("name", "learned_from"):
         if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
             yield f"{name} is no text of up to {LONGEST_TEXT} letters"
+    if DEMONSTRATIONS in arrays and arrays[DEMONSTRATIONS].dtype != np.uint8:
+        yield f"{DEMONSTRATIONS} has numbers of type {arrays[DEMONSTRATIONS].dtype}, bytes needed"
     if "figures" in arrays and not _is_json(arrays["figures"]):
         yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
     if len(arrays["base_inputs"]) > MOST_POINTS:

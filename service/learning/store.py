@@ -5,10 +5,12 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from service.learning.demonstration import fingerprint
+from service.learning.demonstration import NamedDemonstration, fingerprint
 from service.learning.judgement import Judgement
 from service.learning.records import Fitted, Pose
+from service.learning.residual_risk import ResidualRisk
 from service.learning.skill_file import StoredSkill, with_file
+from service.learning.stored_demonstrations import packed
 from service.learning.takes import Division, conductor_of
 
 BOX_MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions by this distance
@@ -16,7 +18,9 @@ BOX_MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions b
 
 def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement: Judgement) -> StoredSkill:
     """The skill of a model and pose with its figures."""
-    positions = np.concatenate([take.position for take in division.takes])
+    takes = [*division.takes, *division.earlier]
+    positions = np.concatenate([take.position for take in takes])
+    figures = msgspec.json.encode(judgement.figures).decode()
     skill = StoredSkill(
         name=name,
         model=fitted.model,
@@ -25,10 +29,12 @@ def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement:
         gripper=pose.gripper,
         workspace=np.stack([positions.min(axis=0) - BOX_MARGIN_M, positions.max(axis=0) + BOX_MARGIN_M]),
         threshold=fitted.gate.threshold,
-        learned_from=fingerprint(take.demonstration for take in division.takes),
+        learned_from=fingerprint(take.demonstration for take in takes),
+        demonstrations=packed([NamedDemonstration(take.name, take.demonstration) for take in takes]),
         components=division.options.components or 0,
-        figures=msgspec.json.encode(judgement.figures).decode(),
+        figures=figures,
         conductor=conductor_of(division, fitted),
         regions=judgement.regions,
+        residual_risk=ResidualRisk.of(figures).accepted,
     )
     return with_file(skill)

@@ -45,6 +45,8 @@ def table(found: Figures) -> str:
         f"{found.ambiguous:.1f} % of the samples contradict others: the same hands, another tool; "
         f"{found.beyond_reach:.1f} % of the tool's path is out of the arm's reach",
     ]
+    if found.explained is not None:
+        lines.append(f"the hands explain {max(found.explained, 0.0):.0f} % of the tool's variance")
     if found.orientation_error_deg is not None:
         lines.append(f"the tool's orientation is missed by {found.orientation_error_deg:.1f}° rms")
     if found.gripper_right is not None:
@@ -59,7 +61,12 @@ def table(found: Figures) -> str:
         wide = max(map(len, found.tried_mm))
         lines.append(f"what the tool may be a function of, and its error when left out; {found.taken} is taken:")
         lines += (f"  {name:<{wide}}  {mm:4.0f} mm" for name, mm in found.tried_mm.items())
+    if found.weights_mm:
+        wide = max(map(len, found.weights_mm))
+        lines.append(f"the weight of a demonstration of yours against one of the skill's; {found.weight} is taken:")
+        lines += (f"  {name:<{wide}}  {mm:4.0f} mm" for name, mm in found.weights_mm.items())
     lines += (f"warning: {text}" for text in found.warnings)
+    lines += (f"residual risk: {text}" for text in found.residual)
     return "\n".join([*lines, *(f"unsafe: {text}" for text in found.unsafe)])
 
 

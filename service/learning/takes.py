@@ -12,7 +12,7 @@ from service.contract.records import SIDES
 from service.contract.requests import Hands
 from service.core.frame import Vector
 from service.learning.ambiguity import same_hands_m
-from service.learning.demonstration import LEAST_M, Demonstration, check, lag, moved_m, persons
+from service.learning.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, lag, moved_m, persons
 from service.learning.methods import Method, method_of
 from service.learning.records import Fitted, Options, Take
 from service.learning.skill_file import SkillError
@@ -23,9 +23,10 @@ REPEATED_M = 0.003  # demonstrations with a smaller root mean square distance ar
 
 
 class Division(NamedTuple):
-    """Takes, with the method to learn from them."""
+    """Takes, with the method to learn from them. Those of a skill that is refined are `earlier`."""
 
     takes: Sequence[Take]
+    earlier: Sequence[Take]
     method: Method
     options: Options
     near_m: float  # hands up to this distance are the same for the tracker
@@ -34,12 +35,20 @@ class Division(NamedTuple):
     remarks: Sequence[str]  # all remarks
 
 
-def divided(demonstrations: Sequence[Demonstration], names: Sequence[str], options: Options) -> Division:
+def divided(
+    demonstrations: Sequence[Demonstration],
+    names: Sequence[str],
+    options: Options,
+    refined: Sequence[NamedDemonstration] = (),
+) -> Division:
     """The takes of the demonstrations that repeat no other, by `names` or, if there are none, by
     numbers.
 
-    Raises SkillError if nothing can be learned from them.
+    `refined` are the demonstrations of a skill that is refined. Those by the persons of the new
+    ones count as new ones. Raises SkillError if nothing can be learned from them.
     """
+    if refined and (options.components is not None or options.ell is not None):
+        raise SkillError("a skill is refined with parameters that are chosen: neither a number of components nor ell")
     if not demonstrations:
         raise SkillError("no demonstrations given, at least 1 needed")
     if options.components is None and options.penalty is not None:
@@ -50,26 +59,66 @@ def divided(demonstrations: Sequence[Demonstration], names: Sequence[str], optio
             check(one)
         except SkillError as error:
             raise SkillError(f"{name}: {error}") from None
-    repeats = _repeats(demonstrations)
-    kept = [i for i in range(len(demonstrations)) if i not in repeats]
-    repeated = [f"{names[i]} repeats {names[j]}, and is left out" for i, j in repeats.items()]
-    demonstrations, names = [demonstrations[i] for i in kept], [names[i] for i in kept]
+    named = [*refined, *map(NamedDemonstration, names, demonstrations)]
+    repeats = _repeats([one.demonstration for one in named])
+    repeated = [f"{named[i].name} repeats {named[j].name}, and is left out" for i, j in repeats.items()]
+    known = {one.person for one in demonstrations if one.person}
+    of_others = [i for i, one in enumerate(refined) if one.demonstration.person not in known]
+    earlier = [named[i] for i in of_others if i not in repeats]
+    names, demonstrations = _columns([one for i, one in enumerate(named) if i not in {*repeats, *of_others}])
     if max(map(moved_m, demonstrations)) < LEAST_M:
         raise SkillError(
             f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"
         )
     check_count(names, options.components, "".join(f"; {remark}" for remark in repeated))
+    before_names, before = _columns(earlier)
     single = "one demonstration: none was held out, so its error is of what was learned, and judges nothing"
     remarks = [*repeated, *[single] * (len(names) == 1)]
-    hand = _conducting(demonstrations, names)
+    hand = _conducting([*demonstrations, *before], [*names, *before_names])
     conductor = None if hand == "both" else SIDES.index(hand)
     if conductor is not None:
-        demonstrations = [
-            one._replace(places=tuple(of_one(point, conductor) for point in one.places)) for one in demonstrations
-        ]
-    method = method_of(demonstrations, options)
+        demonstrations, before = (
+            [one._replace(places=tuple(of_one(point, conductor) for point in one.places)) for one in some]
+            for some in (demonstrations, before)
+        )
+    method = method_of([*demonstrations, *before], options)
+    if before:
+        _check_alike(demonstrations, names, before)
     takes = aligned(demonstrations, names, removes_lag=method.removes_lag)
-    return Division(takes, method, options, same_hands_m(demonstrations), conductor, repeated, remarks)
+    first = 1 + max(take.person for take in takes)
+    return Division(
+        takes,
+        [
+            take._replace(person=first + take.person)
+            for take in aligned(before, before_names, removes_lag=method.removes_lag)
+        ],
+        method,
+        options,
+        same_hands_m(demonstrations),
+        conductor,
+        repeated,
+        remarks,
+    )
+
+
+def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[str], list[Demonstration]]:
+    return [one.name for one in named], [one.demonstration for one in named]
+
+
+def _check_alike(
+    demonstrations: Sequence[Demonstration], names: Sequence[str], earlier: Sequence[Demonstration]
+) -> None:
+    """Raise SkillError if new demonstrations name other via-points than the refined skill's."""
+    needed = [point.name for point in earlier[0].places]
+    if not needed:
+        return
+    for name, one in zip(names, demonstrations, strict=True):
+        given = [point.name for point in one.places]
+        if set(given) != set(needed):
+            raise SkillError(
+                f"{name} has the via-points {', '.join(given) or '(none)'}: {', '.join(needed)} needed, as in "
+                "the skill that is refined; take them with the demonstration (record --places), or name them (--places)"
+            )
 
 
 def _conducting(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> Hands:

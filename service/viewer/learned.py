@@ -172,4 +172,5 @@ def about(skill: SkillContents, shown: int) -> str:
             ]
             lines.append(f"| {' | '.join(cells)} |")
         lines += [f"- {as_markdown(text)}" for text in skill.figures.get("warnings", ())]
+        lines += [f"- residual risk: {as_markdown(text)}" for text in skill.figures.get("residual", ())]
     return "\n".join(lines)

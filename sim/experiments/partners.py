@@ -27,6 +27,7 @@ from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill
 from service.settings.config import Settings
 from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.people.into_reach import RigidMap
 from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
 from sim.experiments.reached import taught
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
@@ -48,6 +49,7 @@ NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
 BLOCK = 9  # takes of `walk` that are left out together
 SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
+OWN = 3  # takes by which a person refines the skill of the others
 DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
 GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
 SHOWN = {
@@ -56,6 +58,7 @@ SHOWN = {
     "linear": ("linear", REFERENCE, "x"),
     "Gaussian process": ("Gaussian process", OTHER, "s"),
     "with 2 s of memory": ("Gaussian process with 2 s of memory", TOOL, "^"),
+    "memory and clock": ("Gaussian process with memory and clock", TOOL, "v"),
     "HMM over demonstrations": ("HMM over demonstrations", "#CC79A7", "D"),
 }
 
@@ -73,6 +76,7 @@ class Fold(NamedTuple):
     """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
 
     refusals: tuple[str, ...]  # reasons why the command writes no skill
+    residual: tuple[str, ...]  # risks that somebody must accept before the daemon serves it
     figures: Figures | None  # none where nothing could be learned
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
@@ -81,10 +85,14 @@ class Fold(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The judged takes of each rival, and the service's fold without and with via-points."""
+    """The judged takes of each rival, the service's fold without and with via-points, and more that
+    some tasks have.
+    """
 
     rivals: dict[str, list[Judged]]
     service: dict[str, Fold]
+    moved: RigidMap | None = None  # of recorded takes, into the arm's reach
+    own: Fold | None = None  # the skill refined by OWN takes of the person who is left out, on the rest
 
 
 @functools.lru_cache(maxsize=2)
@@ -123,11 +131,18 @@ def part(one: Part) -> Found:
         shown, asked = [t for t in shown if t.group != one.out], [t for t in asked if t.group == one.out]
     named = bool(shown[0].demonstration.places)
     found = Found({}, {})
+    if one.task not in TASK_KINDS:
+        into_reach = RigidMap.of(shown, Settings().reach)
+        found = found._replace(moved=into_reach)
+        shown, asked = (list(map(into_reach.moved, some)) for some in (shown, asked))
     for told in [False] * (one.task not in TASK_KINDS) + [True] * named:
         for name, rival in RIVALS.items():
             said = left_out_by(rival, shown, asked, told=told)
             found.rivals[name + TOLD * told] = [judged(*pair) for pair in zip(asked, said, strict=True)]
         found.service[SERVICE + TOLD * told] = served(shown, asked, told=told)
+    if one.task in PEOPLE:
+        skill, _ = as_command(shown, told=named)
+        found = found._replace(own=served(asked[:OWN], asked[OWN:], told=named, refined=skill))
     return found
 
 
@@ -137,9 +152,12 @@ def _defaults() -> argparse.Namespace:
     return parser().parse_args(["learn", "take.mcap", "--output", "skill.npz"])
 
 
-def as_command(shown: Sequence[LeftOut], *, told: bool) -> tuple[StoredSkill | None, tuple[str, ...]]:
+def as_command(
+    shown: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
+) -> tuple[StoredSkill | None, tuple[str, ...]]:
     """The skill of `thirdhand learn` with its defaults, an arm's reach included, and the reasons
-    why the command writes none. `told`: the takes hold their via-points.
+    why the command writes none. `told`: the takes hold their via-points. `refined`: the skill that
+    is given to --from.
     """
     args = _defaults()
     try:
@@ -147,6 +165,7 @@ def as_command(shown: Sequence[LeftOut], *, told: bool) -> tuple[StoredSkill | N
             [one.demonstration if told else one.demonstration._replace(places=()) for one in shown],
             name=args.output.stem,
             names=[one.name for one in shown],
+            refined=refined,
             **{name: getattr(args, name) for name in ("components", "points", "ell", "penalty", "seed")},
         )
     except SkillError as error:
@@ -159,16 +178,19 @@ def figures_of(skill: StoredSkill) -> Figures:
     return msgspec.json.decode(skill.figures, type=Figures)
 
 
-def served(shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) -> Fold:
+def served(
+    shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
+) -> Fold:
     """The service's skill of the shown takes, on those that are left out.
 
     An accepted skill is judged within the reach of the arm. A refused one is judged without it, as
     otherwise the reach alone would decide.
     """
-    skill, refusals = as_command(shown, told=told)
+    skill, refusals = as_command(shown, told=told, refined=refined)
     if skill is None:
-        return Fold(refusals, None, "", [None] * len(asked), [], [])
-    fold = Fold(refusals, figures_of(skill), type(skill.model).__name__, [], [], [])
+        return Fold(refusals, (), None, "", [None] * len(asked), [], [])
+    figures = figures_of(skill)
+    fold = Fold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [])
     for take in asked:
         one = None
         try:
@@ -226,6 +248,8 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
         methods[name] = summary([one for fold in folds for one in fold.accepted if one]) | {
             "folds": len(folds),
             "folds_refused": sum(bool(fold.refusals) for fold in folds),
+            "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
+            "risks": list(dict.fromkeys(text for fold in folds for text in fold.residual))[:2],
             "refuses": accepted.count(False),
             "reasons": list(dict.fromkeys(reasons))[:2],
             "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
@@ -236,7 +260,15 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
             "unsafe": sum(bool(one.unsafe) for one in figures),
             "says": [*figures[0].unsafe, *figures[0].warnings] if figures else [],
         }
-    return {"folds": len(found), "methods": methods}
+    more: dict[str, Any] = {"moved": [part.moved for part in found]} if found[0].moved else {}
+    if own := [part.own for part in found if part.own]:
+        weights = [fold.figures.weight for fold in own if fold.figures]
+        more["own_takes"] = summary([one for fold in own for one in fold.accepted if one]) | {
+            "own": OWN,
+            "folds_refused": sum(bool(fold.refusals) for fold in own),
+            "weights": weights,
+        }
+    return {"folds": len(found), "methods": methods, **more}
 
 
 def summary(rows: Sequence[Judged]) -> dict[str, Any]:
@@ -276,6 +308,7 @@ class Verdict(NamedTuple):
     in_spite: Mapping[str, Any]
     folds_refused: int
     refused: str  # the number of refused skills or takes, in words
+    at_risk: int = 0  # skills that are served only if somebody accepts their residual risk
 
     @property
     def some_refused(self) -> bool:
@@ -294,7 +327,8 @@ def verdict(task: Mapping[str, Any], method: str) -> Verdict:
     refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{one['refuses']} of {takes} takes"
     if "in_spite_of_refusal" not in one and folds_refused:
         return Verdict(none, one, folds_refused, refused)
-    return Verdict(one, one.get("in_spite_of_refusal", none), folds_refused, refused if one["refuses"] else "none")
+    in_spite, at_risk = one.get("in_spite_of_refusal", none), one.get("folds_at_risk", 0)
+    return Verdict(one, in_spite, folds_refused, refused if one["refuses"] else "none", at_risk)
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:

@@ -11,9 +11,11 @@ import pytest
 from service.files.demonstration_reader import write_demonstration
 from service.learning.records import Figures
 from service.learning.skill_file import decoded
+from service.learning.stored_demonstrations import stored_demonstrations
 from sim.scene import Scene
 from sim.teach import demonstrations
 from support.cell import thirdhand, told
+from support.fine_motion import fine
 from support.paths import RECORDINGS
 
 
@@ -64,6 +66,46 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     assert "contradict others" in done.stderr
     assert "unsafe: " not in done.stdout
     assert not out.exists()
+
+
+def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_path: Path) -> None:
+    """Fine motion of one hand, which a noisy tracker hardly tells."""
+    takes = [tmp_path / f"fine-{seed}.mcap" for seed in range(4)]
+    for seed, path in enumerate(takes):
+        write_demonstration(path, fine(seed, 0.003))
+    out = tmp_path / "skill.npz"
+    for option, says in (
+        ((), "it is not served until somebody accepts its residual risk, named above"),
+        (("--accept-residual-risk", "Ada"), "its residual risk is accepted by Ada"),
+    ):
+        done = told("learn", *map(str, takes), "--output", str(out), "--points", "80", *option)
+        assert done.returncode == 0, done.stderr
+        assert "residual risk: 1" in done.stdout
+        assert says in done.stderr
+        assert ("accepted by Ada: 1" in decoded(out.read_bytes(), origin="skill").residual_risk) == bool(option)
+
+
+def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Path) -> None:
+    theirs, mine = tmp_path / "theirs.npz", tmp_path / "mine.npz"
+    done = told("learn", *map(str, files), "--output", str(theirs), "--points", "80")
+    assert done.returncode == 0, done.stderr
+    own = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
+    for path, one in zip(own, demonstrations(Scene(), count=2, seed=5), strict=True):
+        write_demonstration(path, one.every(8))
+    refine = ("learn", *map(str, own), "--output", str(mine), "--points", "80", "--from")
+    done = told(*refine, str(theirs))
+    assert done.returncode == 0, done.stderr
+    assert "the weight of a demonstration of yours against one of the skill's; " in done.stdout
+    names = [one.name for one in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))]
+    assert names == [path.stem for path in (*own, *files)]
+    for skill, says in (
+        (RECORDINGS / "experiments" / "as-paper.npz", "its file does not hold the demonstrations"),
+        (own[0], "not a skill"),
+        (tmp_path / "missing.npz", "cannot read skill"),
+    ):
+        done = told(*refine, str(skill))
+        assert done.returncode == 1
+        assert says in done.stderr
 
 
 def test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read(tmp_path: Path) -> None:

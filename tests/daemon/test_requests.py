@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -29,7 +30,7 @@ from service.daemon.daemon import load_skill
 from service.daemon.queryables import PendingEvent, SavedViaPoints
 from service.daemon.skill_worker import SkillWorker
 from service.learning.reach import beyond_m
-from service.learning.skill_file import SkillError, StoredSkill, with_file
+from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.learning.via_points import adapted
 from service.settings.config import Files, Reach, Settings
 from support.request_cell import PLACES, Cell
@@ -297,6 +298,42 @@ def test_a_skill_out_of_reach_is_not_served(
     served = load_skill(tmp_path / "soldering.npz", Settings(files=Files(state=str(tmp_path))))
     assert served.digest == skill.digest
     assert caplog.text == ""
+
+
+def with_residual_risk(skill: StoredSkill, accepted_by: str) -> StoredSkill:
+    """The skill, as if its gate held 3 % of hands swapped."""
+    risk = {"residual": ["the gate holds 3.0 % of hands swapped"], "accepted_by": accepted_by}
+    figures = msgspec.json.encode(msgspec.json.decode(skill.figures) | risk).decode()
+    return decoded(with_file(replace(skill, figures=figures)).file, origin="skill")
+
+
+def test_a_skill_with_a_residual_risk_is_served_only_if_somebody_accepted_it(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+    skill: StoredSkill,
+    skill_worker: SkillWorker,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    refusal = "not served: nobody has accepted its residual risk: the gate holds 3.0 % of hands swapped. Who takes"
+    for accepted_by in ("", "Ada"):
+        risky, folder = with_residual_risk(skill, accepted_by), tmp_path / f"by {accepted_by}"
+        folder.mkdir()
+        (folder / "risky.npz").write_bytes(risky.file)
+        settings = Settings(files=Files(state=str(folder)))
+        with contextlib.closing(Cell(*sessions, risky, skill_worker, folder)) as cell:
+            if accepted_by:
+                sentence = "accepted by Ada: the gate holds 3.0 % of hands swapped"
+                served = load_skill(folder / "risky.npz", settings)
+                assert (risky.residual_risk, served.residual_risk) == (sentence, sentence)
+                assert f"residual risk of skill 'soldering', {sentence}" in caplog.text
+                assert f"residual risk {sentence}" in cell.client.load_skill("soldering").warnings
+                assert served.for_loop().residual_risk == sentence
+                assert adapted(served, PLACES, tolerance=0.05).residual_risk == sentence
+            else:
+                with pytest.raises(SkillError, match=refusal):
+                    load_skill(folder / "risky.npz", settings)
+                assert refusal in cell.refusal("skill", {"name": "soldering"})
+                assert cell.kept == []
 
 
 # --- hold, resume and reset ---

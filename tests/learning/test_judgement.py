@@ -50,9 +50,9 @@ def test_good_demonstrations_are_judged_safe_and_their_errors_told_one_by_one(go
         (lambda d: [*d[:2], *(with_tool(one, one.tool[:, :3] * (1, -1, 1)) for one in d[:2])], "contradict others"),
         (lambda d: [with_tool(one, 3 * one.tool[:, :3]) for one in d], "out of the arm's reach"),
         (lambda d: [*d[:3], d[3]._replace(frame="camera")], "different frames: 'base', 'camera'"),
-        (lambda d: [*d[:3], d[3]._replace(tool=np.roll(d[3].tool, 25, axis=0))], "missed by"),
+        (lambda d: [one._replace(tool=np.roll(one.tool, 80 * i, axis=0)) for i, one in enumerate(d)], "too little of"),
     ],
-    ids=["same hands, other tool", "not in metres", "frames", "one out of step"],
+    ids=["same hands, other tool", "not in metres", "frames", "all out of step"],
 )
 def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, says: str) -> None:
     found = judged(spoil(good))  # type: ignore[operator]

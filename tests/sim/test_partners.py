@@ -19,10 +19,21 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.settings.config import Settings
 from sim.experiments.partners import Fold, Found, as_command, numbers_of, served, summary
+from sim.experiments.people.into_reach import RigidMap, depth_m
 from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, judged, left_out, predicted, read
 from sim.experiments.results import ExperimentError, Options, Results
 from sim.experiments.rivals.method import Predicted
-from sim.experiments.rivals.partners import MEMORY_S, RIVALS, carried, in_mean_scene, left_out_by, past, scene_of
+from sim.experiments.rivals.partners import (
+    MEMORY_S,
+    MOVES_MPS,
+    RIVALS,
+    carried,
+    clock,
+    in_mean_scene,
+    left_out_by,
+    past,
+    scene_of,
+)
 from sim.made_tasks import takes
 
 
@@ -133,6 +144,34 @@ def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut
 def test_a_rival_that_is_shown_the_take_itself_knows_it(asked: list[LeftOut]) -> None:
     for name in ("nearest neighbours", "Gaussian process", "HMM over demonstrations", "same elapsed time"):
         assert rms_mm(left_out_by(RIVALS[name], [asked[0]] * 2, asked[:1], told=False), asked[:1]) < 30, name
+
+
+def test_takes_are_moved_into_the_arms_reach_by_one_rigid_map(shown: list[LeftOut]) -> None:
+    reach, far = Settings().reach, beside(shown, 1.5)
+    found = RigidMap.of(far, reach)
+    moved = [found.moved(one) for one in far]
+    assert np.quantile(np.concatenate([depth_m(one.tool, reach) for one in moved]), 0.05) > 0.0
+    one, before = moved[0], far[0]
+    for after, at in ((one.tool, before.tool), (one.hands[:, :3], before.hands[:, :3])):
+        assert np.linalg.norm(after - after[0], axis=1) == pytest.approx(np.linalg.norm(at - at[0], axis=1))
+    assert (one.tool - one.hands[:, 3:])[:, 2] == pytest.approx((before.tool - before.hands[:, 3:])[:, 2])
+    assert np.linalg.norm(one.velocities) == pytest.approx(np.linalg.norm(before.velocities))
+    assert one.demonstration.places[0].tool == pytest.approx(
+        found.positions(np.array(before.demonstration.places[0].tool))
+    )
+    assert found.positions(before.demonstration.tool[:, :3]) == pytest.approx(one.demonstration.tool[:, :3])
+    for point, expected in (((0.6, 0, 0.346), 0.25), ((0.1, 0, 0.346), -0.25), ((0.6, 0.0, 0.0), -0.02)):
+        assert float(depth_m(np.array(point), reach)) == pytest.approx(expected)
+
+
+def test_the_clock_runs_from_when_a_hand_first_moves(asked: list[LeftOut]) -> None:
+    one = asked[0]
+    speeds = np.linalg.norm(one.velocities.reshape(-1, 2, 3), axis=2).max(axis=1)
+    begins = int(np.argmax(speeds > MOVES_MPS))
+    found = clock(one)[:, 0]
+    assert not found[: begins + 1].any()
+    assert np.diff(found[begins:]) == pytest.approx(1.0 / JUDGED_HZ)
+    assert not clock(one._replace(velocities=0 * one.velocities)).any()
 
 
 def test_recordings_are_read(tmp_path: Path) -> None:

@@ -163,6 +163,7 @@ class Skill(Immutable):
     digest: bytes = bytes(16)  # 16 bytes that identify the skill's file
     conductor: int | None = None  # side of the hand that leads alone; None: both hands matter
     regions: Regions = NORMAL
+    residual_risk: str = ""  # what somebody accepted at learning, and who did; empty: nothing
 
     def __post_init__(self) -> None:
         frozen(self.workspace)

@@ -12,7 +12,7 @@ from service.learning.demonstration import Demonstration
 from service.learning.methods.inputs import HandInputs
 from service.learning.methods.mixture import Mixture
 from service.learning.methods.staged import Staged
-from service.learning.records import Fitted, Options, Progress, Take
+from service.learning.records import Fitted, Options, Progress, Taught
 
 
 class Method(Protocol):
@@ -26,8 +26,8 @@ class Method(Protocol):
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self | None:
         """The method for these demonstrations and options; None if it does not apply to them."""
 
-    def fit(self, takes: Sequence[Take], progress: Progress) -> Fitted:
-        """The model of the takes, its gate, and its predictions of held-out takes.
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
+        """The model of the takes, its gate, and its predictions of held-out ones of the new takes.
 
         Raises SkillError or ValueError if nothing can be learned.
         """

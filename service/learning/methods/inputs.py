@@ -8,13 +8,14 @@ is given, the inputs are the positions, and the tool's lag is removed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from kmp.criteria.cross_validation import preferred
+from kmp.criteria.direct import DirectSelection
 from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER
@@ -25,7 +26,8 @@ from service.learning.demonstration import Demonstration
 from service.learning.division import task_of
 from service.learning.gate import CEILING_M
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
-from service.learning.records import Fitted, Options, Progress, Take, persons_of
+from service.learning.methods.weights import WEIGHTS, chosen
+from service.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
 from service.learning.regions import refitted_errors
 
 AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good
@@ -79,20 +81,29 @@ class HandInputs:
         """The method; it applies to all demonstrations."""
         return cls(options, "" if options.ell is not None else task_of(demonstrations)[1])
 
-    def fit(self, takes: Sequence[Take], progress: Progress) -> Fitted:
-        """The model of the chosen kind of inputs, and its predictions of held-out takes."""
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
+        """The model of the chosen kind of inputs, and its predictions of held-out takes.
+
+        If a skill is refined, the weight of the new takes is chosen with the kind.
+        """
+        takes, earlier = taught.new, taught.earlier
         remarks = [self.why_not_staged] if self.why_not_staged else []
         points, ell = self.options.points, self.options.ell
-        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(takes, points, progress)
+        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, points, progress)
+        kind = found.kind
         if kind.alone is not None:
             remarks.append(
                 f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
                 "makes no difference, and may be absent"
             )
         inputs = [take.hands if ell is not None else kind.of(take.demonstration) for take in takes]
-        progress(f"choosing parameters over {len(takes)} demonstrations")
-        fit = refit(kind, takes, inputs, points, ell)
-        progress(f"learning from all {len(takes)}")
+        before = [kind.of(take.demonstration) for take in earlier]
+        weight, weights = chosen(found.by_weight_m)
+        if math.isinf(weight):
+            earlier, before = [], []
+        progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
+        fit = refit(kind, [*takes, *earlier], [*inputs, *before], points, ell, earlier=len(earlier), weight=weight)
+        progress(f"learning from all {len(takes) + len(earlier)}")
         primitive = fit(None)
         held_out = held_out_takes(takes, inputs, fit, progress)
         gate = gate_of(primitive, held_out, kind.order, CEILING_M)
@@ -100,7 +111,8 @@ class HandInputs:
             progress("calibrating the covariance")
 
             def refitted(kept: list[int]) -> HandsKMP:
-                others = refit(kind, [takes[i] for i in kept], [inputs[i] for i in kept], points, ell)
+                some, known = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
+                others = refit(kind, some, known, points, ell, earlier=len(earlier), weight=weight)
                 return HandsKMP(others(None), kind.turned)
 
             timed = refitted_errors(takes, inputs, refitted)
@@ -111,9 +123,18 @@ class HandInputs:
             gate,
             conductor=kind.alone,
             taken=kind.name,
-            tried_m=tried_m,
+            tried_m=found.tried_m,
             remarks=remarks,
+            weights=weights if taught.earlier else None,
         )
+
+
+def _weighted(kind: Inputs, taught: Taught, weight: float, points: int) -> DirectSelection:
+    """The selection of a mean of this kind of inputs with this weight of new takes."""
+    earlier = taught.earlier if math.isfinite(weight) else []
+    takes = [*taught.new, *earlier]
+    pairs = [(kind.of(take.demonstration), take.position) for take in takes]
+    return selection_of(pairs, points, persons=persons_of(takes), rich=True, earlier=len(earlier), factor=weight)
 
 
 def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
@@ -130,26 +151,50 @@ def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
     ]
 
 
-def refit(kind: Inputs, takes: Sequence[Take], inputs: Sequence[Vector], points: int, ell: float | None) -> Fit:
+def refit(
+    kind: Inputs,
+    takes: Sequence[Take],
+    inputs: Sequence[Vector],
+    points: int,
+    ell: float | None,
+    *,
+    earlier: int = 0,
+    weight: float = 1.0,
+) -> Fit:
     """The function that fits primitives to takes with inputs (T, I), with the same hyper-parameters
     whichever person is held out; ell [1/m²] is chosen with them unless it is given.
+
+    The last `earlier` takes are of a skill that is refined; a new one has this weight against them.
     """
     is_rich = bool(kind.order or kind.turned)
     pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
-    count = RICH_TIMES * points if is_rich else points
-    choice = selection_of(pairs, count, persons=persons_of(takes), isotropic=is_rich, rich=is_rich)
+    count, persons = RICH_TIMES * points if is_rich else points, persons_of(takes)
+    choice = selection_of(
+        pairs, count, persons=persons, isotropic=is_rich, rich=is_rich, earlier=earlier, factor=weight
+    )
     parameters = choice.parameters(ell, may_be_linear=True)
     residuals = choice.residuals(parameters.ell, parameters.noise, parameters.ridge)
     return lambda without: choice.primitive(parameters, residuals, without=without)
 
 
-def _chosen(takes: Sequence[Take], points: int, progress: Progress) -> tuple[Inputs, dict[str, float]]:
-    """The simplest kind of inputs that is as good as any, and the error [m] of each kind."""
-    kinds, tried_m = candidates([take.demonstration for take in takes]), dict[str, float]()
+class Chosen(NamedTuple):
+    """A kind of inputs, the error [m] of each kind, and that of this one with each weight."""
+
+    kind: Inputs
+    tried_m: Mapping[str, float]
+    by_weight_m: Mapping[float, float]
+
+
+def _chosen(taught: Taught, points: int, progress: Progress) -> Chosen:
+    """The simplest kind of inputs that is as good as any, each with its best weight."""
+    kinds, weights = candidates([take.demonstration for take in taught.all]), WEIGHTS if taught.earlier else WEIGHTS[:1]
+    errors_m: dict[str, dict[float, float]] = {}
     for kind in kinds:
         progress(f"trying {kind.name}")
-        pairs = [(kind.of(take.demonstration), take.position) for take in takes]
-        choice = selection_of(pairs, points, persons=persons_of(takes), rich=True)
-        tried_m[kind.name] = choice.best_mean(may_be_linear=True)[0]
+        errors_m[kind.name] = {
+            weight: _weighted(kind, taught, weight, points).best_mean(may_be_linear=True)[0] for weight in weights
+        }
+    tried_m = {name: min(by_weight.values()) for name, by_weight in errors_m.items()}
     least_m = min(tried_m.values())
-    return preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M)), tried_m
+    kind = preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
+    return Chosen(kind, tried_m, errors_m[kind.name])

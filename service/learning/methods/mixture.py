@@ -17,7 +17,7 @@ from service.core.skill.hands_kmp import HandsKMP
 from service.learning.demonstration import Demonstration
 from service.learning.gate import CEILING_M
 from service.learning.methods.held_out import gate_of, held_out_takes
-from service.learning.records import Fitted, HeldOut, Options, Progress, Take
+from service.learning.records import Fitted, HeldOut, Options, Progress, Take, Taught
 
 ELL_PER_M2, PENALTY = 5.0, 2.0  # the kernel's ell and lambda, unless they are given
 
@@ -36,8 +36,9 @@ class Mixture:
         """The method, if a number of components is given."""
         return None if options.components is None else cls(options, options.components)
 
-    def fit(self, takes: Sequence[Take], progress: Progress) -> Fitted:
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
         """The model of positions; its gate's ceiling is scaled as its covariance is too large."""
+        takes = taught.new
         inputs = [take.hands for take in takes]
         progress(f"learning from all {len(takes)}")
         primitive = self._primitive(takes)

@@ -13,8 +13,9 @@ Held-out predictions use the belief that the filter has along the take, and the 
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
@@ -29,12 +30,14 @@ from service.core.skill.staged import Placed, StagedKMP
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration, lag
 from service.learning.division import NEAR, Encoded, along_all, ordered, recognised, task_of, via_points_never_reached
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
 from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import POSITIONS, refit
-from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, persons_of
+from service.learning.methods.weights import WEIGHTS, chosen
+from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, persons_of
 from service.learning.regions import blocks_of
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
@@ -48,6 +51,7 @@ UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
 MOST_DELAY_S = 0.6  # a teacher's delay is at most this long
+DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, MOST_DELAY_S)  # candidates for the delay of few takes, which refine a skill
 WITHOUT_PLACES = "without places"  # in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
 
@@ -57,6 +61,7 @@ class Hyperparameters(NamedTuple):
 
     ell: float  # of the kernel, whose inputs are shares
     noise: float  # variance of a sample / variance of the kernel
+    weight: float = 1.0  # of a new take, see `weights`
 
 
 ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
@@ -64,45 +69,62 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 class Samples(NamedTuple):
     """The samples that are learned from: inputs (N, 2 + K), outputs (N, OUTPUTS), and the numbers
-    (N,) of their demonstrations.
+    (N,) of their demonstrations, of which the first `new` are held out and judged.
     """
 
     encoded: Sequence[Encoded]
     inputs: Vector
     outputs: Vector
     owner: Indices
+    new: int
 
     @classmethod
-    def of(cls, encoded: Sequence[Encoded]) -> Self:
-        """The samples of demonstrations."""
+    def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
+        """The samples of demonstrations; the first `new` ones are no earlier ones."""
         count = len(encoded[0].stages)
-        each = [one.rows(max(LEAST_SAMPLES, SAMPLES_LEARNED // len(encoded))) for one in encoded]
+        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
+        each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
         shares, labels, outputs = (
             np.concatenate([values[rows] for values, rows in zip(column, each, strict=True)])
             for column in zip(*((one.along, one.labels, one.wanted) for one in encoded), strict=True)
         )
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
-        return cls(encoded, inputs_of(shares, labels, count), outputs, owner)
+        return cls(encoded, inputs_of(shares, labels, count), outputs, owner, new)
 
-    def best(self) -> Hyperparameters:
-        """The hyper-parameters with the least error of held-out demonstrations, if each segment of
-        the tool had the mean length.
+    def best(self, weight: float = 1.0) -> Hyperparameters:
+        """The hyper-parameters of this weight with the least error of held-out demonstrations, if
+        each segment of the tool had the mean length.
         """
         lengths = [np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in self.encoded]
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
-        errors_m = {}
-        for ell in ELLS:
-            residuals = held_out_residuals(
-                np.exp(-ell * squares), np.array(NOISES), self.owner, lambda _: self.outputs - PRIOR
+        is_new, errors_m = self.owner < self.new, {}
+        if math.isinf(weight):
+            squares, is_new, targets, owner = (
+                squares[np.ix_(is_new, is_new)],
+                is_new[is_new],
+                (self.outputs - PRIOR)[is_new],
+                self.owner[is_new],
             )
-            for noise, missed in zip(NOISES, residuals, strict=True):
-                errors_m[Hyperparameters(ell, noise)] = rms(missed[:, 1:] + missed[:, :1] * float(np.mean(lengths)))
+        else:
+            targets, owner = self.outputs - PRIOR, self.owner
+        roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None] if weight != 1.0 else 1.0
+        for ell in ELLS:
+            # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
+            kernel = np.exp(-ell * squares) / (roots * np.transpose(roots))
+            residuals = held_out_residuals(kernel, np.array(NOISES), owner, lambda _: targets / roots)
+            for noise, missed in zip(NOISES, (roots * residuals)[:, is_new], strict=True):
+                errors_m[Hyperparameters(ell, noise, weight)] = rms(
+                    missed[:, 1:] + missed[:, :1] * float(np.mean(lengths))
+                )
         return min(errors_m, key=errors_m.__getitem__)
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
         """The KMP of all demonstrations but these, adapted to where the tool is known to be."""
+        if math.isinf(parameters.weight):
+            without = [*without, *range(self.new, len(self.encoded))]
         kept = ~np.isin(self.owner, without)
-        covariance = np.tile(parameters.noise * np.eye(OUTPUTS), (int(kept.sum()), 1, 1))
+        weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
+        covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
         primitive = KMP.fit(
             self.inputs[kept],
             Gaussians(self.outputs[kept], covariance),
@@ -191,6 +213,39 @@ class _Prediction(NamedTuple):
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
 
 
+def _predictions(
+    task: Task, samples: Samples, parameters: Hyperparameters, off: Vector, blocks: Sequence[list[int]], delay_s: float
+) -> dict[int, _Prediction]:
+    """The predictions of the new demonstrations, each without its block."""
+    found = {}
+    for block in blocks:
+        primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
+        for h in block:
+            placed = Placed.of(task, samples.encoded[h].at, off, primitive, np.empty((0, 6)))
+            found[h] = _Prediction.of(samples.encoded[h], placed, delay_s)
+    return found
+
+
+def _error_m(predictions: Mapping[int, _Prediction]) -> float:
+    """The root mean square error [m] of predictions."""
+    return rms(np.concatenate([one.errors for one in predictions.values()]))
+
+
+def held_out_delay(task: Task, demonstrations: Sequence[Demonstration], blocks: Sequence[list[int]]) -> Delay:
+    """The delay of DELAYS_S that predicts demonstrations best which are held out in blocks; its
+    deviation is that of the delays that are best for each.
+    """
+    squares = []
+    for delay_s in DELAYS_S:
+        encoded = [Encoded.of(task, one, delay_s) for one in demonstrations]
+        samples = Samples.of(encoded, len(encoded))
+        found = _predictions(task, samples, samples.best(), _off_m(encoded), blocks, delay_s)
+        squares.append([float((found[h].errors ** 2).sum(axis=1).mean()) for h in range(len(demonstrations))])
+    candidates_s = np.array(DELAYS_S)
+    best_s = candidates_s[np.mean(squares, axis=1).argmin()]
+    return Delay(float(best_s), float(np.std(candidates_s[np.argmin(squares, axis=0)])))
+
+
 @dataclass(frozen=True)
 class Staged:
     """The method with its options, for a task."""
@@ -208,26 +263,29 @@ class Staged:
         task, _ = task_of(demonstrations)
         return None if task is None else cls(options, task)
 
-    def fit(self, takes: Sequence[Take], progress: Progress) -> Fitted:
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
         """The model of the task, its gate on the hands' distance from their segments, and its
         predictions of held-out takes.
 
         Raises SkillError if the tool never came near a via-point.
         """
-        demonstrations, names = [take.demonstration for take in takes], [take.name for take in takes]
+        takes, demonstrations = taught.new, [take.demonstration for take in taught.all]
+        names = [take.name for take in taught.all]
         remarks = via_points_never_reached(self.task, demonstrations, names)
         progress(f"learning between the via-points {', '.join(self.task.names)}")
+        blocks = blocks_of(persons_of(takes))
         delay, each_s = delay_of(demonstrations)
+        if taught.earlier:
+            progress(f"choosing the delay over {len(takes)} new demonstrations")
+            delay = held_out_delay(self.task, demonstrations[: len(takes)], blocks)
+            each_s[: len(takes)] = [delay.mean_s] * len(takes)
         encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
-        samples, off, blocks = Samples.of(encoded), _off_m(encoded), blocks_of(persons_of(takes))
-        parameters = samples.best()
-        predictions: dict[int, _Prediction] = {}
-        for block in blocks:
-            progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
-            primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
-            for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
-                predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
+        samples, off = Samples.of(encoded, len(takes)), _off_m(encoded)
+        progress(f"holding out {len(takes)} demonstrations")
+        tried = [samples.best(weight) for weight in (WEIGHTS if taught.earlier else WEIGHTS[:1])]
+        found = {one.weight: _predictions(self.task, samples, one, off, blocks, delay.mean_s) for one in tried}
+        weight, weights = chosen({one: _error_m(predictions) for one, predictions in found.items()})
+        parameters, predictions = next(one for one in tried if one.weight == weight), found[weight]
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
@@ -246,7 +304,15 @@ class Staged:
         reached = np.concatenate([one.gate_m for one in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
-        return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks)
+        return Fitted(
+            model,
+            in_order,
+            gate,
+            delay,
+            baselines=baselines,
+            remarks=remarks,
+            weights=weights if taught.earlier else None,
+        )
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""

@@ -21,6 +21,7 @@ from sim.experiments.results import Array
 from sim.experiments.rivals.gaussian_process import by_folds
 from sim.experiments.rivals.method import Law, Learn, Observed, Predicted
 
+MOVES_MPS = 0.08  # a hand that moves faster begins the task
 MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now
 HMM_STATES = 6000
 CORRELATED = 0.2  # weight of an observation in the HMM: consecutive ones are correlated
@@ -61,6 +62,13 @@ def past(seen: Observed | LeftOut) -> Array:
     """Hands at the times of MEMORY_S before now, relative to now: (T, 6 M) [m]."""
     now = np.arange(len(seen.hands))
     return np.hstack([seen.hands[np.maximum(0, now - round(s * JUDGED_HZ))] - seen.hands for s in MEMORY_S])
+
+
+def clock(seen: Observed | LeftOut) -> Array:
+    """The time [s] since a hand first moved faster than MOVES_MPS, (T, 1); 0 before."""
+    speeds = np.linalg.norm(seen.velocities.reshape(len(seen.times), 2, 3), axis=2).max(axis=1)
+    begins = seen.times[int(np.argmax(speeds > MOVES_MPS))] if (speeds > MOVES_MPS).any() else np.inf
+    return np.asarray(np.maximum(seen.times - begins, 0.0)[:, None])
 
 
 def left_out_by(learn: Learn, shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) -> list[Predicted]:
@@ -168,5 +176,6 @@ RIVALS: dict[str, Learn] = {
     "Gaussian process": by_folds(lambda seen: [seen.hands]),
     "with velocities": by_folds(lambda seen: [seen.hands, seen.velocities]),
     "with 2 s of memory": by_folds(lambda seen: [seen.hands, past(seen)]),
+    "memory and clock": by_folds(lambda seen: [seen.hands, past(seen), clock(seen)]),
     "HMM over demonstrations": hmm,
 }

@@ -1,0 +1,119 @@
+"""A skill of others that is refined by takes of whoever will work with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.core.frame import Vector
+from service.learning.choice import shared_counts
+from service.learning.demonstration import Demonstration, NamedDemonstration
+from service.learning.learn import learn
+from service.learning.methods.weights import chosen
+from service.learning.records import Figures
+from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.learning.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
+from service.learning.table import table
+from sim.made_tasks import takes
+from support.circling import circling
+
+HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
+
+
+def figures_of(skill: StoredSkill) -> Figures:
+    return msgspec.json.decode(skill.figures, type=Figures)
+
+
+def with_habit(one: Demonstration) -> Demonstration:
+    """The take with another way of the tool: a bow between its ends."""
+    bow = np.sin(np.pi * np.linspace(0.0, 1.0, len(one.tool)))[:, None] * HABIT_M
+    return one._replace(tool=np.hstack([one.tool[:, :3] + bow, one.tool[:, 3:]]))
+
+
+def missed_mm(skill: StoredSkill, one: Demonstration) -> float:
+    """The error for hands at rest along a take, root mean square."""
+    errors: Vector = one.tool[:, :3] - skill.mean(one.hands)
+    return 1000 * float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+@pytest.fixture(scope="module")
+def others() -> StoredSkill:
+    """A skill of four takes, as read from its file."""
+    shown = [circling(seed).every(4) for seed in range(4)]
+    names = [f"take-{i}" for i in range(4)]
+    return decoded(learn(shown, name="others", names=names, points=80).file, origin="others.npz")
+
+
+def test_takes_of_whoever_works_with_a_skill_refine_it(others: StoredSkill) -> None:
+    mine = [circling(seed).every(4) for seed in range(10, 14)]
+    mine = [one._replace(tool=one.tool + np.concatenate([HABIT_M, np.zeros(4)])) for one in mine]
+    refined = learn(mine[:3], name="mine", names=["a", "b", "c"], points=80, refined=others)
+    found = figures_of(refined)
+    assert [row.name for row in found.demonstrations] == ["a", "b", "c"]
+    assert list(found.weights_mm) == ["1", "4", "16", "64", "yours alone"]
+    assert found.weights_mm[found.weight] == min(found.weights_mm.values()) < found.weights_mm["1"]
+    assert f"{found.weight} is taken:" in table(found)
+    assert missed_mm(refined, mine[3]) < 0.5 * missed_mm(others, mine[3])
+    # The file suffices for the next one; takes of unnamed persons are then those of others.
+    kept = stored_demonstrations(decoded(refined.file, origin="mine.npz"))
+    assert sorted(one.name for one in kept) == ["a", "b", "c", "take-0", "take-1", "take-2", "take-3"]
+
+
+def test_takes_that_do_it_as_the_others_did_count_as_theirs(others: StoredSkill) -> None:
+    mine = [circling(seed).every(4) for seed in (20, 21)]
+    found = figures_of(learn(mine, points=80, refined=others))
+    assert found.weights_mm[found.weight] < 0.9 * found.weights_mm["yours alone"]
+
+
+def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_theirs() -> None:
+    shown = [one.demonstration.every(3) for one in takes("three", people=range(3), each=2)]
+    shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]
+    skill = learn(shown, name="others")
+    mine = [with_habit(one.demonstration.every(3)) for one in takes("three", people=[7], each=4)]
+    mine = [one._replace(person="me") for one in mine]
+    first = learn(mine[:2], name="first", names=["a", "b"], refined=skill)
+    both = figures_of(learn(mine[2:], name="both", names=["c", "d"], refined=first))
+    assert sorted(row.name for row in both.demonstrations) == ["a", "b", "c", "d"]
+    assert both.weights_mm[both.weight] < both.weights_mm["1"]
+    assert both.delay_s is not None
+    with pytest.raises(SkillError, match=r"demonstration 1 has the via-points \(none\): stage 1, .* needed, as in the"):
+        learn([one._replace(places=()) for one in mine[:2]], refined=skill)
+
+
+def test_what_cannot_be_refined_is_refused_with_the_remedy(others: StoredSkill) -> None:
+    mine = [circling(seed).every(4) for seed in (30, 31)]
+    with pytest.raises(SkillError, match=r"does not hold the demonstrations .* earlier version .*learn it anew"):
+        learn(mine, refined=replace(others, demonstrations=b""))
+    for spoilt in (others.demonstrations[:-100], b"PK" + bytes(300), bytes(50)):
+        with pytest.raises(SkillError, match=r"its demonstrations are damaged .*learn it anew"):
+            learn(mine, refined=replace(others, demonstrations=spoilt))
+    with pytest.raises(SkillError, match=r"neither a number of components nor ell"):
+        learn(mine, refined=others, ell=4.0)
+    with pytest.raises(SkillError, match=r"1 demonstration given .*again repeats take-0, and is left out"):
+        learn([mine[0], stored_demonstrations(others)[0].demonstration], names=["mine", "again"], refined=others)
+
+
+def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
+    given = takes("three", people=[0], each=1)[0].demonstration
+    closure = np.linspace(0.0, 1.0, len(given.stamps_ns))
+    given = given._replace(person="Ada", gripper=closure, begins=(200,), conducts="left")
+    one, other = (NamedDemonstration(name, part) for name, part in (("a", given), ("b", given.every(2))))
+    first, second = stored_demonstrations(replace(others, demonstrations=packed([one, other])))
+    step = max(1, int(1.0 / (KEPT_HZ * given.period_s) + 1e-6))
+    expected = given.every(step)
+    assert (first.name, second.name) == ("a", "b")
+    for name in ("frame", "places", "conducts", "person", "begins"):
+        assert getattr(first.demonstration, name) == getattr(expected, name), name
+    assert np.array_equal(first.demonstration.stamps_ns, expected.stamps_ns)
+    for name in ("left", "right", "tool", "gripper"):
+        np.testing.assert_allclose(getattr(first.demonstration, name), getattr(expected, name), atol=1e-6)
+    assert first.demonstration.period_s >= 1.0 / KEPT_HZ - 1e-6
+
+
+def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
+    assert shared_counts(200, 4, 0, 4) == [50] * 4
+    assert shared_counts(200, 2, 100, 4) == [50] * 2 + [4] * 100
+    assert chosen({1.0: 0.03, 4.0: 0.02, np.inf: 0.025}) == (4.0, ("4", {"1": 0.03, "4": 0.02, "yours alone": 0.025}))

@@ -1,0 +1,87 @@
+"""Verdicts: which figures are warned of, which are a residual risk, and which are refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from service.learning.gate import Caught, Gate
+from service.learning.records import Figures, Row
+from service.learning.residual_risk import ResidualRisk
+from service.learning.table import table
+from service.learning.verdicts import Subject, verdicts
+
+GOOD = Row(name="all", error_mm=20.0, worst_mm=60.0, predicted_mm=20.0, within_50=50.0, within_95=95.0, held=1.0)
+FIGURES = Figures(
+    demonstrations=(GOOD,) * 4,
+    all=GOOD,
+    gate_mm=50.0,
+    swapped=100.0,
+    beside=100.0,
+    one_beside=99.0,
+    ambiguous=0.0,
+    beyond_reach=0.0,
+    explained=98.0,
+)
+GATE = Gate(0.05, Caught(1.0, 1.0, 1.0), capped=False, floored=False)
+
+
+def found(frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float = 20.0, **change: Any) -> dict[str, str]:
+    """Texts and severities of figures that differ in these from good ones."""
+    row = msgspec.structs.replace(GOOD, error_mm=error_mm, held=change.pop("held", 1.0))
+    figures = msgspec.structs.replace(FIGURES, demonstrations=(row,) * takes, all=row, **change)
+    return {one.text: one.severity for one in verdicts(Subject(figures, GATE, frames, "a and b", row.error_mm))}
+
+
+def test_good_figures_are_remarked_on_by_nobody() -> None:
+    assert found() == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "severity", "says"),
+    [
+        ({"error_mm": 60.0}, "warning", "missed by 60 mm"),
+        ({"error_mm": 126.0, "explained": 78.0}, "residual", "missed by 126 mm"),
+        ({"error_mm": 150.0, "explained": 15.0}, "unsafe", "15 % of its variance in held-out"),
+        ({"error_mm": 30.0, "explained": 15.0}, "", ""),
+        ({"takes": 2}, "warning", "2 demonstration(s) tell little"),
+        ({"takes": 2, "error_mm": 93.0}, "unsafe", "as they miss each other by 93 mm: record more"),
+        ({"ambiguous": 8.0}, "warning", "8 % of the samples contradict others"),
+        ({"ambiguous": 12.0}, "residual", "12 % of the samples contradict others"),
+        (
+            {"ambiguous": 30.0},
+            "unsafe",
+            "30 % of the samples contradict others, up to 10 % accepted: a and b. Leave out",
+        ),
+        ({"beyond_reach": 10.0}, "warning", "10.0 % of the tool's path"),
+        ({"beyond_reach": 30.0}, "unsafe", "in frame base? If it is, demonstrate nearer to the arm"),
+        ({"held": 30.0}, "warning", "holds 30 % of what was demonstrated"),
+        ({"beside": 80.0}, "warning", "the gate holds 80.0 % of hands 30 cm beside"),
+        ({"beside": 3.0}, "residual", "the gate holds 3.0 % of hands 30 cm beside, 50 % wanted: the arm follows hands"),
+        ({"swapped": 3.0}, "residual", "the gate holds 3.0 % of hands swapped"),
+        ({"frames": ("base", "camera")}, "unsafe", "'base', 'camera'; one needed: record them again in one frame"),
+    ],
+)
+def test_a_figure_is_warned_of_accepted_by_somebody_or_refused(
+    change: dict[str, Any], severity: str, says: str
+) -> None:
+    texts = {text: kind for text, kind in found(**change).items() if says in text} if says else found(**change)
+    assert list(texts.values()) == [severity] * bool(says)
+
+
+def test_a_residual_risk_is_refused_until_somebody_accepts_it() -> None:
+    risky = msgspec.structs.replace(FIGURES, residual=("the gate holds 3 %",))
+    assert "residual risk: the gate holds 3 %" in table(risky)
+    for accepted_by, refused, accepted in (
+        ("", "nobody has accepted its residual risk: the gate holds 3 %. Who takes", ""),
+        ("Ada", "", "accepted by Ada: the gate holds 3 %"),
+    ):
+        figures = msgspec.json.encode(msgspec.structs.replace(risky, accepted_by=accepted_by)).decode()
+        risk = ResidualRisk.of(figures)
+        assert risk.refusal.startswith(refused)
+        assert bool(risk.refusal) == bool(refused)
+        assert risk.accepted == accepted
+    for harmless in ("", msgspec.json.encode(FIGURES).decode()):
+        assert ResidualRisk.of(harmless) == ResidualRisk()
