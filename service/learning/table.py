@@ -53,7 +53,8 @@ def table(found: Figures) -> str:
         late = f"{found.delay_s:.2f} s" if found.delay_s >= LEAST_DELAY_S else "not"
         then = ": the tool is as late; [skill] lead_s takes it back" if found.delay_s >= LEAST_DELAY_S else ""
         lines.append(
-            f"the teacher was {late} late (standard deviation {found.delay_std_s:.2f} s over demonstrations){then}"
+            f"the teacher was {late} late, which predicts held-out demonstrations best (standard deviation "
+            f"{found.delay_std_s:.2f} s over demonstrations){then}"
         )
     if found.tried_mm:
         wide = max(map(len, found.tried_mm))
