@@ -17,8 +17,8 @@ from service.core.frame import Event, Tick, as_array, order
 from service.core.intake.arm_samples import still_ticks
 from service.core.limiter.stage import Limiter
 from service.core.separation.stage import Separation
-from service.core.skill import ORDER
-from service.core.skill.memory import delayed, moving_features
+from service.core.skill import ORDER, TURNS
+from service.core.skill.memory import delayed, moving_features, turning
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 from service.core.skill.unseen import deviation_m
@@ -62,6 +62,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
     limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
     Separation(settings, urdf).share(still)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
+    turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations of a task: both hands and the tool over time, their checks and the tool's lag."""
+"""Demonstrations of a task: both hands and the tool over time, and their checks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from service.learning.skill_file import SkillError
 
 FARTHEST_M = 5.0  # positions farther from the origin are refused: their unit is hardly the metre
 LEAST_M = 0.01  # if hands or tool move by less along every axis, nothing can be learned
-LEAST_CORRELATION = 0.25  # of the speeds of hands and tool at their lag; noise alone reaches 0.2
-LONGEST_LAG_S = 1.0  # a lag between hands and tool is searched up to this one
-LAG_GAIN = 1.02  # a lag must raise the correlation of the speeds by this factor
+LONGEST_PERIOD_S = 1.0  # samples farther apart on average show no motion
 CLOSURE_MARGIN = 0.05  # closures from -0.05 to 1.05 are accepted
 NORM_TOLERANCE = 0.01  # accepted deviation of a quaternion's norm from 1
 LEAST_SAMPLES = 4  # samples of a demonstration
@@ -115,7 +113,7 @@ def check(demonstration: Demonstration) -> None:
     hands, tool, period_s = demonstration.hands, demonstration.tool, demonstration.period_s
     if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
         raise SkillError("a demonstration holds numbers that are not finite")
-    if len(hands) < LEAST_SAMPLES or period_s <= 0 or period_s > LONGEST_LAG_S:
+    if len(hands) < LEAST_SAMPLES or period_s <= 0 or period_s > LONGEST_PERIOD_S:
         raise SkillError(f"a demonstration of {len(hands)} samples is too short to learn from")
     if (farthest := max(np.abs(hands).max(), np.abs(tool[:, :3]).max())) > FARTHEST_M:
         raise SkillError(f"a demonstration goes {farthest:.0f} m away: is it in metres?")
@@ -133,24 +131,3 @@ def check(demonstration: Demonstration) -> None:
 def moved_m(demonstration: Demonstration) -> float:
     """The range of motion [m] along an axis, of the hands or the tool, whichever is smaller."""
     return float(min(np.ptp(demonstration.hands, axis=0).max(), np.ptp(demonstration.tool[:, :3], axis=0).max()))
-
-
-def lag(demonstration: Demonstration) -> int:
-    """The lag of the tool behind the hands in samples, negative if the hands lag; 0 if they rest.
-
-    The lag n maximises the correlation sum_t a(t) b(t + n) of the centred speeds a of the hands and
-    b of the tool.
-    """
-    if moved_m(demonstration) < LEAST_M:
-        return 0
-    hands, position = demonstration.hands, demonstration.tool[:, :3]
-    reach = min(int(LONGEST_LAG_S / demonstration.period_s), len(hands) // 4)
-    steps = [demonstration.by_pieces(lambda x: np.gradient(x, axis=0), x) for x in (hands, position)]
-    speeds = [np.linalg.norm(x, axis=1) for x in steps]
-    a, b = (s - s.mean() for s in speeds)
-    inner = a[reach : len(a) - reach]
-    shifted = [b[reach + shift : len(b) - reach + shift] for shift in range(-reach, reach + 1)]
-    score = [float(inner @ other) for other in shifted]
-    best = int(np.argmax(score))
-    least = LEAST_CORRELATION * float(np.linalg.norm(inner) * np.linalg.norm(shifted[best]))
-    return 0 if score[best] < max(LAG_GAIN * score[reach], least) else best - reach

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,12 @@ from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector
 from service.core.intake.hand_estimator import stillness_of
+from service.core.skill import TURNS
+from service.core.skill.memory import along as filtered
+from service.core.skill.memory import turn_lag_s
 from service.core.skill.stages import LEFT, MOST_STAGES, NONE, RIGHT, add_followed, along_way, on_way, recognise
 from service.core.skill.task import Indices, NamedViaPoints, Task
-from service.core.skill.tuning import DIRECTION_SPEED_MPS
+from service.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import SkillError
 
@@ -39,6 +42,7 @@ ANOTHER = 12.0  # cost of any other change
 LATER = 3.0  # cost of each stage that is left out at the beginning
 NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
+LEAST_WEIGHT = 1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
@@ -109,23 +113,19 @@ def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Encoded:
-    """A demonstration (T samples) in the stages of its task."""
+class Divided:
+    """A demonstration (T samples), divided into the stages of its task."""
 
+    demonstration: Demonstration
     at: NamedViaPoints
     stages: Records  # (K,) at the via-points of the demonstration
     moving: Vector  # (T, 3, 6) position, velocity and acceleration of the hands
     stillness: Vector  # (T, 2) of each hand, 0 to 1
-    tool: Vector  # (T, 3) [m]
     labels: Indices  # (T,) numbers of the stages
-    along: Vector  # (T, 2) shares of the stage that the hands have covered
-    off: Vector  # (T, 2) [m] distances of the hands from their segments
-    wanted: Vector  # (T, OUTPUTS) share of the stage that the tool has covered, and its offset (3,) [m]
-    period_s: float
 
     @staticmethod
-    def of(task: Task, demonstration: Demonstration, late_s: float) -> Encoded:
-        """The stages and shares of a demonstration whose teacher is late by `late_s`."""
+    def of(task: Task, demonstration: Demonstration) -> Divided:
+        """The stages of a demonstration."""
         period_s = demonstration.period_s
         window = round(SMOOTHED_S / period_s)
         hands, smooth_tool = (
@@ -137,24 +137,67 @@ class Encoded:
         )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
         at = NamedViaPoints.of(demonstration.places)
-        stages, tool = task.stages(at, np.full((len(task.names) - 1, 2), OFF_M)), demonstration.tool[:, :3]
+        stages = _stages(task, at)
         labels = _divided(stages, moving, (smooth_tool, tool_velocities), period_s)
-        steps = round(late_s / period_s)
-        stillness = stillness_of(velocities, period_s)
-        late, rested = (demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (hands, stillness))
+        return Divided(demonstration, at, stages, moving, stillness_of(velocities, period_s), labels)
+
+    @property
+    def tool(self) -> Vector:
+        """The tool's position (T, 3) [m]."""
+        return self.demonstration.tool[:, :3]
+
+    @property
+    def period_s(self) -> float:
+        """The mean time [s] between samples."""
+        return self.demonstration.period_s
+
+    def in_task(self, task: Task) -> Divided:
+        """The same stages of a task in which the tool follows other hands, or turns with them."""
+        return replace(self, stages=_stages(task, self.at))
+
+    def turns(self, late_s: float) -> Vector:
+        """The entries (T, 18) of the hands' rotation matrices, filtered so that they are `late_s`
+        late; (T, 0) if the tool does not turn with the hands.
+        """
+        if not self.stages["turned"].any():
+            return np.empty((len(self.labels), 0))
+        return filtered(self.demonstration.turns, self.period_s, turn_lag_s(late_s), TURNS)[:, -1]
+
+    def late(self, late_s: float) -> Encoded:
+        """The shares of the stages, for a teacher whose tool is late by `late_s`."""
+        steps, labels, stages, tool = round(late_s / self.period_s), self.labels, self.stages, self.tool
+        hands, rested = (
+            self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
+        )
+        hands = np.hstack([hands, self.turns(late_s)])
         found = np.empty((len(hands), 4))
-        along_all(late, rested, labels, stages, found)
+        along_all(hands, rested, labels, stages, found)
         along, off = found[:, :2], found[:, 2:]
         begins, way = stages["tool"][labels], stages["tool_way"][labels]
         square = (way**2).sum(axis=1)
         goes = square > SAME_M**2
         share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
-        share = share.clip(0.0, 1.0)
-        followed = np.zeros_like(tool)
-        all_followed(late, share, labels, stages, followed)
-        offset = tool - begins - share[:, None] * way - followed
-        wanted = np.column_stack([share, offset])
-        return Encoded(at, stages, moving, stillness, tool, labels, along, off, wanted, period_s)
+        wanted = np.column_stack([share.clip(0.0, 1.0), np.zeros_like(tool)])
+        one = Encoded(**vars(self), hands=hands, along=along, off=off, wanted=wanted)
+        wanted[:, 1:] = tool - one.tools(np.arange(len(tool)), wanted)
+        return one
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded(Divided):
+    """A divided demonstration in shares of its stages."""
+
+    hands: Vector  # (T, 6) [m] positions of the hands, delayed as the tool is; (T, 24) with their turns
+    along: Vector  # (T, 2) shares of the stage that the hands have covered
+    off: Vector  # (T, 2) [m] distances of the hands from their segments
+    wanted: Vector  # (T, OUTPUTS) share of the stage that the tool has covered, and its offset (3,) [m]
+
+    def tools(self, rows: Indices, outputs: Vector) -> Vector:
+        """Tool positions (M, 3) [m] for outputs (M, OUTPUTS) of the primitive at rows (M,)."""
+        labels, share = self.labels[rows], outputs[:, 0]
+        out = self.stages["tool"][labels] + share[:, None] * self.stages["tool_way"][labels] + outputs[:, 1:]
+        all_followed(self.hands[rows], share.clip(0.0, 1.0), labels, self.stages, out)
+        return np.asarray(out)
 
     def near(self, corner: tuple[float, float], stages: Sequence[int]) -> NDArray[np.bool_]:
         """Return whether the hands' shares are near these in one of these stages (T,)."""
@@ -166,6 +209,44 @@ class Encoded:
         way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
         kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
         return np.asarray(np.unique(kept), np.int64)
+
+
+def _stages(task: Task, at: NamedViaPoints) -> Records:
+    return task.stages(at, np.full((len(task.names) - 1, 2), OFF_M))
+
+
+def encode(task: Task, shown: Sequence[Divided], late_s: Sequence[float]) -> tuple[Task, list[Encoded]]:
+    """The demonstrations encoded for teachers who are late by `late_s` in each, and the task; if
+    the tool turns with the hands there, with the levers that the demonstrations lead to.
+    """
+    out = [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+    if task.levers is None:
+        return task, out
+    task = task._replace(levers=np.array([_lever(out, i, side) for i, side in enumerate(task.follow.tolist())]))
+    return task, [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+
+
+def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
+    """The mean position (3,) [m] of the tool in the frame of a hand at the via-point of this
+    number; zeros if the tool follows no hand there:
+
+        l = Σ_t w_t R_tᵀ (x_t - h_t) / Σ_t w_t
+
+    with the tool x and the hand's position h and rotation matrix R, delayed as the tool is. With
+    the tool's share s, w = sⁿ in the stage that ends at the via-point and (1 - s)ⁿ in the one that
+    begins there.
+    """
+    if side == NONE:
+        return np.zeros(3)
+    total, weight = np.zeros(3), 0.0
+    for one in shown:
+        share = one.wanted[:, 0]
+        near = np.where(one.labels == number, 1.0 - share, np.where(one.labels == number - 1, share, 0.0))
+        weights = near**WITH_HAND_POWER + LEAST_WEIGHT
+        turned = one.hands[:, 6 + 9 * side :][:, :9].reshape(-1, 3, 3)
+        total += np.einsum("t,tji,tj->i", weights, turned, one.tool - one.hands[:, 3 * side : 3 * side + 3])
+        weight += float(weights.sum())
+    return np.asarray(total / weight)
 
 
 def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:

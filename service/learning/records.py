@@ -38,8 +38,7 @@ class Take(NamedTuple):
     """A demonstration with its name, the number of its person, and the T samples that are learned
     from: hands (T, 6), tool (T, 7) and the gripper's closure (T,), if it is known.
 
-    All takes of a person are held out at once. Tool and closure may be shifted against the hands,
-    `moment` (T, 3) [m] is the tool's position when the hands were there.
+    All takes of a person are held out at once.
     """
 
     name: str
@@ -47,7 +46,6 @@ class Take(NamedTuple):
     demonstration: Demonstration
     hands: Vector
     tool: Vector
-    moment: Vector
     closure: Vector | None
 
     @property
@@ -181,7 +179,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     error_mm: float
     worst_mm: float
-    moment_mm: float = 0.0  # error including the tool's lag
+    moment_mm: float = 0.0  # error with hyper-parameters that were chosen without its block
     predicted_mm: float  # `moment_mm` as the covariance predicts it, calibrated without this demonstration
     within_50: float  # [%] of the samples inside the region that should contain 50 %
     within_95: float

@@ -111,7 +111,7 @@ def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
         if i in begins:
             trail[:] = position
         velocity[i] = recent(position, take.demonstration.period_s, trail)
-    return TimedErrors((take.moment - mean)[rows], covariance, velocity[rows])
+    return TimedErrors((take.position - mean)[rows], covariance, velocity[rows])
 
 
 def _through_places(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:

@@ -223,7 +223,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
-    yield from _beyond(arrays, [*RANGES, *_model(arrays).ranges], "")
+    own = [name for name in _model(arrays).ranges if name in arrays]  # one that is missing is found missing later
+    yield from _beyond(arrays, [*RANGES, *own], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
             yield from _beyond(part, RANGES.keys() & part.keys(), prefix)

@@ -32,7 +32,7 @@ def table(found: Figures) -> str:
         if len(found.demonstrations) > 1
         else "The row is the demonstration that was learned from, as none could be left out. The columns:",
         "  error, worst   distance of the predicted tool from the demonstrated one: root mean square, and largest",
-        *["  at the moment  that error without any allowance for a tool that is early or late"] * is_other,
+        *["  at the moment  that error with parameters that were chosen without the demonstration, too"] * is_other,
         "  expected       root mean square error that the skill expects, by its covariance as calibrated",
         "  in 50 %, 95 %  share of the samples in the regions that should hold 50 % and 95 % of them",
         "  held           share of the time in which the arm would hold, as the hands are beyond the gate",
@@ -55,7 +55,8 @@ def table(found: Figures) -> str:
         late = f"{found.delay_s:.2f} s" if found.delay_s >= LEAST_DELAY_S else "not"
         then = ": the tool is as late; [skill] lead_s takes it back" if found.delay_s >= LEAST_DELAY_S else ""
         lines.append(
-            f"the teacher was {late} late (standard deviation {found.delay_std_s:.2f} s over demonstrations){then}"
+            f"the teacher was {late} late, which predicts held-out demonstrations best (standard deviation "
+            f"{found.delay_std_s:.2f} s over demonstrations){then}"
         )
     if found.tried_mm:
         wide = max(map(len, found.tried_mm))

@@ -1,4 +1,4 @@
-"""Takes: the demonstrations that are learned from, checked, and their hands and tool aligned."""
+"""Takes: the demonstrations that are learned from, checked."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.contract.records import SIDES
 from service.contract.requests import Hands
 from service.core.frame import Vector
 from service.learning.ambiguity import same_hands_m
-from service.learning.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, lag, moved_m, persons
+from service.learning.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, moved_m, persons
 from service.learning.methods import Method, method_of
 from service.learning.records import Fitted, Options, Take
 from service.learning.skill_file import SkillError
@@ -84,21 +84,10 @@ def divided(
     method = method_of([*demonstrations, *before], options)
     if before:
         _check_alike(demonstrations, names, before)
-    takes = aligned(demonstrations, names, removes_lag=method.removes_lag)
+    takes = takes_of(demonstrations, names)
     first = 1 + max(take.person for take in takes)
-    return Division(
-        takes,
-        [
-            take._replace(person=first + take.person)
-            for take in aligned(before, before_names, removes_lag=method.removes_lag)
-        ],
-        method,
-        options,
-        same_hands_m(demonstrations),
-        conductor,
-        repeated,
-        remarks,
-    )
+    before_takes = [take._replace(person=first + take.person) for take in takes_of(before, before_names)]
+    return Division(takes, before_takes, method, options, same_hands_m(demonstrations), conductor, repeated, remarks)
 
 
 def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[str], list[Demonstration]]:
@@ -150,22 +139,12 @@ def check_count(names: Sequence[str], components: int | None, remark: str = "") 
         )
 
 
-def aligned(demonstrations: Sequence[Demonstration], names: Sequence[str], *, removes_lag: bool) -> list[Take]:
-    """The takes of demonstrations; if their lag is removed, hands and tool are shifted by it.
-
-    With a tool that lags, one position of the hands would belong to two of the tool.
-    """
-    out = []
-    for name, person, one in zip(names, persons(demonstrations), demonstrations, strict=True):
-        late = lag(one) if removes_lag else 0
-        hands, moment = (_shifted(one, values, -late) for values in (one.hands, one.tool[:, :3]))
-        closure = None if one.gripper is None else _shifted(one, one.gripper, late)
-        out.append(Take(name, person, one, hands, _shifted(one, one.tool, late), moment, closure))
-    return out
-
-
-def _shifted(demonstration: Demonstration, values: Vector, by: int) -> Vector:
-    return demonstration.by_pieces(lambda x: x[max(0, by) : max(0, len(x) + min(0, by))], values)
+def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[Take]:
+    """The takes of demonstrations."""
+    return [
+        Take(name, person, one, one.hands, one.tool, one.gripper)
+        for name, person, one in zip(names, persons(demonstrations), demonstrations, strict=True)
+    ]
 
 
 def _repeats(demonstrations: Sequence[Demonstration]) -> dict[int, int]:

@@ -12,8 +12,8 @@ from service.contract.records import Field
 from service.core.frame import blank
 from service.core.skill import ORDER, TURNS
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import features, moving_features, remember
-from service.core.skill.tuning import MEMORY_LAG_S, TURN_WEIGHT_M
+from service.core.skill.memory import features, moving_features, remember, turning
+from service.core.skill.tuning import MEMORY_LAG_S, TURN_LAG_S, TURN_WEIGHT_M
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill, decoded
@@ -53,7 +53,7 @@ def both_remembered(
         if tick not in unseen:
             state["hand_ticks"], state["hands"][:, 0] = tick, both.reshape(2, 3)
             state["hand_turns"] = turn.reshape(2, 9)
-            remember(states, period_s, MEMORY_LAG_S)
+            remember(states, period_s, MEMORY_LAG_S, TURN_LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
         turned.append(state["turns"].reshape(TURNS, 18).copy())
     return np.array(out), np.array(turned)
@@ -102,6 +102,10 @@ def test_inputs_move_as_their_velocity_and_acceleration_say() -> None:
         slope = np.gradient(found[:, order], h, axis=0)[late]
         assert np.abs(slope - found[late, order + 1]).max() < 0.01
         assert np.abs(slope[:, -18:]).max() > 0.01
+    for rows, out in zip(turns, found, strict=True):
+        turned = np.empty((3, 18))
+        turning(rows, TURN_LAG_S, turned)
+        np.testing.assert_allclose(TURN_WEIGHT_M * turned, out[:, -18:], rtol=1e-12, atol=1e-12)
     assert MEMORY_LAG_S * ORDER == 2.0
 
 

@@ -8,7 +8,7 @@ import pytest
 from service.learning.baselines import baselines, held_out_errors, linear, look_up, same_time
 from service.learning.demonstration import Demonstration
 from service.learning.records import Take
-from service.learning.takes import aligned
+from service.learning.takes import takes_of
 
 RANDOM = np.random.default_rng(0)
 SLOPE, OFFSET = RANDOM.normal(size=(6, 3)), np.array([0.1, 0.2, 0.3])
@@ -56,7 +56,7 @@ def test_after_as_much_time_the_tool_is_where_the_others_were_and_stays_at_their
         tool[:, 0] = speed * times
         return Demonstration((1e9 * times).astype(np.int64), tool, tool, tool)
 
-    one, *others = aligned([shown(2.05, 1.0), shown(1.05, 2.0), shown(1.05, 4.0)], list("abc"), removes_lag=False)
+    one, *others = takes_of([shown(2.05, 1.0), shown(1.05, 2.0), shown(1.05, 4.0)], list("abc"))
     found = same_time(one, others)
     np.testing.assert_allclose(found[:, 0], [3.0 * min(t, 1.0) for t in np.arange(0.0, 2.05, 0.1)], atol=1e-9)
     assert not found[:, 1:].any()

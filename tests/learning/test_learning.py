@@ -1,4 +1,4 @@
-"""Learning from demonstrations: what comes of it, in phase, deterministic, and what is refused."""
+"""Learning from demonstrations: what comes of it, deterministic, and what is refused."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 
 from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration, lag
+from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import mean_orientation
 from service.learning.skill_file import SkillError
-from support.circling import circling
-from support.taught_scene import demonstrated, deviations, error_m, quickly
-
-LATE = 40  # samples of 10 ms
+from support.taught_scene import deviations, error_m, quickly
 
 
 def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(
@@ -25,16 +22,6 @@ def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(
 
 def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstration]) -> None:
     assert quickly(taught[:2]).file == coarse.file
-
-
-def test_hands_and_tool_that_move_steadily_are_taken_to_be_in_phase() -> None:
-    assert [lag(circling(seed)) for seed in range(5)] == [0] * 5
-
-
-def test_a_tool_that_lags_is_put_in_phase(coarse: Skill, taught: list[Demonstration]) -> None:
-    late = quickly(demonstrated(2, late=LATE))
-    assert error_m(late, taught[3:]) < error_m(coarse, taught[3:]) + 0.006
-    assert late.learned_from != coarse.learned_from
 
 
 def test_the_box_holds_the_demonstrated_tool_with_a_margin(learned: Skill, taught: list[Demonstration]) -> None:
@@ -89,7 +76,6 @@ def test_a_take_in_which_the_hands_rest_is_learned_from_with_others(taught: list
     resting = resting._replace(
         left=np.tile(resting.left[0], (len(resting.left), 1)), right=np.tile(resting.right[0], (len(resting.left), 1))
     )
-    assert lag(resting) == 0
     skill = learn([*(one.every(4) for one in taught[:2]), resting], points=60)
     assert len(msgspec.json.decode(skill.figures)["demonstrations"]) == 3
 

@@ -20,7 +20,7 @@ from service.learning.learn import learn
 from service.learning.pose import learned_pose
 from service.learning.records import Figures, HeldOut
 from service.learning.skill_file import SkillError, decoded
-from service.learning.takes import aligned
+from service.learning.takes import takes_of
 from service.learning.via_points import adapted, in_force
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
@@ -68,7 +68,7 @@ def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[D
 
 def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demonstration]) -> None:
     other = [one._replace(tool=np.hstack([one.tool[:, :3], turning(one, -TURN).tool[:, 3:]])) for one in shown]
-    takes = aligned([one._replace(gripper=None) for one in (*shown, other[0])], list("abcd"), removes_lag=False)
+    takes = takes_of([one._replace(gripper=None) for one in (*shown, other[0])], list("abcd"))
     held_out = [
         HeldOut(
             take, np.zeros_like(take.position), np.zeros((len(take.hands), 3, 3)), np.zeros(0), take.hands, take.hands

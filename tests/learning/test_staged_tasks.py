@@ -6,26 +6,29 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from kmp.storage import checksum
 from service.contract.requests import ViaPoint
+from service.core.skill import TURNS
+from service.core.skill.memory import turn_lag_s
 from service.core.skill.skill import Skill
 from service.core.skill.staged import StagedKMP
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of, via_points_never_reached
 from service.learning.learn import learn
-from service.learning.methods.staged import delay_of
 from service.learning.records import Figures
-from service.learning.skill_file import SkillError, decoded
+from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.learning.table import table
 from service.learning.via_points import adapted, in_force, warnings_of
 from sim.experiments.people.left_out import judged, left_out, predicted
-from sim.made_tasks import takes
+from sim.made_tasks import CARRIED_M, takes
 from sim.teach import by_people
 
 AT_REST = np.zeros(6)
@@ -205,16 +208,58 @@ def test_six_places_of_each_hand_are_learned() -> None:
 
 
 def test_the_teachers_delay_is_learned_and_the_tool_led_by_less(cyclic: Skill) -> None:
-    shown = [take.demonstration for take in takes("cyclic", people=range(4), each=2)]
-    delay, each_s = delay_of(shown)
-    assert cyclic.model.delay_s == delay.mean_s == pytest.approx(0.25, abs=0.1)
-    assert len(each_s) == len(shown)
-    assert 0.0 < delay.std_s < 0.2
     figures = msgspec.json.decode(cyclic.figures, type=Figures)
-    assert (figures.delay_s, figures.delay_std_s) == delay
-    says = f"the teacher was {delay.mean_s:.2f} s late (standard deviation {delay.std_s:.2f} s over demonstrations)"
-    assert f"\n{says}: the tool is as late; [skill] lead_s takes it back" in table(figures)
+    late_s, std_s = figures.delay_s, figures.delay_std_s
+    assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)  # the mean of 0.09 to 0.34 s
+    assert 0.0 < std_s < 0.2
+    says = f"the teacher was {late_s:.2f} s late, which predicts held-out demonstrations best (standard deviation "
+    assert f"\n{says}{std_s:.2f} s over demonstrations): the tool is as late; [skill] lead_s" in table(figures)
     assert not any("late" in text for text in figures.warnings)
     in_time = msgspec.structs.replace(figures, delay_s=0.0)
     assert "the teacher was not late" in table(in_time)
     assert "lead_s" not in table(in_time)
+
+
+def without_follow(shown: Demonstration) -> Demonstration:
+    """A demonstration whose via-points do not state which hand the tool follows."""
+    return shown._replace(places=tuple(msgspec.structs.replace(place, follow="none") for place in shown.places))
+
+
+@pytest.fixture(scope="module")
+def carried() -> StoredSkill:
+    """The tool is fixed to what the left hand carries."""
+    return learn([without_follow(take.demonstration) for take in takes("heading", people=range(4), each=2)])
+
+
+def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carried: StoredSkill) -> None:
+    figures = msgspec.json.decode(carried.figures, type=Figures)
+    assert figures.taken == "orientation of the left hand"
+    assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
+    assert isinstance(carried.model, StagedKMP)
+    np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
+    assert rms_mm("heading", carried) < 22.0  # without the orientation: 39; a Gaussian process told the places: 80
+    again = decoded(carried.file, origin="a file")
+    assert again.model.own_arrays()["levers"].tobytes() == carried.model.own_arrays()["levers"].tobytes()
+    assert with_file(replace(again, file=b"")).file == carried.file
+
+
+def test_its_velocity_is_that_of_the_turning_hand_and_without_orientation_it_moves_only(carried: StoredSkill) -> None:
+    model, still = carried.model, np.zeros((2, 3))
+    hands, belief = model.hands[1].reshape(2, 3), model.belief(model.hands[1])
+    lag_s, h, rate = turn_lag_s(model.delay_s), 1e-3, np.array([0.0, 0.0, 0.5])
+
+    def turns(at_s: float) -> np.ndarray:
+        """The rows of the filters of hands that turn evenly: each lags by as much again."""
+        rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel() for i in range(TURNS)]
+        return np.stack([rows, rows], axis=1)
+
+    behind, now, ahead = (
+        carried.predict(hands, still, still, turns=turns(at_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
+    )
+    np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
+    lever = Rotation.from_rotvec(-TURNS * lag_s * rate).apply(CARRIED_M)
+    np.testing.assert_allclose(now.velocity, np.cross(rate, lever), atol=0.01)
+    np.testing.assert_allclose(now.position, hands[0] + lever, atol=0.02)
+    untold = carried.predict(hands, still, still, belief=belief.copy())
+    assert not untold.velocity.any()
+    np.testing.assert_allclose(untold.position, model.nominal.at[1, 6:], atol=0.02)

@@ -33,9 +33,9 @@ def _follow(now: float, share: float, rows: Vector) -> None:
 
 
 @compiled
-def remember(states: Records, period_s: float, lag_s: float) -> None:
+def remember(states: Records, period_s: float, lag_s: float, turn_lag_s: float) -> None:
     """Update the memory of both hands' positions, with the time constant `lag_s`, and of their
-    orientations, with TURN_LAG_S: share = 1 - exp(-elapsed time / time constant).
+    orientations, with `turn_lag_s`: share = 1 - exp(-elapsed time / time constant).
 
     For positions, the elapsed time is at most MEMORY_LONGEST_STEP_S. A hand's first sample is taken
     into all filters at once.
@@ -48,7 +48,7 @@ def remember(states: Records, period_s: float, lag_s: float) -> None:
         if state.memory_ticks[side] >= 0:
             passed_s = (state.tick - state.memory_ticks[side]) * period_s
             share = 1.0 - math.exp(-min(passed_s, MEMORY_LONGEST_STEP_S) / lag_s) if lag_s > 0.0 else 1.0
-            turn_share = 1.0 - math.exp(-passed_s / TURN_LAG_S)
+            turn_share = 1.0 - math.exp(-passed_s / turn_lag_s)
         state.memory_ticks[side] = state.tick
         for i in range(3):
             _follow(state.hands[side, 0, i], share, state.memory[:, side, i])
@@ -84,6 +84,25 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
         out[0, first + i] = TURN_WEIGHT_M * last
         out[1, first + i] = TURN_WEIGHT_M * (between - last) / TURN_LAG_S
         out[2, first + i] = TURN_WEIGHT_M * (before - 2.0 * between + last) / TURN_LAG_S**2
+
+
+def turn_lag_s(late_s: float) -> float:
+    """Time constant [s] of the filters of the hands' orientations, so that they are `late_s` late,
+    or as late as smoothing needs.
+    """
+    return max(late_s / TURNS, TURN_LAG_S)
+
+
+@compiled
+def turning(turns: Vector, lag_s: float, out: Vector) -> None:
+    """Filtered rotation matrices with their rate [1/s] and acceleration [1/s²], written to `out`
+    (3, E), from the rows of their filters (TURNS, E) with the time constant `lag_s`.
+    """
+    for i in range(out.shape[1]):
+        before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
+        out[0, i] = last
+        out[1, i] = (between - last) / lag_s
+        out[2, i] = (before - 2.0 * between + last) / lag_s**2
 
 
 @compiled

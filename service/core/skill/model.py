@@ -59,6 +59,7 @@ class Seen(NamedTuple):
     stillness: Vector  # (2,) stillness of each hand, 0 to 1
     past: Vector  # (ORDER, 6) [m] memory of the hands' positions, see `remember`
     turns: Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
+    turn_lag_s: float  # time constant of these filters
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
     belief: Vector  # (MOST_STAGES,) probability of each stage; zeros: not yet known
     period_s: float  # time since the belief was updated; 0: it is not updated
@@ -130,6 +131,10 @@ class Model(Protocol):
     @property
     def remembers(self) -> bool:
         """True if the hands' past positions are inputs."""
+
+    @property
+    def turned(self) -> bool:
+        """True if the tool depends on the hands' orientation."""
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""

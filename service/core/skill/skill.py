@@ -21,7 +21,7 @@ from service.core.intake.hand_estimator import STILL
 from service.core.numerics import MAX_TARGET_M
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import delayed
+from service.core.skill.memory import delayed, turn_lag_s
 from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
@@ -209,7 +209,7 @@ class Skill(Immutable):
         if self.conductor is not None:
             stillness = stillness[[self.conductor] * 2]
         told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
-        seen = Seen(moving, stillness, behind, told, now, belief, period_s)
+        seen = Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s)
         motion = self.model.predict(seen, None if before is None else before[0])
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)

@@ -10,7 +10,7 @@ from service.core.codes import AMBIGUOUS
 from service.core.frame import Record, Vector, as_array
 from service.core.intake.tuning import END_SHARE
 from service.core.skill import ORDER
-from service.core.skill.memory import remember
+from service.core.skill.memory import remember, turn_lag_s
 from service.core.skill.model import Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp
@@ -39,6 +39,7 @@ class SkillStage:
         self.skill = skill
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
+        self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
 
     def adopt(self, state: Record, skill: Skill) -> None:
         """Replace the skill. The belief is kept if the new skill has the same via-points, and the
@@ -46,9 +47,11 @@ class SkillStage:
         """
         if skill.model.names != self.skill.model.names:
             state["stage_belief"] = 0.0
-        if skill.model.remembers != self.skill.model.remembers or skill.model.delay_s != self.skill.model.delay_s:
-            state["memory_ticks"] = -1
+        before, turn_before_s = self.skill.model, self._turn_lag_s
         self._take(skill)
+        is_same = skill.model.remembers == before.remembers and skill.model.delay_s == before.delay_s
+        if not is_same or self._turn_lag_s != turn_before_s:
+            state["memory_ticks"] = -1
         state["skill"] = np.frombuffer(skill.digest, np.uint8)
         state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
         state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
@@ -58,7 +61,7 @@ class SkillStage:
         side of a hand that is not seen now. Covariances and closure are computed at new samples
         only.
         """
-        remember(as_array(state), self._period_s, self._lag_s)
+        remember(as_array(state), self._period_s, self._lag_s, self._turn_lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
         belief = state["stage_belief"]
         is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0

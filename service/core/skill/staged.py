@@ -20,6 +20,7 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
 from service.core.numerics import BELIEF_PERIODS, MOTION_STEP_S
+from service.core.skill.memory import turning
 from service.core.skill.model import COVARIANCE_ROUND_TO, Arrays, Motion, Seen
 from service.core.skill.stages import (
     MOST_STAGES,
@@ -90,8 +91,8 @@ class Placed(Immutable):
         return out
 
     def mean(self, hands: Vector, beliefs: Vector, stillness: Vector | None = None) -> Vector:
-        """Expected tool positions (T, 3) [m] for hands (T, 6) with these beliefs (T, K or more) and
-        stillness (T, 2); without it, the hands are still.
+        """Expected tool positions (T, 3) [m] for hands (T, 6), or with their rotation matrices (T,
+        24), with these beliefs (T, K or more) and stillness (T, 2); without it, hands are still.
         """
         out = np.empty((len(hands), 3))
         for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
@@ -100,7 +101,7 @@ class Placed(Immutable):
         return out
 
     def _tools(self, hands: Vector, still: Vector, belief: Vector, pulls: Vector) -> Vector:
-        """Tool positions (K, 3) [m] for hands (6,) in all stages with at least
+        """Tool positions (K, 3) [m] for hands (6 or 24,) in all stages with at least
         LEAST_STAGE_PROBABILITY.
         """
         out = np.empty((len(self.stages), 3))
@@ -112,8 +113,8 @@ class Placed(Immutable):
         return np.array([off_all(np.ascontiguousarray(one), self.stages) for one in hands])
 
     def covariance(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
-        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6,), a belief and stillness (2,),
-        see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
+        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6 or 24,), a belief and stillness
+        (2,), see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
         via-points' variance.
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
@@ -143,6 +144,8 @@ class StagedKMP:
     * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
     * `errors` (M, 6): inputs and the tool's errors [m] in held-out demonstrations, see `Placed`.
     * `delay_s`: delay of the demonstrated tool behind the hands.
+
+    Where the hands' orientation is unknown, a tool that turns with them only moves with them.
     """
 
     primitive: KMP
@@ -167,6 +170,10 @@ class StagedKMP:
     @property
     def names(self) -> tuple[str, ...]:
         return self.task.names
+
+    @property
+    def turned(self) -> bool:
+        return self.task.levers is not None
 
     @cached_property
     def hands(self) -> Vector:
@@ -200,6 +207,9 @@ class StagedKMP:
         at, out, hands = self.placed, np.empty((6, 3)), np.zeros(1, SEEN)
         hands["moving"], hands["now"] = seen.moving, seen.now
         hands["stillness"], hands["period_s"] = seen.stillness, seen.period_s
+        if self.turned and len(seen.turns):
+            hands["is_turning"] = 1
+            turning(seen.turns, seen.turn_lag_s, hands["turning"][0])
         errors = at.errors if known is None else NO_ERRORS
         gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)

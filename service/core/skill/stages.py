@@ -58,6 +58,8 @@ STAGE = np.dtype(
         ("tool", np.float64, (3,)),  # [m] the tool's first via-point
         ("tool_way", np.float64, (3,)),  # [m] the tool's segment
         ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the stage
+        ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
+        ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
     ]
 )
 # Numbers that hold in all stages, as compiled functions read them.
@@ -76,6 +78,8 @@ SEEN = np.dtype(
         ("now", np.float64, (3, 6)),
         ("stillness", np.float64, (2,)),
         ("period_s", np.float64),
+        ("turning", np.float64, (3, 18)),  # both hands' rotation matrices, their rate and acceleration
+        ("is_turning", np.int64),  # 1: these are known
     ]
 )
 
@@ -125,8 +129,8 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
 
 @compiled
 def along_both(hands: Vector, still: Vector, stage: Record) -> tuple[float, float]:
-    """Shares of the stage, by `along_way`, of both hands (6,) with the stillness (2,)."""
-    return along_way(hands[:3], still[0], stage, 0), along_way(hands[3:], still[1], stage, 1)
+    """Shares of the stage, by `along_way`, of both hands (6 or more,) with the stillness (2,)."""
+    return along_way(hands[:3], still[0], stage, 0), along_way(hands[3:6], still[1], stage, 1)
 
 
 @compiled
@@ -230,30 +234,43 @@ def off_all(hands: Vector, stages: Records) -> float:
 
 @compiled
 def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> None:
-    """Add to `out` (3,) the offset with which the tool follows the hands (6,), at a `share` s of a
-    stage:
+    """Add to `out` (3,) the offset with which the tool follows the hands (6 or 24,), at a `share` s
+    of a stage:
 
         out = out + (1 - s)ⁿ (h_0 - q_0) + sⁿ (h_1 - q_1)
 
     h_0 is the hand that the tool follows at the stage's begin and q_0 that hand's via-point there;
     h_1 and q_1 are the same at its end. n = 1 if it is one hand, else WITH_HAND_POWER. An end at
     which the tool follows no hand adds nothing.
+
+    If the tool turns with the hands, and their rotation matrices R are known (the last 18 of 24
+    numbers), it is at the lever l in the frame of the hand, wherever the tool's via-point t is:
+
+        h - q + R l - (t - q) = h + R l - t   in place of   h - q
     """
     follow = stage["follow"]
     power = 1 if follow[0] == follow[1] else WITH_HAND_POWER
+    turns = stage["turned"] == 1 and len(hands) > 6
     for end in range(2):
         side = follow[end]
         if side >= 0:
             goes = (share if end else 1.0 - share) ** power
             for i in range(3):
-                out[i] += goes * (hands[3 * side + i] - stage["begins"][side, i] - end * stage["way"][side, i])
+                if turns:
+                    off = hands[3 * side + i] - stage["tool"][i] - end * stage["tool_way"][i]
+                    for j in range(3):
+                        off += hands[6 + 9 * side + 3 * i + j] * stage["levers"][end, j]
+                    out[i] += goes * off
+                else:
+                    out[i] += goes * (hands[3 * side + i] - stage["begins"][side, i] - end * stage["way"][side, i])
 
 
 @compiled
 def _tool_in(
     hands: Vector, still: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
 ) -> None:
-    """Tool position in stage k for hands (6,) with the stillness (2,), written to `out` (3,) [m].
+    """Tool position in stage k for hands (6 or 24,) with the stillness (2,), written to `out` (3,)
+    [m]. The last 18 of 24 numbers are the hands' rotation matrices.
 
     With the hands' shares x (2,) of the stage, the primitive gives the tool's share s and its
     offset δ (3,) [m] by equation (8) of Huang et al. 2019, over its R centres c_r with the weights
@@ -280,7 +297,7 @@ def _tool_in(
         out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
     add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
-        add_weighted(hands, pulls, PULL_SHARPNESS_PER_M2, out)
+        add_weighted(hands[:6], pulls, PULL_SHARPNESS_PER_M2, out)
 
 
 @compiled
@@ -340,8 +357,8 @@ def _ambiguity(belief: Vector, tools: Vector) -> float:
 
 @compiled
 def _around(moving: Vector, out: Vector) -> None:
-    """Hands' positions one step h = MOTION_STEP_S ago, now and one step ahead, written to `out` (3,
-    6), for the hands' motion (3, 6):
+    """Hands' positions one step h = MOTION_STEP_S ago, now and one step ahead, written to the first
+    columns of `out` (3, 6 or more), for the hands' motion (3, 6):
 
         x - h g v + ½ h² g a,   x,   x + h g v + ½ h² g a,   g = 1 - exp(-(|v| / CALM_MPS)⁴)
 
@@ -355,6 +372,17 @@ def _around(moving: Vector, out: Vector) -> None:
         for i in range(3 * side, 3 * side + 3):
             step, curved = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
             out[0, i], out[1, i], out[2, i] = moving[0, i] - step + curved, moving[0, i], moving[0, i] + step + curved
+
+
+@compiled
+def _turned_around(turning: Vector, out: Vector) -> None:
+    """Entries of the hands' rotation matrices at the three times of `_around`, written to the last
+    columns of `out` (3, 24), for these matrices with their rate and acceleration (3, 18).
+    """
+    for n in range(3):
+        step = (n - 1) * MOTION_STEP_S
+        for i in range(turning.shape[1]):
+            out[n, 6 + i] = turning[0, i] + step * turning[1, i] + 0.5 * step**2 * turning[2, i]
 
 
 @compiled
@@ -432,11 +460,14 @@ def predicted(
     Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
     the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
-    one, hands, steps = seen[0], np.empty((3, 6)), np.empty((3, 3))
+    one, steps = seen[0], np.empty((3, 3))
+    hands = np.empty((3, 6 + 18 * one["is_turning"]))
     still, tools = one["stillness"], np.empty((3, len(stages), 3))
     if one["period_s"] > 0.0:
         recognise(belief, one["now"], one["period_s"], stages)
     _around(one["moving"], hands)
+    if one["is_turning"]:
+        _turned_around(one["turning"], hands)
     for n in range(3):
         tools_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
         expected(belief, tools[n], steps[n])

@@ -28,6 +28,7 @@ TASK_RANGES = {
     "seen": (-0.001, MOST_STAGES, ""),
     "errors": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "delay": (0.0, 1.0, "s"),
+    "levers": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
 }
 """Minimum, maximum and unit of the numbers in the arrays of a task's model."""
 Indices = NDArray[np.int64]
@@ -39,11 +40,14 @@ class Task(NamedTuple):
     * `corners` (N, 2): index of the position of the left and the right hand at each via-point. A
       hand that returns to a position has the same index.
     * `follow` (N,): the hand that the tool follows at each via-point: NONE, LEFT or RIGHT.
+    * `levers` (N, 3) [m]: the tool there in the frame of that hand, with which it turns; None if
+      the tool moves with the hand but does not turn with it.
     """
 
     names: tuple[str, ...]
     corners: Indices
     follow: Indices
+    levers: Vector | None = None
 
     def stages(self, points: NamedViaPoints, off: Vector) -> Records:
         """Stages (N - 1,) of STAGE between these via-points. `off` (N - 1, 2) [m] is its field.
@@ -67,12 +71,15 @@ class Task(NamedTuple):
         out["way"] *= (out["square"] > STAYS)[:, :, None]
         out["off"], out["tool"], out["tool_way"] = off, at[:-1, 6:], np.diff(at[:, 6:], axis=0)
         out["follow"] = np.stack([self.follow[:-1], self.follow[1:]], axis=1)
+        if self.levers is not None:
+            out["turned"], out["levers"] = 1, np.stack([self.levers[:-1], self.levers[1:]], axis=1)
         return out
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of the task in a skill's file."""
         names = np.array(msgspec.json.encode(self.names).decode())
-        return {"names": names, "corners": self.corners, "follow": self.follow}
+        levers = {} if self.levers is None else {"levers": self.levers}
+        return {"names": names, "corners": self.corners, "follow": self.follow, **levers}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Task:
@@ -86,7 +93,10 @@ class Task(NamedTuple):
         for side in (0, 1):
             if not np.array_equal(np.unique(corners[:, side]), np.arange(corners[:, side].max() + 1)):
                 raise ValueError(f"the hands' positions {corners.tolist()} are not numbered through")
-        return Task(names, corners, follow)
+        if "levers" not in arrays:
+            return Task(names, corners, follow)
+        check_shapes(arrays, {"levers": (count, 3)})
+        return Task(names, corners, follow, np.ascontiguousarray(arrays["levers"], np.float64))
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:

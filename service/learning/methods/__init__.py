@@ -18,10 +18,6 @@ from service.learning.records import Fitted, Options, Progress, Taught
 class Method(Protocol):
     """A way to learn the tool's position from takes."""
 
-    @property
-    def removes_lag(self) -> bool:
-        """True if the tool's lag behind the hands is removed from the takes before `fit`."""
-
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self | None:
         """The method for these demonstrations and options; None if it does not apply to them."""

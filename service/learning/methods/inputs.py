@@ -2,7 +2,7 @@
 
 The simplest kind of inputs is chosen that predicts held-out persons as well as any. A memory also
 contains the tool's delay, so hands and tool are not shifted against each other. If the kernel's ell
-is given, the inputs are the positions, and the tool's lag is removed.
+is given, the inputs are the positions.
 """
 
 from __future__ import annotations
@@ -70,11 +70,6 @@ class HandInputs:
 
     options: Options
     why_not_staged: str  # empty if no demonstration names via-points
-
-    @property
-    def removes_lag(self) -> bool:
-        """True if the kernel's ell is given."""
-        return self.options.ell is not None
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -28,8 +28,6 @@ class Mixture:
 
     options: Options
     components: int
-
-    removes_lag: ClassVar[bool] = True
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self | None:

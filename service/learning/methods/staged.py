@@ -17,32 +17,44 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
-from kmp.criteria.cross_validation import held_out_residuals, rms
+from kmp.criteria.cross_validation import held_out_residuals, preferred, rms
+from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import Placed, StagedKMP
+from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
-from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
 from service.learning.choice import shared_counts
-from service.learning.demonstration import Demonstration, lag
-from service.learning.division import NEAR, Encoded, along_all, ordered, recognised, task_of, via_points_never_reached
+from service.learning.demonstration import Demonstration
+from service.learning.division import (
+    NEAR,
+    Divided,
+    Encoded,
+    along_all,
+    encode,
+    ordered,
+    recognised,
+    task_of,
+    via_points_never_reached,
+)
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
 from service.learning.methods.held_out import held_out_takes
-from service.learning.methods.inputs import POSITIONS, refit
+from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, LEAST_TURN_RAD, POSITIONS, refit
 from service.learning.methods.weights import WEIGHTS, chosen
-from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, persons_of
+from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, Weights, persons_of
 from service.learning.regions import blocks_of
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
+SAMPLES_TRIED = 200  # samples of a demonstration by which delays and inputs are tried, about
 LEAST_OFF_M = 0.03  # hands deviate from their segments by at least this distance, also where few takes show it
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
 CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
@@ -50,8 +62,7 @@ SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the way to a corne
 UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration has
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
-MOST_DELAY_S = 0.6  # a teacher's delay is at most this long
-DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, MOST_DELAY_S)  # candidates for the delay of few takes, which refine a skill
+DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
 WITHOUT_PLACES = "without places"  # in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
 
@@ -68,11 +79,13 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 
 class Samples(NamedTuple):
-    """The samples that are learned from: inputs (N, 2 + K), outputs (N, OUTPUTS), and the numbers
-    (N,) of their demonstrations, of which the first `new` are held out and judged.
+    """The samples that are learned from: their rows in each demonstration, inputs (N, 2 + K),
+    outputs (N, OUTPUTS), and the numbers (N,) of their demonstrations, of which the first `new` are
+    held out and judged.
     """
 
     encoded: Sequence[Encoded]
+    rows: Sequence[Indices]
     inputs: Vector
     outputs: Vector
     owner: Indices
@@ -89,39 +102,36 @@ class Samples(NamedTuple):
             for column in zip(*((one.along, one.labels, one.wanted) for one in encoded), strict=True)
         )
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
-        return cls(encoded, inputs_of(shares, labels, count), outputs, owner, new)
+        return cls(encoded, each, inputs_of(shares, labels, count), outputs, owner, new)
 
-    def best(self, weight: float = 1.0) -> Hyperparameters:
-        """The hyper-parameters of this weight with the least error of held-out demonstrations, if
-        each segment of the tool had the mean length.
-        """
-        lengths = [np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in self.encoded]
-        squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
-        is_new, errors_m = self.owner < self.new, {}
-        if math.isinf(weight):
-            squares, is_new, targets, owner = (
-                squares[np.ix_(is_new, is_new)],
-                is_new[is_new],
-                (self.outputs - PRIOR)[is_new],
-                self.owner[is_new],
-            )
-        else:
-            targets, owner = self.outputs - PRIOR, self.owner
-        roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None] if weight != 1.0 else 1.0
-        for ell in ELLS:
-            # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
-            kernel = np.exp(-ell * squares) / (roots * np.transpose(roots))
-            residuals = held_out_residuals(kernel, np.array(NOISES), owner, lambda _: targets / roots)
-            for noise, missed in zip(NOISES, (roots * residuals)[:, is_new], strict=True):
-                errors_m[Hyperparameters(ell, noise, weight)] = rms(
-                    missed[:, 1:] + missed[:, :1] * float(np.mean(lengths))
-                )
+    def best(self, weight: float) -> Hyperparameters:
+        """The hyper-parameters of this weight with the least error of held-out demonstrations."""
+        errors_m = {
+            Hyperparameters(ell, noise, weight): rms(errors)
+            for ell in ELLS
+            for noise, errors in zip(NOISES, self.held_out(ell, NOISES, weight), strict=True)
+        }
         return min(errors_m, key=errors_m.__getitem__)
+
+    def held_out(self, ell: float, noises: Sequence[float], weight: float) -> Vector:
+        """The tool's errors (J, N, 3) [m] at the samples of held-out new demonstrations, with these
+        noises (J,) and this weight.
+        """
+        squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
+        is_new = self.owner < self.new
+        roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None]
+        # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
+        kernel, targets = np.exp(-ell * squares) / (roots * roots.T), (self.outputs - PRIOR) / roots
+        missed = roots * held_out_residuals(kernel, np.array(noises), self.owner, lambda _: targets)
+        found = (self.outputs - missed)[:, is_new]
+        errors = np.empty((*found.shape[:2], 3))
+        for h, (one, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
+            mine = self.owner[is_new] == h
+            errors[:, mine] = [one.tool[rows] - one.tools(rows, outputs) for outputs in found[:, mine]]
+        return errors
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
         """The KMP of all demonstrations but these, adapted to where the tool is known to be."""
-        if math.isinf(parameters.weight):
-            without = [*without, *range(self.new, len(self.encoded))]
         kept = ~np.isin(self.owner, without)
         weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
         covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
@@ -177,15 +187,27 @@ def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
     return np.hstack([shares, STAGE_DISTANCE * np.eye(count)[labels]])
 
 
-def delay_of(demonstrations: Sequence[Demonstration]) -> tuple[Delay, list[float]]:
-    """The teacher's delay, the median over the demonstrations, and the delay [s] in each."""
-    each_s = [min(max(lag(one) * one.period_s, 0.0), MOST_DELAY_S) for one in demonstrations]
-    return Delay(float(np.median(each_s)), float(np.std(each_s))), each_s
+def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[str, Task]:
+    """Tasks in which the tool turns with the hands that it follows, or follows one hand everywhere
+    and turns with it, by name, for the hands that turn in the demonstrations.
+    """
+    turns = np.concatenate([one.turns for one in demonstrations]).reshape(-1, 2, 9)
+    sides = np.flatnonzero(np.ptp(turns, axis=0).max(axis=1) > math.sin(LEAST_TURN_RAD)).tolist()
+    levers = np.zeros((len(task.names), 3))
+    out: dict[str, Task] = {}
+    if np.isin(task.follow, sides).any():
+        out["orientation of the followed hand"] = task._replace(levers=levers)
+    for side in sides:
+        if (task.follow != side).any():
+            everywhere = np.full_like(task.follow, side)
+            out[f"orientation of the {SIDES[side]} hand"] = task._replace(follow=everywhere, levers=levers)
+    return out
 
 
 class _Prediction(NamedTuple):
-    """A take's mean prediction without its block: the delayed hands (T, 6) [m], the belief
-    (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of primitives beside the position's.
+    """A take's mean prediction without its block: the delayed hands (T, 6) [m], or (T, 24) with
+    their turns, the belief (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of primitives
+    beside the position's.
     """
 
     hands: Vector
@@ -194,15 +216,18 @@ class _Prediction(NamedTuple):
     inputs: Vector
 
     @classmethod
-    def of(cls, one: Encoded, placed: Placed, delay_s: float) -> Self:
+    def of(cls, one: Encoded, placed: Placed, delay_s: float, step: int) -> Self:
+        """The prediction at one of every `step` samples."""
         belief = np.zeros((len(one.tool), MOST_STAGES))
         recognised(one.moving, one.period_s, placed.stages, belief)
         hands = one.moving[:, 0]
         if delay_s > 0.0:
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
-        errors = one.tool - placed.mean(hands, belief, one.stillness)
+        hands = np.hstack([hands, one.turns(delay_s)])[::step]
+        belief, stillness = belief[::step], one.stillness[::step]
+        errors = one.tool[::step] - placed.mean(hands, belief, stillness)
         found = np.empty((len(hands), 4))
-        along_all(hands, one.stillness, belief.argmax(axis=1), placed.stages, found)
+        along_all(hands, stillness, belief.argmax(axis=1), placed.stages, found)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
         return cls(hands, belief, errors, np.hstack([found[:, :2], beside]))
 
@@ -213,37 +238,67 @@ class _Prediction(NamedTuple):
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
 
 
-def _predictions(
-    task: Task, samples: Samples, parameters: Hyperparameters, off: Vector, blocks: Sequence[list[int]], delay_s: float
-) -> dict[int, _Prediction]:
-    """The predictions of the new demonstrations, each without its block."""
-    found = {}
-    for block in blocks:
-        primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
-        for h in block:
-            placed = Placed.of(task, samples.encoded[h].at, off, primitive, np.empty((0, 6)))
-            found[h] = _Prediction.of(samples.encoded[h], placed, delay_s)
-    return found
+class Candidate(NamedTuple):
+    """A task and a teacher's delay that are tried, with the encoded demonstrations, the samples,
+    the hands' distances (K, 2) [m] from their segments, and hyper-parameters.
 
-
-def _error_m(predictions: Mapping[int, _Prediction]) -> float:
-    """The root mean square error [m] of predictions."""
-    return rms(np.concatenate([one.errors for one in predictions.values()]))
-
-
-def held_out_delay(task: Task, demonstrations: Sequence[Demonstration], blocks: Sequence[list[int]]) -> Delay:
-    """The delay of DELAYS_S that predicts demonstrations best which are held out in blocks; its
-    deviation is that of the delays that are best for each.
+    The delay is the one of the new demonstrations, see `Samples`.
     """
-    squares = []
-    for delay_s in DELAYS_S:
-        encoded = [Encoded.of(task, one, delay_s) for one in demonstrations]
-        samples = Samples.of(encoded, len(encoded))
-        found = _predictions(task, samples, samples.best(), _off_m(encoded), blocks, delay_s)
-        squares.append([float((found[h].errors ** 2).sum(axis=1).mean()) for h in range(len(demonstrations))])
-    candidates_s = np.array(DELAYS_S)
-    best_s = candidates_s[np.mean(squares, axis=1).argmin()]
-    return Delay(float(best_s), float(np.std(candidates_s[np.argmin(squares, axis=0)])))
+
+    task: Task
+    delay_s: float
+    encoded: Sequence[Encoded]
+    samples: Samples
+    off: Vector
+    parameters: Hyperparameters
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        new: Sequence[Divided],
+        delay_s: float,
+        earlier: Sequence[Divided] = (),
+        before_s: float = 0.0,
+        weight: float = 1.0,
+    ) -> Self:
+        """The candidate of a task with this delay, and this weight against earlier demonstrations,
+        which have a delay of their own.
+        """
+        task, encoded = encode(task, [*new, *earlier], [delay_s] * len(new) + [before_s] * len(earlier))
+        samples = Samples.of(encoded, len(new))
+        return cls(task, delay_s, encoded, samples, _off_m(encoded), samples.best(weight))
+
+    def without(self, block: Sequence[int], primitive: KMP, step: int = 1) -> dict[int, _Prediction]:
+        """The predictions, by a primitive without them, of a block's demonstrations at one of every
+        `step` samples.
+        """
+        placed = {h: Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS) for h in block}
+        return {h: _Prediction.of(self.encoded[h], placed[h], self.delay_s, step) for h in block}
+
+    def squares(self, blocks: Sequence[Sequence[int]]) -> Vector:
+        """The mean squared errors (H,) [m²] of the held-out demonstrations, at some samples."""
+        step = 1 + max(len(one.labels) for one in self.encoded) // SAMPLES_TRIED
+        found: dict[int, _Prediction] = {}
+        for block in blocks:
+            found |= self.without(block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step)
+        return np.array([rms(found[h].errors) ** 2 for h in range(self.samples.new)])
+
+
+def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence[int]:
+    """The demonstrations that are left out to predict a block: itself, unless there is no other."""
+    return block if len(blocks) > 1 else ()
+
+
+def with_delay(task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]]) -> tuple[Candidate, Delay, float]:
+    """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
+    in all of them; that delay, with the standard deviation of the delays that predict each of them
+    best; and the error [m].
+    """
+    candidates = [Candidate.of(task, shown, late_s) for late_s in DELAYS_S]
+    squares = np.array([one.squares(blocks) for one in candidates])
+    best, each_s = int(squares.sum(axis=1).argmin()), np.array(DELAYS_S)[squares.argmin(axis=0)]
+    return candidates[best], Delay(DELAYS_S[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
 
 
 @dataclass(frozen=True)
@@ -252,8 +307,6 @@ class Staged:
 
     options: Options
     task: Task
-
-    removes_lag: ClassVar[bool] = False
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self | None:
@@ -274,29 +327,29 @@ class Staged:
         remarks = via_points_never_reached(self.task, demonstrations, names)
         progress(f"learning between the via-points {', '.join(self.task.names)}")
         blocks = blocks_of(persons_of(takes))
-        delay, each_s = delay_of(demonstrations)
-        if taught.earlier:
-            progress(f"choosing the delay over {len(takes)} new demonstrations")
-            delay = held_out_delay(self.task, demonstrations[: len(takes)], blocks)
-            each_s[: len(takes)] = [delay.mean_s] * len(takes)
-        encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
-        samples, off = Samples.of(encoded, len(takes)), _off_m(encoded)
-        progress(f"holding out {len(takes)} demonstrations")
-        tried = [samples.best(weight) for weight in (WEIGHTS if taught.earlier else WEIGHTS[:1])]
-        found = {one.weight: _predictions(self.task, samples, one, off, blocks, delay.mean_s) for one in tried}
-        weight, weights = chosen({one: _error_m(predictions) for one, predictions in found.items()})
-        parameters, predictions = next(one for one in tried if one.weight == weight), found[weight]
+        best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
+        task, encoded, off = best.task, best.encoded, best.off
+        predictions: dict[int, _Prediction] = {}
+        for block in blocks:
+            progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
+            primitive = best.samples.fitted(best.parameters, _left_out(blocks, block))
+            predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
-            samples.fitted(parameters), self.task, self._nominal(takes), off, np.concatenate(errors), delay.mean_s
+            best.samples.fitted(best.parameters),
+            task,
+            self._nominal(takes),
+            off,
+            np.concatenate(errors),
+            delay.mean_s,
         )
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, model.primitive, others)
+                placed = Placed.of(task, encoded[h].at, off, model.primitive, others)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
@@ -309,10 +362,47 @@ class Staged:
             in_order,
             gate,
             delay,
+            taken=taken,
+            tried_m=tried_m,
             baselines=baselines,
             remarks=remarks,
-            weights=weights if taught.earlier else None,
+            weights=weights,
         )
+
+    def _chosen(
+        self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
+    ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
+        """The candidate that predicts held-out new takes best, its delay, the errors [m] of the ways
+        in which the tool may turn and the name of the one taken, and of the weights.
+        """
+        new, earlier = (
+            [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
+        )
+        progress(f"choosing the delay over {len(new)} demonstrations")
+        best, delay, error_m = with_delay(self.task, new, blocks)
+        tried_m = {POSITIONS.name: error_m}
+        turning = turning_tasks(self.task, [take.demonstration for take in taught.new])
+        for name, task in turning.items():
+            progress(f"trying {name}")
+            tried_m[name] = math.sqrt(Candidate.of(task, new, delay.mean_s).squares(blocks).mean())
+        least_m = min(tried_m.values())
+        taken = preferred(list(tried_m), list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
+        if taken in turning:
+            best, delay, tried_m[taken] = with_delay(turning[taken], new, blocks)
+        if not turning:
+            tried_m = {}
+        if not earlier:
+            return best, delay, tried_m, taken, None
+        progress(f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones")
+        before_s = with_delay(best.task, earlier, blocks_of(persons_of(taught.earlier)))[1].mean_s
+        weighted = {
+            weight: Candidate.of(
+                best.task, new, delay.mean_s, earlier if math.isfinite(weight) else (), before_s, weight
+            )
+            for weight in WEIGHTS
+        }
+        weight, weights = chosen({one: math.sqrt(it.squares(blocks).mean()) for one, it in weighted.items()})
+        return weighted[weight], delay, tried_m, taken, weights
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
@@ -345,6 +435,6 @@ def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> H
         np.array([placed.covariance(*row) for row in rows]),
         placed.gates_m(hands),
         found.inputs,
-        known=np.hstack([hands, found.inputs[:, 2:]]),
+        known=np.hstack([hands, TURN_WEIGHT_M * found.hands[:, 6:], found.inputs[:, 2:]]),
         belief=found.belief[:, : len(one.stages)],
     )
