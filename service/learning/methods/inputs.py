@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.criteria.cross_validation import preferred
 from service.contract.records import SIDES
@@ -20,10 +21,12 @@ from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import features
+from service.core.skill.task_clock import TaskClock
 from service.learning.choice import selection_of
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of
 from service.learning.gate import CEILING_M
+from service.learning.methods.clock import Pace, clock_of, paired, remark_on
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
 from service.learning.records import Fitted, Options, Progress, Take, persons_of
 from service.learning.regions import refitted_errors
@@ -36,21 +39,31 @@ LEAST_PERSONS = 3  # hyper-parameters are chosen anew without each block of take
 
 class Inputs(NamedTuple):
     """A kind of inputs: the positions of the hands, rows of their memory, and their orientation; of
-    both hands, or of one that stands for both.
+    both hands, or of one that stands for both; and the clock of the task.
     """
 
     name: str
     order: int = 0  # rows of memory
     turned: bool = False  # true if the orientation is an input
     alone: int | None = None  # the side of the only hand
+    clock: TaskClock | None = None
 
-    def of(self, demonstration: Demonstration) -> Vector:
-        """The inputs (T, I) [m] of a demonstration."""
+    @property
+    def is_rich(self) -> bool:
+        """True if there are other inputs than positions."""
+        return bool(self.order or self.turned or self.clock is not None)
+
+    def of(self, demonstration: Demonstration, pace: Pace | None = None) -> Vector:
+        """The inputs (T, I) [m] of a demonstration, whose `pace` is needed for a clock."""
         hands, turns = demonstration.hands, demonstration.turns if self.turned else None
         if self.alone is not None:
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
             turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
-        return features(hands, demonstration.period_s, self.order, turns)
+        found = features(hands, demonstration.period_s, self.order, turns)
+        if self.clock is None:
+            return found
+        assert pace is not None
+        return np.column_stack([found, self.clock.weight * pace.seconds(self.clock, self.alone)])
 
 
 POSITIONS = Inputs("positions")
@@ -60,6 +73,9 @@ KINDS = (  # from simple to rich
     Inputs("orientations", turned=True),
     Inputs("memory", order=ORDER),
 )
+CLOCKS = {True: ", and a clock that waits for resting hands", False: ", and a clock"}  # names; the first is simpler
+WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
+CLOCK_ERROR_SHARE = 0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
 
 
 @dataclass(frozen=True)
@@ -83,13 +99,22 @@ class HandInputs:
         """The model of the chosen kind of inputs, and its predictions of held-out takes."""
         remarks = [self.why_not_staged] if self.why_not_staged else []
         points, ell = self.options.points, self.options.ell
-        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(takes, points, progress)
+        paces = [Pace.of(take.demonstration) for take in takes]
+        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(takes, paces, points, progress)
+        if kind.clock is not None:
+            remarks.append(
+                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.rest_s:.1f} s, where demonstrations begin "
+                "or after the task, starts it anew"
+            )
         if kind.alone is not None:
             remarks.append(
                 f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
                 "makes no difference, and may be absent"
             )
-        inputs = [take.hands if ell is not None else kind.of(take.demonstration) for take in takes]
+        inputs = [
+            take.hands if ell is not None else kind.of(take.demonstration, pace)
+            for take, pace in zip(takes, paces, strict=True)
+        ]
         progress(f"choosing parameters over {len(takes)} demonstrations")
         fit = refit(kind, takes, inputs, points, ell)
         progress(f"learning from all {len(takes)}")
@@ -101,12 +126,12 @@ class HandInputs:
 
             def refitted(kept: list[int]) -> HandsKMP:
                 others = refit(kind, [takes[i] for i in kept], [inputs[i] for i in kept], points, ell)
-                return HandsKMP(others(None), kind.turned)
+                return HandsKMP(others(None), kind.turned, kind.clock)
 
             timed = refitted_errors(takes, inputs, refitted)
             held_out = [one._replace(timed=errors) for one, errors in zip(held_out, timed, strict=True)]
         return Fitted(
-            HandsKMP(primitive, kind.turned),
+            HandsKMP(primitive, kind.turned, kind.clock),
             held_out,
             gate,
             conductor=kind.alone,
@@ -134,7 +159,7 @@ def refit(kind: Inputs, takes: Sequence[Take], inputs: Sequence[Vector], points:
     """The function that fits primitives to takes with inputs (T, I), with the same hyper-parameters
     whichever person is held out; ell [1/m²] is chosen with them unless it is given.
     """
-    is_rich = bool(kind.order or kind.turned)
+    is_rich = kind.is_rich
     pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
     count = RICH_TIMES * points if is_rich else points
     choice = selection_of(pairs, count, persons=persons_of(takes), isotropic=is_rich, rich=is_rich)
@@ -143,13 +168,50 @@ def refit(kind: Inputs, takes: Sequence[Take], inputs: Sequence[Vector], points:
     return lambda without: choice.primitive(parameters, residuals, without=without)
 
 
-def _chosen(takes: Sequence[Take], points: int, progress: Progress) -> tuple[Inputs, dict[str, float]]:
-    """The simplest kind of inputs that is as good as any, and the error [m] of each kind."""
+def _chosen(
+    takes: Sequence[Take], paces: Sequence[Pace], points: int, progress: Progress
+) -> tuple[Inputs, dict[str, float]]:
+    """The simplest kind of inputs that is as good as any, and the error [m] of each kind.
+
+    A clock is tried with positions, and with the best kinds without it. For it, the blocks of
+    `paired` are held out.
+    """
+    persons = persons_of(takes)
+    blocks = paired(persons)
+
+    def error_m(kind: Inputs, held_out: NDArray[np.intp]) -> float:
+        pairs = [(kind.of(take.demonstration, pace), take.position) for take, pace in zip(takes, paces, strict=True)]
+        choice = selection_of(pairs, points, persons=held_out, rich=True)
+        return choice.best_mean(may_be_linear=True)[0]
+
     kinds, tried_m = candidates([take.demonstration for take in takes]), dict[str, float]()
     for kind in kinds:
         progress(f"trying {kind.name}")
-        pairs = [(kind.of(take.demonstration), take.position) for take in takes]
-        choice = selection_of(pairs, points, persons=persons_of(takes), rich=True)
-        tried_m[kind.name] = choice.best_mean(may_be_linear=True)[0]
-    least_m = min(tried_m.values())
-    return preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M)), tried_m
+        tried_m[kind.name] = error_m(kind, persons)
+    chosen = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
+    if not blocks.any():
+        return chosen, tried_m
+    best = min(kinds, key=lambda kind: tried_m[kind.name])
+    first = next(kind for kind in kinds if kind.alone == chosen.alone)
+    bases, timed = sorted({first, chosen, best}, key=kinds.index), list[Inputs]()
+    limit_m = clock_limit_m(min(error_m(kind, blocks) for kind in bases))
+    for kind in bases:
+        for waits, name in CLOCKS.items():
+            progress(f"trying {kind.name}{name}")
+            clock = clock_of(paces, kind.alone, waits=waits)
+            weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
+            errors_m = [error_m(one, blocks) for one in weighted]
+            weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))
+            tried_m[weighed.name] = error_m(weighed, persons)
+            timed += [weighed] * (min(errors_m) < limit_m)
+    return _simplest(timed, [tried_m[kind.name] for kind in timed]) if timed else chosen, tried_m
+
+
+def clock_limit_m(least_m: float) -> float:
+    """The error [m] that a clock must go below, if the least one without a clock is this."""
+    return min(CLOCK_ERROR_SHARE * least_m, least_m - AS_GOOD_M)
+
+
+def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
+    """The first of the kinds whose error is as good as the least of theirs."""
+    return preferred(kinds, errors_m, max(AS_GOOD * min(errors_m), min(errors_m) + AS_GOOD_M))

@@ -14,26 +14,28 @@ Held-out predictions use the belief that the filter has along the take, and the 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
-from kmp.criteria.cross_validation import held_out_residuals, rms
+from kmp.criteria.cross_validation import held_out_residuals, preferred, rms
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import Placed, StagedKMP
+from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, rows_of
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
+from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.learning.demonstration import Demonstration, lag
 from service.learning.division import NEAR, Encoded, along_all, ordered, recognised, task_of, via_points_never_reached
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
+from service.learning.methods.clock import Pace, paired, remark_on, stage_clock_of
 from service.learning.methods.held_out import held_out_takes
-from service.learning.methods.inputs import POSITIONS, refit
+from service.learning.methods.inputs import AS_GOOD, CLOCKS, POSITIONS, clock_limit_m, refit
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, persons_of
 from service.learning.regions import blocks_of
 
@@ -45,9 +47,12 @@ LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for 
 CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
 SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the way to a corner that was demonstrated
 UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration has
+KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the clock at which it is known
+CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
 MOST_DELAY_S = 0.6  # a teacher's delay is at most this long
+SHARES_ALONE = "shares"  # the name of the inputs without a clock
 WITHOUT_PLACES = "without places"  # in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
 
@@ -63,18 +68,19 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 
 class Samples(NamedTuple):
-    """The samples that are learned from: inputs (N, 2 + K), outputs (N, OUTPUTS), and the numbers
-    (N,) of their demonstrations.
+    """The samples that are learned from: inputs (N, 2 + K), with a clock (N, 2 + K + 1), outputs
+    (N, OUTPUTS), and the numbers (N,) of their demonstrations.
     """
 
     encoded: Sequence[Encoded]
     inputs: Vector
     outputs: Vector
     owner: Indices
+    clock: TaskClock | None = None
 
     @classmethod
     def of(cls, encoded: Sequence[Encoded]) -> Self:
-        """The samples of demonstrations."""
+        """The samples of demonstrations, without a clock."""
         count = len(encoded[0].stages)
         each = [one.rows(max(LEAST_SAMPLES, SAMPLES_LEARNED // len(encoded))) for one in encoded]
         shares, labels, outputs = (
@@ -84,20 +90,34 @@ class Samples(NamedTuple):
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
         return cls(encoded, inputs_of(shares, labels, count), outputs, owner)
 
-    def best(self) -> Hyperparameters:
-        """The hyper-parameters with the least error of held-out demonstrations, if each segment of
-        the tool had the mean length.
+    def clocked(self, paces: Sequence[Pace], clock: TaskClock) -> Self:
+        """The samples with a clock as the last input."""
+        each = max(LEAST_SAMPLES, SAMPLES_LEARNED // len(self.encoded))
+        times = [
+            pace.in_stages(rows_of(clock, one.stages), one.labels)[one.rows(each)]
+            for pace, one in zip(paces, self.encoded, strict=True)
+        ]
+        inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
+        return self._replace(inputs=inputs, clock=clock)
+
+    def best(self, ells: Sequence[float] = ELLS) -> Hyperparameters:
+        """The hyper-parameters with the least error of held-out demonstrations."""
+        return min(scores := self.scores(ells), key=scores.__getitem__)
+
+    def scores(self, ells: Sequence[float] = ELLS) -> dict[Hyperparameters, float]:
+        """The error [m] of held-out demonstrations with each of the hyper-parameters, if each
+        segment of the tool had the mean length.
         """
         lengths = [np.linalg.norm(one.stages["tool_way"], axis=1).mean() for one in self.encoded]
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
         errors_m = {}
-        for ell in ELLS:
+        for ell in ells:
             residuals = held_out_residuals(
                 np.exp(-ell * squares), np.array(NOISES), self.owner, lambda _: self.outputs - PRIOR
             )
             for noise, missed in zip(NOISES, residuals, strict=True):
                 errors_m[Hyperparameters(ell, noise)] = rms(missed[:, 1:] + missed[:, :1] * float(np.mean(lengths)))
-        return min(errors_m, key=errors_m.__getitem__)
+        return errors_m
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
         """The KMP of all demonstrations but these, adapted to where the tool is known to be."""
@@ -112,11 +132,31 @@ class Samples(NamedTuple):
             representation="dense",
         )
         at, shares = self._known([one for i, one in enumerate(self.encoded) if i not in without])
+        if self.clock is not None:
+            at, shares = self._timed(at, shares, self.clock)
         wanted = np.column_stack([shares, np.zeros((len(at), OUTPUTS - 1))])
         known = Gaussians(wanted, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(at), 1, 1)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)
             return primitive.adapt(at, known, tolerance=0.0)
+
+    def _timed(self, at: Vector, shares: Vector, clock: TaskClock) -> tuple[Vector, Vector]:
+        """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
+
+        Where a clock runs on, the tool may still be on its way when the hands are at the end of a
+        stage, so it is known there when the clock ends; and at the begin of a stage when the clock
+        begins. All else is known at any time.
+        """
+        moves = self.encoded[0].stages["square"][at[:, 2:].argmax(axis=1)] > STAYS
+        ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
+        found = [
+            (row, share, time)
+            for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
+            for time in KNOWN_TIMES
+            if clock.waits or not (is_end or is_begin) or time == float(is_end)
+        ]
+        rows, kept, times = (np.array(column) for column in zip(*found, strict=True))
+        return np.column_stack([rows, clock.weight * clock.longest_s * times]), kept
 
     @staticmethod
     def _known(shown: Sequence[Encoded]) -> tuple[Vector, Vector]:
@@ -170,24 +210,30 @@ class _Prediction(NamedTuple):
     belief: Vector
     errors: Vector
     inputs: Vector
+    paces: Vector  # (T, 3) as in `Placed.mean`
 
     @classmethod
-    def of(cls, one: Encoded, placed: Placed, delay_s: float) -> Self:
+    def of(cls, one: Encoded, placed: Placed, delay_s: float, pace: Pace, clock: TaskClock | None) -> Self:
         belief = np.zeros((len(one.tool), MOST_STAGES))
         recognised(one.moving, one.period_s, placed.stages, belief)
         hands = one.moving[:, 0]
         if delay_s > 0.0:
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
-        errors = one.tool - placed.mean(hands, belief, one.stillness)
+        times = np.zeros(len(hands))
+        if clock is not None:
+            times = pace.in_stages(rows_of(clock, placed.stages), belief.argmax(axis=1))
+        paces = np.column_stack([one.stillness, times])
+        errors = one.tool - placed.mean(hands, belief, paces)
         found = np.empty((len(hands), 4))
         along_all(hands, one.stillness, belief.argmax(axis=1), placed.stages, found)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
-        return cls(hands, belief, errors, np.hstack([found[:, :2], beside]))
+        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * times[:, None]])]
+        return cls(hands, belief, errors, np.hstack(inputs), paces)
 
     def retained(self, count: int) -> Vector:
         """Errors (M, 6) at about `count` samples: shares (2,), stage, and error (3,) [m]."""
         rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
-        stages = self.inputs[rows, 2:].argmax(axis=1)
+        stages = self.belief[rows].argmax(axis=1)
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
 
 
@@ -220,25 +266,48 @@ class Staged:
         delay, each_s = delay_of(demonstrations)
         encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
         samples, off, blocks = Samples.of(encoded), _off_m(encoded), blocks_of(persons_of(takes))
+        paces = [Pace.of(one) for one in demonstrations]
+
+        def held_out_by(kind: Samples, parameters: Hyperparameters) -> dict[int, _Prediction]:
+            """The predictions of each block of demonstrations by the others."""
+            predictions: dict[int, _Prediction] = {}
+            for block in blocks:
+                progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
+                primitive = kind.fitted(parameters, block if len(blocks) > 1 else ())
+                for h in block:
+                    placed = Placed.of(self.task, encoded[h].at, off, primitive, NO_ERRORS, kind.clock)
+                    predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s, paces[h], kind.clock)
+            return predictions
+
         parameters = samples.best()
-        predictions: dict[int, _Prediction] = {}
-        for block in blocks:
-            progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
-            primitive = samples.fitted(parameters, block if len(blocks) > 1 else ())
-            for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
-                predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
+        predictions, tried_m = held_out_by(samples, parameters), dict[str, float]()
+        tried = {SHARES_ALONE: (samples, parameters, predictions)}
+        for name, kind in _with_clocks(samples, parameters, paces, persons_of(takes), progress).items():
+            best = kind.best()
+            tried[name] = (kind, best, held_out_by(kind, best))
+        if len(tried) > 1:
+            tried_m = {name: _rms_m(found) for name, (*_, found) in tried.items()}
+        taken = _simplest(tried_m)
+        samples, parameters, predictions = tried[taken]
+        if samples.clock is not None:
+            remarks.append(f"{remark_on(samples.clock)}. It starts anew in each stage")
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
-            samples.fitted(parameters), self.task, self._nominal(takes), off, np.concatenate(errors), delay.mean_s
+            samples.fitted(parameters),
+            self.task,
+            self._nominal(takes),
+            off,
+            np.concatenate(errors),
+            delay.mean_s,
+            clock=samples.clock,
         )
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, model.primitive, others)
+                placed = Placed.of(self.task, encoded[h].at, off, model.primitive, others, model.clock)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
@@ -246,7 +315,16 @@ class Staged:
         reached = np.concatenate([one.gate_m for one in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
-        return Fitted(model, in_order, gate, delay, baselines=baselines, remarks=remarks)
+        return Fitted(
+            model,
+            in_order,
+            gate,
+            delay,
+            taken=taken,
+            tried_m=tried_m,
+            baselines=baselines,
+            remarks=remarks,
+        )
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
@@ -261,6 +339,48 @@ class Staged:
         return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
 
 
+def _with_clocks(
+    samples: Samples, parameters: Hyperparameters, paces: Sequence[Pace], persons: Indices, progress: Progress
+) -> dict[str, Samples]:
+    """The samples with those clocks that may predict clearly better, by the name of the inputs.
+
+    What is compared here leaves out where the tool is known to be, and holds out the blocks of
+    `paired`.
+    """
+    block_of = paired(persons)
+    if not block_of.any():
+        return {}
+
+    def error_m(kind: Samples) -> float:
+        return min(kind._replace(owner=block_of[kind.owner]).scores((parameters.ell,)).values())
+
+    limit_m, out = clock_limit_m(error_m(samples)), dict[str, Samples]()
+    stages, labels = [one.stages for one in samples.encoded], [one.labels for one in samples.encoded]
+    for waits, name in CLOCKS.items():
+        progress(f"trying {SHARES_ALONE}{name}")
+        clock = stage_clock_of(paces, stages, labels, waits=waits)
+        tried = [samples.clocked(paces, clock._replace(weight=weight)) for weight in CLOCK_WEIGHTS_PER_S]
+        errors_m = [error_m(one) for one in tried]
+        if min(errors_m) < limit_m:
+            out[SHARES_ALONE + name] = preferred(tried, errors_m, AS_GOOD * min(errors_m))
+    return out
+
+
+def _simplest(tried_m: Mapping[str, float]) -> str:
+    """The name of the simplest inputs that are as good as any with a clock, if one is clearly
+    better than none.
+    """
+    timed = {name: error_m for name, error_m in tried_m.items() if name != SHARES_ALONE}
+    if not timed or min(timed.values()) >= clock_limit_m(tried_m[SHARES_ALONE]):
+        return SHARES_ALONE
+    return preferred(list(timed), list(timed.values()), AS_GOOD * min(timed.values()))
+
+
+def _rms_m(predictions: Mapping[int, _Prediction]) -> float:
+    """The root mean square error [m] of predictions."""
+    return rms(np.concatenate([one.errors for one in predictions.values()]))
+
+
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
     """The distances (K, 2) [m] of the hands from their segments, root mean square, in each stage;
     in all stages where no demonstration has this one.
@@ -272,7 +392,7 @@ def _off_m(encoded: Sequence[Encoded]) -> Vector:
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
     """The record of a take with the covariance from other blocks' errors, in `placed`."""
-    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, one.stillness, strict=True)
+    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.paces, strict=True)
     return HeldOut(
         take,
         found.errors,
