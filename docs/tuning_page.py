@@ -71,7 +71,7 @@ def page() -> str:
     why = staleness("sensitivity", result, tree()) if measured else ""
     state = f"{len(measured)} of {len(known)} numbers have been measured; no session reads {unread} of these."
     if why:
-        state += f" *Measured with an earlier version: {why}.*"
+        state += f"\n*Measured with an earlier version: {why}.*"
     head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
     return head + "".join(
         part

@@ -22,7 +22,7 @@ from service.core.skill.task_clock import (
 )
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
-from service.learning.methods.clock import Pace, clock_of
+from service.learning.methods.clock import Tempo, clock_of
 from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 
@@ -117,8 +117,8 @@ def clock(skill: StoredSkill) -> TaskClock | None:
 def test_the_intake_finds_when_hands_begin_to_move() -> None:
     for shown in takes(3, timetable=True):
         moves = np.linalg.norm(np.gradient(shown.left[:, :3], shown.period_s, axis=0), axis=1) > 0.1
-        pace = Pace.of(shown)
-        starts_s = shown.seconds[np.argmax(pace.seconds(clock_of([pace], None, waits=False), None) > 0.0)]
+        tempo = Tempo.of(shown)
+        starts_s = shown.seconds[np.argmax(tempo.seconds(clock_of([tempo], None, waits=False), None) > 0.0)]
         assert shown.seconds[np.argmax(moves)] - 0.1 < starts_s < shown.seconds[np.argmax(moves)] + 0.2
 
 
@@ -191,7 +191,7 @@ def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
 
 
 def test_a_file_with_a_broken_clock_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    skill = learn(takes(4, timetable=True))
+    skill = learn(takes(6, timetable=True))
     monkeypatch.setattr(TaskClock, "numbers", np.full(12, np.inf))
     with pytest.raises(SkillError, match="task_clock"):
         decoded(with_file(skill).file, origin="broken")

@@ -41,7 +41,7 @@ from service.core.skill.via_points import pulls_through
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
-RESTING_PACE = np.array([*STILL, 0.0])  # pace of two hands that rest and have not begun
+RESTING_TEMPO = np.array([*STILL, 0.0])  # tempo of two hands that rest and have not begun
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,36 +103,36 @@ class Placed(Immutable):
             recognise(out, moving, 0.1, self.stages)
         return out
 
-    def mean(self, hands: Vector, beliefs: Vector, paces: Vector | None = None) -> Vector:
+    def mean(self, hands: Vector, beliefs: Vector, tempos: Vector | None = None) -> Vector:
         """Expected tool positions (T, 3) [m] for hands (T, 6) with these beliefs (T, K or more) and
-        paces (T, 3), as in `stages.tools_at`; without them, the hands are at rest.
+        tempos (T, 3), as in `stages.tools_at`; without them, the hands are at rest.
         """
         out = np.empty((len(hands), 3))
         for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
-            pace = RESTING_PACE if paces is None else paces[t]
-            expected(belief, self._tools(one, pace, belief, self.pulls), out[t])
+            tempo = RESTING_TEMPO if tempos is None else tempos[t]
+            expected(belief, self._tools(one, tempo, belief, self.pulls), out[t])
         return out
 
-    def _tools(self, hands: Vector, pace: Vector, belief: Vector, pulls: Vector) -> Vector:
+    def _tools(self, hands: Vector, tempo: Vector, belief: Vector, pulls: Vector) -> Vector:
         """Tool positions (K, 3) [m] for hands (6,) in all stages with at least
         LEAST_STAGE_PROBABILITY.
         """
         out = np.empty((len(self.stages), 3))
-        tools_at(np.ascontiguousarray(hands), pace, belief, self.stages, self.sizes, self.rows, pulls, out)
+        tools_at(np.ascontiguousarray(hands), tempo, belief, self.stages, self.sizes, self.rows, pulls, out)
         return out
 
     def gates_m(self, hands: Vector) -> Vector:
         """Distances (T,) [m] of hands (T, 6) from the task, see `stages.off_all`."""
         return np.array([off_all(np.ascontiguousarray(one), self.stages) for one in hands])
 
-    def covariance(self, hands: Vector, belief: Vector, pace: Vector = RESTING_PACE) -> Vector:
-        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6,), a belief and a pace (3,),
+    def covariance(self, hands: Vector, belief: Vector, tempo: Vector = RESTING_TEMPO) -> Vector:
+        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6,), a belief and a tempo (3,),
         see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
         via-points' variance.
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
-        tools = self._tools(hands, pace, belief, NO_PULLS)
-        scatter(hands, pace, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
+        tools = self._tools(hands, tempo, belief, NO_PULLS)
+        scatter(hands, tempo, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
@@ -215,7 +215,7 @@ class StagedKMP:
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
-        return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]), self._paces(hands))
+        return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]), self._tempos(hands))
 
     def belief(self, hands: Vector) -> Vector:
         return self.placed.belief(hands)
@@ -232,10 +232,10 @@ class StagedKMP:
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        return self.placed.mean(hands, self._beliefs(hands, names), self._paces(hands, names))
+        return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
 
     def covariances(self, hands: Vector) -> Vector:
-        rows = zip(hands, self._beliefs(hands), self._paces(hands), strict=True)
+        rows = zip(hands, self._beliefs(hands), self._tempos(hands), strict=True)
         return np.array([self.placed.covariance(*row) for row in rows]).reshape(-1, 3, 3)
 
     def gates_m(self, hands: Vector) -> Vector:
@@ -252,18 +252,18 @@ class StagedKMP:
                 row[max(self.names.index(name) - 1, 0)] = 1.0
         return out
 
-    def _paces(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """Paces (T, 3) of hands (T, 6) at rest: when the clock ends, or when it begins for hands at
-        the first via-point.
+    def _tempos(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
+        """Tempos (T, 3) of hands (T, 6) at rest: when the clock ends, or for hands at the first
+        via-point, when it begins.
         """
-        out = np.tile(RESTING_PACE, (len(hands), 1))
+        out = np.tile(RESTING_TEMPO, (len(hands), 1))
         if self.clock is not None:
             out[:, 2] = self.clock.longest_s
             out[[row for row, name in enumerate(names) if name == self.names[0]], 2] = 0.0
         return out
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        rows = zip(hands, self._beliefs(hands, names), self._paces(hands, names)[:, 2], strict=True)
+        rows = zip(hands, self._beliefs(hands, names), self._tempos(hands, names)[:, 2], strict=True)
         return np.array([self._input(one, belief, clock_s=float(clock_s)) for one, belief, clock_s in rows]).reshape(
             -1, self.shape[0]
         )

@@ -253,10 +253,10 @@ def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> Non
 
 @compiled
 def _tool_in(
-    hands: Vector, pace: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
+    hands: Vector, tempo: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
 ) -> None:
-    """Tool position in stage k for hands (6,) with the `pace` (3,), written to `out` (3,) [m]. The
-    pace is the stillness of both hands, and the clock [s] of the stage.
+    """Tool position in stage k for hands (6,) with the `tempo` (3,), written to `out` (3,) [m]. The
+    tempo is the stillness of both hands, and the clock [s] of the stage.
 
     With the inputs x (3,), the hands' shares of the stage and the clock times `clock_weight`, the
     primitive gives the tool's share s and its offset δ (3,) [m] by equation (8) of Huang et al.
@@ -270,8 +270,8 @@ def _tool_in(
     (`via_points.pulls_through`).
     """
     stage, found = stages[k], np.empty(OUTPUTS)
-    one, other = along_both(hands, pace, stage)
-    found[:], time = size["prior"], size["clock_weight"] * pace[2]
+    one, other = along_both(hands, tempo, stage)
+    found[:], time = size["prior"], size["clock_weight"] * tempo[2]
     for r in range(len(rows)):
         square = (one - rows[r, 0]) ** 2 + (other - rows[r, 1]) ** 2 + (time - rows[r, 3 + OUTPUTS]) ** 2
         value = math.exp(-size["scale"] * square)
@@ -290,7 +290,7 @@ def _tool_in(
 @compiled
 def tools_at(
     hands: Vector,
-    pace: Vector,
+    tempo: Vector,
     belief: Vector,
     stages: Records,
     sizes: Records,
@@ -303,7 +303,7 @@ def tools_at(
     """
     for k in range(len(stages)):
         if belief[k] >= LEAST_STAGE_PROBABILITY:
-            _tool_in(hands, pace, k, stages, sizes[0], rows, pulls, out[k])
+            _tool_in(hands, tempo, k, stages, sizes[0], rows, pulls, out[k])
 
 
 @compiled
@@ -437,15 +437,15 @@ def predicted(
     the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
     one, hands, steps = seen[0], np.empty((3, 6)), np.empty((3, 3))
-    pace, tools, clock = np.empty(3), np.empty((3, len(stages), 3)), one["clock"]
-    pace[:2] = one["stillness"]
+    tempo, tools, clock = np.empty(3), np.empty((3, len(stages), 3)), one["clock"]
+    tempo[:2] = one["stillness"]
     if one["period_s"] > 0.0:
         recognise(belief, one["now"], one["period_s"], stages)
     _around(one["moving"], hands)
     for n in range(3):
         ahead_s = (n - 1) * MOTION_STEP_S
-        pace[2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
-        tools_at(hands[n], pace, belief, stages, sizes, rows, pulls, tools[n])
+        tempo[2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
+        tools_at(hands[n], tempo, belief, stages, sizes, rows, pulls, tools[n])
         expected(belief, tools[n], steps[n])
     for i in range(3):
         acceleration = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
@@ -454,7 +454,7 @@ def predicted(
         out[2, i] = min(max(acceleration, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
     if len(errors):
-        scatter(hands[1], pace, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
+        scatter(hands[1], tempo, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
     return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])

@@ -22,11 +22,12 @@ from service.settings.config import Settings
 LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
 LEAST_NEAR_M = 0.1  # hands within this distance of where demonstrations begin have returned there
 NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of a demonstration's hands
-MOST_PACE_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
+MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
+LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
 FIRST_STAMP_NS = 1_000_000_000
 
 
-class Pace(NamedTuple):
+class Tempo(NamedTuple):
     """Hands (T, 6) [m], their speeds (T, 2) [m/s] without tremor, and their stillness (T, 2) along
     a demonstration, as the core's intake estimates them.
     """
@@ -38,8 +39,8 @@ class Pace(NamedTuple):
 
     @classmethod
     def of(cls, demonstration: Demonstration) -> Self:
-        """The pace of a demonstration, sample by sample."""
-        step = max(1, math.floor(1.0 / (MOST_PACE_HZ * demonstration.period_s)))
+        """The tempo of a demonstration, sample by sample."""
+        step = max(1, math.floor(1.0 / (MOST_TEMPO_HZ * demonstration.period_s)))
         settings = Settings()
         intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
         intake.begin(state)
@@ -83,39 +84,40 @@ class Pace(NamedTuple):
         return float(np.diff([*moving, len(self.speeds)]).max()) * self.period_s
 
 
-def clock_of(paces: Sequence[Pace], alone: int | None, *, waits: bool) -> TaskClock:
-    """The clock of demonstrations with these paces, with a weight of 1 m/s."""
-    begins = np.array([one.hands[0] if alone is None else np.tile(one.hands[0, 3 * alone :][:3], 2) for one in paces])
+def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
+    """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
+    begins = np.array([one.hands[0] if alone is None else np.tile(one.hands[0, 3 * alone :][:3], 2) for one in tempos])
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
     near_m = max(LEAST_NEAR_M, NEAR_TIMES * off_m)
-    rest_s = LONGER * max(one.longest_rest_s(alone) for one in paces)
+    rest_s = LONGER * max(one.longest_rest_s(alone) for one in tempos)
     free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, near_m, tuple(begin.tolist()))
-    ends_s = [float(one.seconds(free, alone)[-1]) for one in paces]
+    ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
     return free._replace(longest_s=max(ends_s), over_s=min(ends_s), rest_s=max(rest_s, 1.0))
 
 
 def stage_clock_of(
-    paces: Sequence[Pace], placed: Sequence[Records], labels: Sequence[NDArray[np.int64]], *, waits: bool
+    tempos: Sequence[Tempo], placed: Sequence[Records], labels: Sequence[NDArray[np.int64]], *, waits: bool
 ) -> TaskClock:
-    """The clock of the stages (K,) of demonstrations with these paces and labels (T,), with a
+    """The clock of the stages (K,) of demonstrations with these tempos and labels (T,), with a
     weight of 1. Only where a stage begins does a rest start it anew.
     """
-    rest_s = LONGER * max(one.longest_rest_s(None) for one in paces)
+    rest_s = LONGER * max(one.longest_rest_s(None) for one in tempos)
     free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, LEAST_NEAR_M, (0.0,) * 6)
     ends_s = [
-        float(pace.in_stages(rows_of(free, stages), label).max())
-        for pace, stages, label in zip(paces, placed, labels, strict=True)
+        float(tempo.in_stages(rows_of(free, stages), label).max())
+        for tempo, stages, label in zip(tempos, placed, labels, strict=True)
     ]
     return free._replace(longest_s=max(ends_s), over_s=LONGEST_CLOCK_S, rest_s=max(rest_s, 1.0))
 
 
 def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:
     """The numbers (H,) of blocks of at least two takes that follow each other, by the takes'
-    persons (H,). Such takes are often of one person, whose pace others need not have.
+    persons (H,). Such takes are often of one person, whose pace others need not have. All are 0 if
+    there would be fewer than LEAST_PAIRS blocks.
     """
-    out = np.zeros_like(persons)
-    for number, block in enumerate(blocks_of(persons, len(persons) // 2)):
+    out, blocks = np.zeros_like(persons), blocks_of(persons, len(persons) // 2)
+    for number, block in enumerate(blocks if len(blocks) >= LEAST_PAIRS else ()):
         out[block] = number
     return out
 

@@ -26,7 +26,7 @@ from service.learning.choice import selection_of
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of
 from service.learning.gate import CEILING_M
-from service.learning.methods.clock import Pace, clock_of, paired, remark_on
+from service.learning.methods.clock import Tempo, clock_of, paired, remark_on
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
 from service.learning.records import Fitted, Options, Progress, Take, persons_of
 from service.learning.regions import refitted_errors
@@ -53,8 +53,8 @@ class Inputs(NamedTuple):
         """True if there are other inputs than positions."""
         return bool(self.order or self.turned or self.clock is not None)
 
-    def of(self, demonstration: Demonstration, pace: Pace | None = None) -> Vector:
-        """The inputs (T, I) [m] of a demonstration, whose `pace` is needed for a clock."""
+    def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
+        """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
         hands, turns = demonstration.hands, demonstration.turns if self.turned else None
         if self.alone is not None:
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
@@ -62,8 +62,8 @@ class Inputs(NamedTuple):
         found = features(hands, demonstration.period_s, self.order, turns)
         if self.clock is None:
             return found
-        assert pace is not None
-        return np.column_stack([found, self.clock.weight * pace.seconds(self.clock, self.alone)])
+        assert tempo is not None
+        return np.column_stack([found, self.clock.weight * tempo.seconds(self.clock, self.alone)])
 
 
 POSITIONS = Inputs("positions")
@@ -99,8 +99,8 @@ class HandInputs:
         """The model of the chosen kind of inputs, and its predictions of held-out takes."""
         remarks = [self.why_not_staged] if self.why_not_staged else []
         points, ell = self.options.points, self.options.ell
-        paces = [Pace.of(take.demonstration) for take in takes]
-        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(takes, paces, points, progress)
+        tempos = [Tempo.of(take.demonstration) for take in takes]
+        kind, tried_m = (POSITIONS, {}) if ell is not None else _chosen(takes, tempos, points, progress)
         if kind.clock is not None:
             remarks.append(
                 f"{remark_on(kind.clock)}. A rest of more than {kind.clock.rest_s:.1f} s, where demonstrations begin "
@@ -112,8 +112,8 @@ class HandInputs:
                 "makes no difference, and may be absent"
             )
         inputs = [
-            take.hands if ell is not None else kind.of(take.demonstration, pace)
-            for take, pace in zip(takes, paces, strict=True)
+            take.hands if ell is not None else kind.of(take.demonstration, tempo)
+            for take, tempo in zip(takes, tempos, strict=True)
         ]
         progress(f"choosing parameters over {len(takes)} demonstrations")
         fit = refit(kind, takes, inputs, points, ell)
@@ -169,7 +169,7 @@ def refit(kind: Inputs, takes: Sequence[Take], inputs: Sequence[Vector], points:
 
 
 def _chosen(
-    takes: Sequence[Take], paces: Sequence[Pace], points: int, progress: Progress
+    takes: Sequence[Take], tempos: Sequence[Tempo], points: int, progress: Progress
 ) -> tuple[Inputs, dict[str, float]]:
     """The simplest kind of inputs that is as good as any, and the error [m] of each kind.
 
@@ -180,7 +180,7 @@ def _chosen(
     blocks = paired(persons)
 
     def error_m(kind: Inputs, held_out: NDArray[np.intp]) -> float:
-        pairs = [(kind.of(take.demonstration, pace), take.position) for take, pace in zip(takes, paces, strict=True)]
+        pairs = [(kind.of(take.demonstration, tempo), take.position) for take, tempo in zip(takes, tempos, strict=True)]
         choice = selection_of(pairs, points, persons=held_out, rich=True)
         return choice.best_mean(may_be_linear=True)[0]
 
@@ -198,7 +198,7 @@ def _chosen(
     for kind in bases:
         for waits, name in CLOCKS.items():
             progress(f"trying {kind.name}{name}")
-            clock = clock_of(paces, kind.alone, waits=waits)
+            clock = clock_of(tempos, kind.alone, waits=waits)
             weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
             errors_m = [error_m(one, blocks) for one in weighted]
             weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))

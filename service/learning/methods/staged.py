@@ -33,7 +33,7 @@ from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.learning.demonstration import Demonstration, lag
 from service.learning.division import NEAR, Encoded, along_all, ordered, recognised, task_of, via_points_never_reached
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
-from service.learning.methods.clock import Pace, paired, remark_on, stage_clock_of
+from service.learning.methods.clock import Tempo, paired, remark_on, stage_clock_of
 from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import AS_GOOD, CLOCKS, POSITIONS, clock_limit_m, refit
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, persons_of
@@ -90,12 +90,12 @@ class Samples(NamedTuple):
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
         return cls(encoded, inputs_of(shares, labels, count), outputs, owner)
 
-    def clocked(self, paces: Sequence[Pace], clock: TaskClock) -> Self:
+    def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The samples with a clock as the last input."""
         each = max(LEAST_SAMPLES, SAMPLES_LEARNED // len(self.encoded))
         times = [
-            pace.in_stages(rows_of(clock, one.stages), one.labels)[one.rows(each)]
-            for pace, one in zip(paces, self.encoded, strict=True)
+            tempo.in_stages(rows_of(clock, one.stages), one.labels)[one.rows(each)]
+            for tempo, one in zip(tempos, self.encoded, strict=True)
         ]
         inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
         return self._replace(inputs=inputs, clock=clock)
@@ -210,10 +210,10 @@ class _Prediction(NamedTuple):
     belief: Vector
     errors: Vector
     inputs: Vector
-    paces: Vector  # (T, 3) as in `Placed.mean`
+    tempos: Vector  # (T, 3) as in `Placed.mean`
 
     @classmethod
-    def of(cls, one: Encoded, placed: Placed, delay_s: float, pace: Pace, clock: TaskClock | None) -> Self:
+    def of(cls, one: Encoded, placed: Placed, delay_s: float, tempo: Tempo, clock: TaskClock | None) -> Self:
         belief = np.zeros((len(one.tool), MOST_STAGES))
         recognised(one.moving, one.period_s, placed.stages, belief)
         hands = one.moving[:, 0]
@@ -221,14 +221,14 @@ class _Prediction(NamedTuple):
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
         times = np.zeros(len(hands))
         if clock is not None:
-            times = pace.in_stages(rows_of(clock, placed.stages), belief.argmax(axis=1))
-        paces = np.column_stack([one.stillness, times])
-        errors = one.tool - placed.mean(hands, belief, paces)
+            times = tempo.in_stages(rows_of(clock, placed.stages), belief.argmax(axis=1))
+        tempos = np.column_stack([one.stillness, times])
+        errors = one.tool - placed.mean(hands, belief, tempos)
         found = np.empty((len(hands), 4))
         along_all(hands, one.stillness, belief.argmax(axis=1), placed.stages, found)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
         inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * times[:, None]])]
-        return cls(hands, belief, errors, np.hstack(inputs), paces)
+        return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
         """Errors (M, 6) at about `count` samples: shares (2,), stage, and error (3,) [m]."""
@@ -266,7 +266,7 @@ class Staged:
         delay, each_s = delay_of(demonstrations)
         encoded = [Encoded.of(self.task, *one) for one in zip(demonstrations, each_s, strict=True)]
         samples, off, blocks = Samples.of(encoded), _off_m(encoded), blocks_of(persons_of(takes))
-        paces = [Pace.of(one) for one in demonstrations]
+        tempos = [Tempo.of(one) for one in demonstrations]
 
         def held_out_by(kind: Samples, parameters: Hyperparameters) -> dict[int, _Prediction]:
             """The predictions of each block of demonstrations by the others."""
@@ -276,13 +276,13 @@ class Staged:
                 primitive = kind.fitted(parameters, block if len(blocks) > 1 else ())
                 for h in block:
                     placed = Placed.of(self.task, encoded[h].at, off, primitive, NO_ERRORS, kind.clock)
-                    predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s, paces[h], kind.clock)
+                    predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s, tempos[h], kind.clock)
             return predictions
 
         parameters = samples.best()
         predictions, tried_m = held_out_by(samples, parameters), dict[str, float]()
         tried = {SHARES_ALONE: (samples, parameters, predictions)}
-        for name, kind in _with_clocks(samples, parameters, paces, persons_of(takes), progress).items():
+        for name, kind in _with_clocks(samples, parameters, tempos, persons_of(takes), progress).items():
             best = kind.best()
             tried[name] = (kind, best, held_out_by(kind, best))
         if len(tried) > 1:
@@ -340,7 +340,7 @@ class Staged:
 
 
 def _with_clocks(
-    samples: Samples, parameters: Hyperparameters, paces: Sequence[Pace], persons: Indices, progress: Progress
+    samples: Samples, parameters: Hyperparameters, tempos: Sequence[Tempo], persons: Indices, progress: Progress
 ) -> dict[str, Samples]:
     """The samples with those clocks that may predict clearly better, by the name of the inputs.
 
@@ -358,8 +358,8 @@ def _with_clocks(
     stages, labels = [one.stages for one in samples.encoded], [one.labels for one in samples.encoded]
     for waits, name in CLOCKS.items():
         progress(f"trying {SHARES_ALONE}{name}")
-        clock = stage_clock_of(paces, stages, labels, waits=waits)
-        tried = [samples.clocked(paces, clock._replace(weight=weight)) for weight in CLOCK_WEIGHTS_PER_S]
+        clock = stage_clock_of(tempos, stages, labels, waits=waits)
+        tried = [samples.clocked(tempos, clock._replace(weight=weight)) for weight in CLOCK_WEIGHTS_PER_S]
         errors_m = [error_m(one) for one in tried]
         if min(errors_m) < limit_m:
             out[SHARES_ALONE + name] = preferred(tried, errors_m, AS_GOOD * min(errors_m))
@@ -392,7 +392,7 @@ def _off_m(encoded: Sequence[Encoded]) -> Vector:
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
     """The record of a take with the covariance from other blocks' errors, in `placed`."""
-    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.paces, strict=True)
+    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.tempos, strict=True)
     return HeldOut(
         take,
         found.errors,
