@@ -23,6 +23,7 @@ from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
+from service.core.skill.task_clock import CLOCK_S
 from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.settings.config import Settings
 
@@ -94,6 +95,7 @@ class CellStatus(NamedTuple):
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
             stage=skill.model.names[frame["stage"] : frame["stage"] + 2] if frame["stage_belief"] else (),
             stage_belief=round(float(frame["stage_belief"]), 3),
+            task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2) if skill.model.clock else None,
             deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             **more,

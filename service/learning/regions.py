@@ -44,10 +44,12 @@ LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as th
 LEAST_RADIUS = 1e-9  # a squared radius is at least this large
 
 
-def blocks_of(persons: NDArray[np.intp]) -> list[list[int]]:
-    """The numbers of the takes that are held out at once, by the takes' persons (H,)."""
+def blocks_of(persons: NDArray[np.intp], most: int = BLOCKS) -> list[list[int]]:
+    """The numbers of the takes that are held out at once, by the takes' persons (H,), in at most
+    `most` blocks, or BLOCKS.
+    """
     numbers = np.unique(persons)
-    blocks = np.array_split(numbers, max(1, min(BLOCKS, len(numbers))))
+    blocks = np.array_split(numbers, max(1, min(BLOCKS, most, len(numbers))))
     return [np.flatnonzero(np.isin(persons, block)).tolist() for block in blocks if len(block)]
 
 

@@ -30,6 +30,7 @@ from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
+from service.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT
 from service.learning.residual_risk import ResidualRisk
 
 POSED = 4  # format of a skill with an orientation or a gripper; other skills have their model's formats
@@ -61,6 +62,7 @@ ALL_RANGES = (
     | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
     | {name: found for model in MODELS for name, found in model.ranges.items()}
 )
+INPUT_ARRAYS = ("base_inputs", "via_inputs")
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
@@ -71,6 +73,7 @@ KNOWN = {
     DEMONSTRATIONS,
     *OTHERS,
     "replaced",
+    "task_clock",
     *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
     TURN + "auxiliary",
 }
@@ -224,10 +227,11 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
     own = [name for name in _model(arrays).ranges if name in arrays]  # one that is missing is found missing later
+    clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
     yield from _beyond(arrays, [*RANGES, *own], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
-            yield from _beyond(part, RANGES.keys() & part.keys(), prefix)
+            yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
             if len(part["base_inputs"]) > MOST_POINTS:
                 yield f"{len(part['base_inputs'])} points of {prefix}, at most {MOST_POINTS} accepted"
     for prefix in ("", TURN, GRIPPER):
@@ -255,12 +259,17 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
 
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
-    """Faults of arrays with numbers out of their ranges."""
+    """Faults of arrays with numbers out of their ranges. The last input may be a clock's."""
     for name in names:
         array, (low, high, unit) = arrays[name], ALL_RANGES[name]
         if array.dtype.kind not in "iuf":
             yield f"{prefix}{name} has numbers of type {array.dtype}, real ones needed"
-        elif array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
+            continue
+        if "task_clock" in arrays and name in INPUT_ARRAYS and array.ndim == 2:
+            array, times = array[:, :-1], array[:, -1]
+            if not (np.abs(times) <= LONGEST_CLOCK_S * MOST_CLOCK_WEIGHT).all():
+                yield f"{prefix}{name} has a clock that is no number, or too late"
+        if array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
             worst = array.flat[np.argmax(np.where(np.isfinite(array), np.abs(array), np.inf))]
             yield f"{prefix}{name} has {worst:g}, {low:g} to {high:g} {unit}".rstrip() + " accepted"
 

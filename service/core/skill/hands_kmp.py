@@ -30,6 +30,7 @@ from service.core.skill.model import (
     standard_deviations,
 )
 from service.core.skill.stages import MOST_STAGES
+from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import TURN_WEIGHT_M
 from service.core.skill.via_points import neighbourhoods
 
@@ -42,13 +43,16 @@ class HandsKMP:
 
     * both hands' positions (6);
     * for each of `order` rows of their memory, its offset from these positions (6 each);
-    * if `turned`, both hands' rotation matrices times TURN_WEIGHT_M (18).
+    * if `turned`, both hands' rotation matrices times TURN_WEIGHT_M (18);
+    * if there is a `clock` of the task, its time times its weight (1).
 
     A hand of unknown orientation is assumed to have the mean orientation of the demonstrations.
+    Where no clock is known, as at a via-point, it is that of the nearest reference point.
     """
 
     primitive: KMP
     turned: bool = False  # true if the hands' orientation is an input
+    clock: TaskClock | None = None
 
     measure: ClassVar[str] = "the target's standard deviation"
     formats: ClassVar[tuple[int, ...]] = (1, 2)
@@ -61,18 +65,20 @@ class HandsKMP:
     @property
     def order(self) -> int:
         """Number of rows of the hands' memory that are inputs."""
-        return min(max((int(self.primitive.inputs.shape[1]) - TURN_INPUTS * self.turned) // 6 - 1, 0), ORDER)
+        beside = TURN_INPUTS * self.turned + (self.clock is not None)
+        return min(max((int(self.primitive.inputs.shape[1]) - beside) // 6 - 1, 0), ORDER)
 
     @property
     def shape(self) -> tuple[int, int]:
-        return 6 * (1 + self.order) + TURN_INPUTS * self.turned, 3
+        return 6 * (1 + self.order) + TURN_INPUTS * self.turned + (self.clock is not None), 3
 
     @cached_property
     def _usual_turns(self) -> Vector:
         """Mean orientation inputs (TURN_INPUTS,) [m] of the demonstrations; empty if orientation is
         no input.
         """
-        return np.asarray(self.primitive.base.inputs[:, 6 * (1 + self.order) :].mean(axis=0))
+        first = 6 * (1 + self.order)
+        return np.asarray(self.primitive.base.inputs[:, first : first + TURN_INPUTS * self.turned].mean(axis=0))
 
     @property
     def hands(self) -> Vector:
@@ -81,6 +87,10 @@ class HandsKMP:
     @property
     def remembers(self) -> bool:
         return self.order > 0
+
+    @cached_property
+    def clock_rows(self) -> Vector | None:
+        return None if self.clock is None else self.clock.numbers[None]
 
     def belief(self, hands: Vector) -> Vector:
         return np.zeros(MOST_STAGES)
@@ -91,7 +101,7 @@ class HandsKMP:
 
         The covariance, which takes as long as all else, is computed only if it is not `known`.
         """
-        moving = self._moving(seen.moving, seen.past, seen.turns)
+        moving = self._moving(seen)
         found = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
         covariance = found.covariance if known is None else known
         assert covariance is not None
@@ -109,25 +119,35 @@ class HandsKMP:
         return standard_deviations(self.covariances(hands))
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        if not (self.order or self.turned):
+        if not self._is_rich:
             return hands
         usual = self._usual_turns
-        return np.hstack([hands, np.zeros((len(hands), 6 * self.order)), np.tile(usual, (len(hands), 1))])
+        out = [hands, np.zeros((len(hands), 6 * self.order)), np.tile(usual, (len(hands), 1))]
+        if self.clock is not None:
+            known = self.primitive.base.inputs
+            nearest = ((hands[:, None] - known[:, :6]) ** 2).sum(axis=2).argmin(axis=1)
+            out.append(known[nearest, -1:])
+        return np.hstack(out)
+
+    @property
+    def _is_rich(self) -> bool:
+        """True if there are other inputs than positions."""
+        return bool(self.order or self.turned or self.clock is not None)
 
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
-        moving = self._moving(seen.moving, seen.past, seen.turns)
+        moving = self._moving(seen)
         return moving[0], moving[1]
 
-    def _moving(self, moving: Vector, past: Vector, turns: Vector) -> Vector:
-        """Inputs (I,) with their velocity and acceleration, (3, I), for hands with this motion (3,
-        6), memory (ORDER, 6) and orientation filters (TURNS, 18) or (0, 18).
-        """
-        if not (self.order or self.turned):
-            return moving
+    def _moving(self, seen: Seen) -> Vector:
+        """Inputs (I,) with their velocity and acceleration, (3, I)."""
+        if not self._is_rich:
+            return seen.moving
+        turns, out = seen.turns, np.empty((3, self.shape[0]))
         if self.turned and not len(turns):
             turns = np.tile(self._usual_turns / TURN_WEIGHT_M, (TURNS, 1))
-        out = np.empty((3, self.shape[0]))
-        moving_features(moving, past[: self.order], turns, out)
+        moving_features(seen.moving, seen.past[: self.order], turns, out)
+        if self.clock is not None:
+            out[:, -1] = self.clock.weight * seen.clock[:3]
         return out
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> HandsKMP:
@@ -141,11 +161,13 @@ class HandsKMP:
         return replace(self, primitive=self.primitive.base)
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        return {"turned": np.array(1)} if self.turned else {}
+        clock = {} if self.clock is None else {"task_clock": self.clock.numbers}
+        return ({"turned": np.array(1)} if self.turned else {}) | clock
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> HandsKMP:
-        return cls(from_arrays(arrays), "turned" in arrays)
+        clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
+        return cls(from_arrays(arrays), "turned" in arrays, clock)
 
 
 @compiled

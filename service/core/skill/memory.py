@@ -59,8 +59,8 @@ def remember(states: Records, period_s: float, lag_s: float, turn_lag_s: float) 
 @compiled
 def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) -> None:
     """Inputs of the primitive with their velocity and acceleration, written to `out` (3, (1 + K) D
-    + E): positions x (D), offsets m_k - x of each row of the `memory` (K, D), and the last row of
-    `turns` (TURNS, E) times TURN_WEIGHT_M.
+    or more): positions x (D), offsets m_k - x of each row of the `memory` (K, D), and the last row
+    of `turns` (TURNS, E) times TURN_WEIGHT_M if `out` has E columns more.
 
     `moving` (3, D) is position, velocity and acceleration of the hands. Derivatives are those of
     the cascades, e.g. dm_k/dt = (m_(k-1) - m_k) / MEMORY_LAG_S.
@@ -79,7 +79,7 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
             out[1, column] = velocity - moving[1, i]
             out[2, column] = acceleration - moving[2, i]
     first = (1 + len(memory)) * width
-    for i in range(out.shape[1] - first):
+    for i in range(turns.shape[1] if out.shape[1] - first >= turns.shape[1] else 0):
         before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
         out[0, first + i] = TURN_WEIGHT_M * last
         out[1, first + i] = TURN_WEIGHT_M * (between - last) / TURN_LAG_S

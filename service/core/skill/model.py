@@ -13,6 +13,7 @@ from kmp import KMP
 from kmp.compiled import compiled
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
+from service.core.skill.task_clock import TaskClock
 
 MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to micrometres
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
@@ -20,6 +21,7 @@ LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the cal
 CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # χ² with 3 degrees of freedom
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
+NO_CLOCK = np.zeros(3)
 
 
 class Regions(NamedTuple):
@@ -63,6 +65,7 @@ class Seen(NamedTuple):
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
     belief: Vector  # (MOST_STAGES,) probability of each stage; zeros: not yet known
     period_s: float  # time since the belief was updated; 0: it is not updated
+    clock: Vector = NO_CLOCK  # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
 
 
 class Target(NamedTuple):
@@ -135,6 +138,14 @@ class Model(Protocol):
     @property
     def turned(self) -> bool:
         """True if the tool depends on the hands' orientation."""
+
+    @property
+    def clock(self) -> TaskClock | None:
+        """Clock of the task, if it is an input."""
+
+    @property
+    def clock_rows(self) -> Vector | None:
+        """Parameters (K, 12) of the clock in each stage, see `task_clock.count`."""
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""

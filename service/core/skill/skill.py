@@ -22,7 +22,7 @@ from service.core.numerics import MAX_TARGET_M
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import delayed, turn_lag_s
-from service.core.skill.model import NORMAL, Model, Regions, Seen, Target
+from service.core.skill.model import NO_CLOCK, NORMAL, Model, Regions, Seen, Target
 from service.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from service.core.skill.staged import StagedKMP
 from service.settings.config import Reach
@@ -181,6 +181,7 @@ class Skill(Immutable):
         belief: Vector | None = None,
         period_s: float = 0.0,
         lead_s: float = 0.0,
+        clock: Vector = NO_CLOCK,
     ) -> Prediction:
         """Predict tool, orientation and gripper for the hands' positions, velocities and
         accelerations (2, 3) [m, m/s, m/s²] and stillness (2,), `lead_s` earlier than the
@@ -194,6 +195,7 @@ class Skill(Immutable):
           it, the orientation is the mean of the demonstrations.
         * `belief` (MOST_STAGES,): probability of each stage, updated in place if `period_s` > 0.
           Without it, the hands have always been at rest.
+        * `clock` (3,) or more: clock of the task [s] and its two derivatives, see `task_clock`.
 
         The result is rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines whose last bits differ agree
         in all that follows.
@@ -209,7 +211,7 @@ class Skill(Immutable):
         if self.conductor is not None:
             stillness = stillness[[self.conductor] * 2]
         told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
-        seen = Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s)
+        seen = Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s, clock)
         motion = self.model.predict(seen, None if before is None else before[0])
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)

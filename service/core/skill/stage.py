@@ -15,10 +15,12 @@ from service.core.skill.model import Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp
 from service.core.skill.step import calibrate, recent, write
+from service.core.skill.task_clock import move
 from service.core.skill.tuning import (
     AMBIGUOUS_PROBABILITY,
     AMBIGUOUS_S,
     MEMORY_LAG_S,
+    MEMORY_LONGEST_STEP_S,
     UNSURE_M,
 )
 from service.core.skill.unseen import off_m
@@ -40,14 +42,18 @@ class SkillStage:
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
+        self._clock, side = skill.model.clock_rows, skill.conductor
+        self._sides = np.array([0, 1] if side is None else [side, side])
 
     def adopt(self, state: Record, skill: Skill) -> None:
-        """Replace the skill. The belief is kept if the new skill has the same via-points, and the
-        memory of the hands if it has the same filters.
+        """Replace the skill. The belief is kept if the new skill has the same via-points, the
+        memory of the hands if it has the same filters, and the clock if it has the same clock.
         """
         if skill.model.names != self.skill.model.names:
             state["stage_belief"] = 0.0
         before, turn_before_s = self.skill.model, self._turn_lag_s
+        if skill.model.clock != before.clock:
+            state["task_clock"] = 0.0
         self._take(skill)
         is_same = skill.model.remembers == before.remembers and skill.model.delay_s == before.delay_s
         if not is_same or self._turn_lag_s != turn_before_s:
@@ -61,6 +67,7 @@ class SkillStage:
         side of a hand that is not seen now. Covariances and closure are computed at new samples
         only.
         """
+        self._count(state)
         remember(as_array(state), self._period_s, self._lag_s, self._turn_lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
         belief = state["stage_belief"]
@@ -77,6 +84,7 @@ class SkillStage:
             belief=belief,
             period_s=self._period_s,
             lead_s=self._lead_s,
+            clock=state["task_clock"],
         )
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
@@ -95,6 +103,16 @@ class SkillStage:
             state["sure_tick"] = tick
         is_ambiguous = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S
         return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
+
+    def _count(self, state: Record) -> None:
+        """Advance the clock of the task to this tick, if the skill has one. While a hand is not
+        seen, it waits.
+        """
+        if self._clock is None:
+            return
+        before = int(state["memory_ticks"].max())
+        passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
+        move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
 
     def set_stage(self, state: Record, name: str) -> None:
         """Set the belief to the stage that begins at the via-point of this name (at the last

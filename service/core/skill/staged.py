@@ -36,11 +36,13 @@ from service.core.skill.stages import (
     tools_at,
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
+from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.core.skill.via_points import pulls_through
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
+RESTING_TEMPO = np.array([*STILL, 0.0])  # tempo of two hands that rest and have not begun
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,8 +50,8 @@ class Placed(Immutable):
     """Stages of a task at their via-points in a scene, with the primitive as plain arrays: K
     stages, R centres, M errors, X pulls.
 
-    * `rows` (R, 3 + 4): a centre's shares x (2,) of left and right hand, its stage, and its weights
-      (4,).
+    * `rows` (R, 3 + 4 + 1): a centre's shares x (2,) of left and right hand, its stage, its weights
+      (4,), and its clock times the clock's weight.
     * `errors` (M, 3 + 3): shares x (2,), stage, and the tool's error [m] in held-out
       demonstrations.
     * `pulls` (X, 9): hands (6,) [m] and weight (3,) [m] of the kernels by which other via-points
@@ -70,15 +72,27 @@ class Placed(Immutable):
             frozen(part)
 
     @classmethod
-    def of(cls, task: Task, at: NamedViaPoints, off: Vector, primitive: KMP, errors: Vector) -> Placed:
+    def of(
+        cls,
+        task: Task,
+        at: NamedViaPoints,
+        off: Vector,
+        primitive: KMP,
+        errors: Vector,
+        clock: TaskClock | None = None,
+    ) -> Placed:
         """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
-        from their segments, root mean square; `errors` (M, 6) those of the primitive.
+        from their segments, root mean square; `errors` (M, 6) those of the primitive. Its last
+        input is the `clock`, if there is one.
         """
         sizes = structured(1, PLACED)
         sizes["scale"], sizes["likeness"] = scale_of(primitive), likeness(primitive)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
-        along, stage = primitive.centres[:, :2], primitive.centres[:, 2:].argmax(axis=1)
-        rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS)])
+        last, times = 2 + len(off), np.zeros(len(primitive.centres))
+        if clock is not None:
+            sizes["clock_weight"], times = clock.weight, primitive.centres[:, last]
+        along, stage = primitive.centres[:, :2], primitive.centres[:, 2:last].argmax(axis=1)
+        rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS), times])
         return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), NO_PULLS)
 
     def belief(self, hands: Vector) -> Vector:
@@ -90,37 +104,45 @@ class Placed(Immutable):
             recognise(out, moving, 0.1, self.stages)
         return out
 
-    def mean(self, hands: Vector, beliefs: Vector, stillness: Vector | None = None) -> Vector:
+    def mean(self, hands: Vector, beliefs: Vector, tempos: Vector | None = None) -> Vector:
         """Expected tool positions (T, 3) [m] for hands (T, 6), or with their rotation matrices (T,
-        24), with these beliefs (T, K or more) and stillness (T, 2); without it, hands are still.
+        24), with these beliefs (T, K or more) and tempos (T, 3), as in `stages.tools_at`; without
+        tempos, the hands are at rest.
         """
         out = np.empty((len(hands), 3))
         for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
-            still = STILL if stillness is None else stillness[t]
-            expected(belief, self._tools(one, still, belief, self.pulls), out[t])
+            tempo = RESTING_TEMPO if tempos is None else tempos[t]
+            expected(belief, self._tools(one, tempo, belief, self.pulls), out[t])
         return out
 
-    def _tools(self, hands: Vector, still: Vector, belief: Vector, pulls: Vector) -> Vector:
+    def _tools(self, hands: Vector, tempo: Vector, belief: Vector, pulls: Vector) -> Vector:
         """Tool positions (K, 3) [m] for hands (6 or 24,) in all stages with at least
         LEAST_STAGE_PROBABILITY.
         """
         out = np.empty((len(self.stages), 3))
-        tools_at(np.ascontiguousarray(hands), still, belief, self.stages, self.sizes, self.rows, pulls, out)
+        tools_at(np.ascontiguousarray(hands), tempo, belief, self.stages, self.sizes, self.rows, pulls, out)
         return out
 
     def gates_m(self, hands: Vector) -> Vector:
         """Distances (T,) [m] of hands (T, 6) from the task, see `stages.off_all`."""
         return np.array([off_all(np.ascontiguousarray(one), self.stages) for one in hands])
 
-    def covariance(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
-        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6 or 24,), a belief and stillness
-        (2,), see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
+    def covariance(self, hands: Vector, belief: Vector, tempo: Vector = RESTING_TEMPO) -> Vector:
+        """Covariance (3, 3) [m²] of the tool, rounded, for hands (6 or 24,), a belief and a tempo
+        (3,), see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
         via-points' variance.
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
-        tools = self._tools(hands, still, belief, NO_PULLS)
-        scatter(hands, still, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
+        tools = self._tools(hands, tempo, belief, NO_PULLS)
+        scatter(hands, tempo, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
+
+
+def rows_of(clock: TaskClock, stages: Records) -> Vector:
+    """Parameters (K, 12) of a clock in these stages, each with the hands at its begin."""
+    out = np.tile(clock.numbers, (len(stages), 1))
+    out[:, 6:] = stages["begins"].reshape(-1, 6)
+    return out
 
 
 def scale_of(primitive: KMP) -> float:
@@ -137,8 +159,9 @@ def likeness(primitive: KMP) -> float:
 
 @dataclass(frozen=True, eq=False)
 class StagedKMP:
-    """Model with the inputs share of a stage that the left and the right hand have covered, and the
-    stage (2 + K), and the outputs share that the tool covers, and its offset [m] (4). See `Model`.
+    """Model with the inputs share of a stage that the left and the right hand have covered, the
+    stage and, if there is a clock, that of the stage times its weight (2 + K or 2 + K + 1); and the
+    outputs share that the tool covers, and its offset [m] (4). See `Model`.
 
     * `nominal`: mean via-points of the demonstrations.
     * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
@@ -155,6 +178,7 @@ class StagedKMP:
     errors: Vector
     delay_s: float
     via_points: tuple[ViaPoint, ...] = ()
+    clock: TaskClock | None = None
 
     measure: ClassVar[str] = "the distance of a hand from its segments"
     formats: ClassVar[tuple[int, ...]] = (5,)
@@ -165,7 +189,11 @@ class StagedKMP:
 
     @property
     def shape(self) -> tuple[int, int]:
-        return 2 + len(self.off), OUTPUTS
+        return 2 + len(self.off) + (self.clock is not None), OUTPUTS
+
+    @cached_property
+    def clock_rows(self) -> Vector | None:
+        return None if self.clock is None else rows_of(self.clock, self._unpulled.stages)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -191,11 +219,11 @@ class StagedKMP:
     def _unpulled(self) -> Placed:
         """Stages between the via-points in force, without pulls."""
         at = self.nominal.moved(self.via_points)
-        return Placed.of(self.task, at, self.off, self.primitive, self.errors)
+        return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.clock)
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
-        return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]))
+        return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]), self._tempos(hands))
 
     def belief(self, hands: Vector) -> Vector:
         return self.placed.belief(hands)
@@ -206,7 +234,7 @@ class StagedKMP:
         """
         at, out, hands = self.placed, np.empty((6, 3)), np.zeros(1, SEEN)
         hands["moving"], hands["now"] = seen.moving, seen.now
-        hands["stillness"], hands["period_s"] = seen.stillness, seen.period_s
+        hands["stillness"], hands["period_s"], hands["clock"] = seen.stillness, seen.period_s, seen.clock[:3]
         if self.turned and len(seen.turns):
             hands["is_turning"] = 1
             turning(seen.turns, seen.turn_lag_s, hands["turning"][0])
@@ -215,11 +243,11 @@ class StagedKMP:
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        return self.placed.mean(hands, self._beliefs(hands, names))
+        return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
 
     def covariances(self, hands: Vector) -> Vector:
-        beliefs = self._beliefs(hands)
-        return np.array([self.placed.covariance(*one) for one in zip(hands, beliefs, strict=True)]).reshape(-1, 3, 3)
+        rows = zip(hands, self._beliefs(hands), self._tempos(hands), strict=True)
+        return np.array([self.placed.covariance(*row) for row in rows]).reshape(-1, 3, 3)
 
     def gates_m(self, hands: Vector) -> Vector:
         return self.placed.gates_m(hands)
@@ -235,27 +263,39 @@ class StagedKMP:
                 row[max(self.names.index(name) - 1, 0)] = 1.0
         return out
 
+    def _tempos(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
+        """Tempos (T, 3) of hands (T, 6) at rest: when the clock ends, or for hands at the first
+        via-point, when it begins.
+        """
+        out = np.tile(RESTING_TEMPO, (len(hands), 1))
+        if self.clock is not None:
+            out[:, 2] = self.clock.longest_s
+            out[[row for row, name in enumerate(names) if name == self.names[0]], 2] = 0.0
+        return out
+
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        return np.array(
-            [self._input(one, belief) for one, belief in zip(hands, self._beliefs(hands, names), strict=True)]
-        ).reshape(-1, self.shape[0])
+        rows = zip(hands, self._beliefs(hands, names), self._tempos(hands, names)[:, 2], strict=True)
+        return np.array([self._input(one, belief, clock_s=float(clock_s)) for one, belief, clock_s in rows]).reshape(
+            -1, self.shape[0]
+        )
 
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
         hands, velocity = seen.moving[0], seen.moving[1]
         behind, now, ahead = (
-            self._input(hands + step * velocity, seen.belief, seen.stillness)
+            self._input(hands + step * velocity, seen.belief, seen.stillness, seen.clock[0] + step * seen.clock[1])
             for step in (-MOTION_STEP_S, 0.0, MOTION_STEP_S)
         )
         return now, (ahead - behind) / (2.0 * MOTION_STEP_S)
 
-    def _input(self, hands: Vector, belief: Vector, still: Vector = STILL) -> Vector:
+    def _input(self, hands: Vector, belief: Vector, still: Vector = STILL, clock_s: float = 0.0) -> Vector:
         """Input (2 + K,) of orientation and gripper: shares of the most probable stage, and the
-        belief times STAGE_DISTANCE_BESIDE.
+        belief times STAGE_DISTANCE_BESIDE; with a clock, also that times its weight.
         """
         most = int(belief.argmax())
         stage, hands = self.placed.stages[most], np.ascontiguousarray(hands)
         along = along_both(hands, still, stage)
-        return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)])])
+        time = [] if self.clock is None else [self.clock.weight * clock_s]
+        return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)]), *time])
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> StagedKMP:
         """Model in a scene with these via-points. Nothing is solved: those of a known name move the
@@ -267,13 +307,17 @@ class StagedKMP:
         return replace(self, via_points=())
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        return self.task.to_arrays() | {
-            "nominal": self.nominal.at,
-            "off_ways": self.off,
-            "seen": np.ascontiguousarray(self.errors[:, :3]),
-            "errors": np.ascontiguousarray(self.errors[:, 3:]),
-            "delay": np.array(self.delay_s),
-        }
+        return (
+            self.task.to_arrays()
+            | {
+                "nominal": self.nominal.at,
+                "off_ways": self.off,
+                "seen": np.ascontiguousarray(self.errors[:, :3]),
+                "errors": np.ascontiguousarray(self.errors[:, 3:]),
+                "delay": np.array(self.delay_s),
+            }
+            | ({} if self.clock is None else {"task_clock": self.clock.numbers})
+        )
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> StagedKMP:
@@ -289,4 +333,5 @@ class StagedKMP:
         errors = np.hstack([arrays["seen"], arrays["errors"]])
         off, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
         nominal = NamedViaPoints(task.names, arrays["nominal"])
-        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points)
+        clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
+        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points, clock)

@@ -68,6 +68,7 @@ PLACED = np.dtype(
         ("scale", np.float64),  # scale of the kernel exp(-scale |difference|²)
         ("likeness", np.float64),  # factor of the kernel for a centre of another stage
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
+        ("clock_weight", np.float64),  # as an input, a second in the stage counts as this share of it
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
     ]
 )
@@ -80,6 +81,7 @@ SEEN = np.dtype(
         ("period_s", np.float64),
         ("turning", np.float64, (3, 18)),  # both hands' rotation matrices, their rate and acceleration
         ("is_turning", np.int64),  # 1: these are known
+        ("clock", np.float64, (3,)),
     ]
 )
 
@@ -267,14 +269,15 @@ def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> Non
 
 @compiled
 def _tool_in(
-    hands: Vector, still: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
+    hands: Vector, tempo: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
 ) -> None:
-    """Tool position in stage k for hands (6 or 24,) with the stillness (2,), written to `out` (3,)
-    [m]. The last 18 of 24 numbers are the hands' rotation matrices.
+    """Tool position in stage k for hands (6 or 24,) with the `tempo` (3,), written to `out` (3,)
+    [m]. The last 18 of 24 numbers are the hands' rotation matrices. The tempo is the stillness of
+    both hands, and the clock [s] of the stage.
 
-    With the hands' shares x (2,) of the stage, the primitive gives the tool's share s and its
-    offset δ (3,) [m] by equation (8) of Huang et al. 2019, over its R centres c_r with the weights
-    W_r (4,):
+    With the inputs x (3,), the hands' shares of the stage and the clock times `clock_weight`, the
+    primitive gives the tool's share s and its offset δ (3,) [m] by equation (8) of Huang et al.
+    2019, over its R centres c_r with the weights W_r (4,):
 
         (s, δ) = prior + Σ_r g_r exp(-scale |x - c_r|²) W_r,   g_r = 1 in stage k, else `likeness`
         tool = t + s u + δ
@@ -284,10 +287,11 @@ def _tool_in(
     (`via_points.pulls_through`).
     """
     stage, found = stages[k], np.empty(OUTPUTS)
-    one, other = along_both(hands, still, stage)
-    found[:] = size["prior"]
+    one, other = along_both(hands, tempo, stage)
+    found[:], time = size["prior"], size["clock_weight"] * tempo[2]
     for r in range(len(rows)):
-        value = math.exp(-size["scale"] * ((one - rows[r, 0]) ** 2 + (other - rows[r, 1]) ** 2))
+        square = (one - rows[r, 0]) ** 2 + (other - rows[r, 1]) ** 2 + (time - rows[r, 3 + OUTPUTS]) ** 2
+        value = math.exp(-size["scale"] * square)
         if rows[r, 2] != k:
             value *= size["likeness"]
         for o in range(OUTPUTS):
@@ -303,7 +307,7 @@ def _tool_in(
 @compiled
 def tools_at(
     hands: Vector,
-    still: Vector,
+    tempo: Vector,
     belief: Vector,
     stages: Records,
     sizes: Records,
@@ -316,7 +320,7 @@ def tools_at(
     """
     for k in range(len(stages)):
         if belief[k] >= LEAST_STAGE_PROBABILITY:
-            _tool_in(hands, still, k, stages, sizes[0], rows, pulls, out[k])
+            _tool_in(hands, tempo, k, stages, sizes[0], rows, pulls, out[k])
 
 
 @compiled
@@ -452,7 +456,7 @@ def predicted(
 
     Written to `out` (6, 3), rounded: position, velocity, acceleration, and the covariance (3, 3) of
     `scatter`, which is zero without `errors`. With the expected positions t_-, t_0, t_+ at the
-    three times of `_around`, h = MOTION_STEP_S apart:
+    three times of `_around`, h = MOTION_STEP_S apart, at which the clock is t ± h r + ½ h² dr/dt:
 
         velocity = (t_+ - t_-) / (2 h)
         acceleration = clip((t_+ - 2 t_0 + t_-) / h², ±MAX_TARGET_MPS2)
@@ -462,14 +466,17 @@ def predicted(
     """
     one, steps = seen[0], np.empty((3, 3))
     hands = np.empty((3, 6 + 18 * one["is_turning"]))
-    still, tools = one["stillness"], np.empty((3, len(stages), 3))
+    tempo, tools, clock = np.empty(3), np.empty((3, len(stages), 3)), one["clock"]
+    tempo[:2] = one["stillness"]
     if one["period_s"] > 0.0:
         recognise(belief, one["now"], one["period_s"], stages)
     _around(one["moving"], hands)
     if one["is_turning"]:
         _turned_around(one["turning"], hands)
     for n in range(3):
-        tools_at(hands[n], still, belief, stages, sizes, rows, pulls, tools[n])
+        ahead_s = (n - 1) * MOTION_STEP_S
+        tempo[2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
+        tools_at(hands[n], tempo, belief, stages, sizes, rows, pulls, tools[n])
         expected(belief, tools[n], steps[n])
     for i in range(3):
         acceleration = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
@@ -478,7 +485,7 @@ def predicted(
         out[2, i] = min(max(acceleration, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
     if len(errors):
-        scatter(hands[1], still, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
+        scatter(hands[1], tempo, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
     return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])

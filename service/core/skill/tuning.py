@@ -74,6 +74,12 @@ TURN_LAG_S = 0.03  # time constant of the filters of a hand's turn; trackers hav
 # 0.03 to 0.3. More: orientations weigh more. Less: positions weigh more.
 TURN_WEIGHT_M = 0.1  # entries of a rotation matrix become lengths: those of a tool fixed to the hand this far away
 
+# Clock of the task.
+# 0.03 to 0.2. More: the clock starts later. Less: a restless hand starts it.
+CLOCK_START_MPS = 0.08  # a faster hand has begun the task; tremor and drift are slower
+# 0.03 to 0.3. More: the clock starts and stops softly. Less: the target accelerates more.
+CLOCK_LAG_S = 0.1  # time constant with which the clock's rate changes
+
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
 GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure

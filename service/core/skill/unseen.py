@@ -59,6 +59,7 @@ def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
             turns=state["turns"],
             belief=state["stage_belief"],
             lead_s=skill.model.delay_s,
+            clock=state["task_clock"],
         ).position
 
     hands = state["hands"][:, 0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from kmp import KMP
 from service.core.frame import Vector
+from service.core.skill.hands_kmp import TURN_INPUTS
 from service.core.skill.model import standard_deviations
 from service.learning.gate import Gate, every_few, gate_between, nonsense
 from service.learning.records import HeldOut, Progress, Take, persons_of
@@ -51,7 +52,8 @@ def swapped(inputs: Vector, order: int) -> Vector:
     the hands' positions stay.
     """
     out, turns = inputs.copy(), 6 * (1 + order)
-    for columns, width in ((slice(6, turns), 3), (slice(turns, None), 9)):
+    end = turns + (inputs.shape[1] - turns) // TURN_INPUTS * TURN_INPUTS  # a clock has no side
+    for columns, width in ((slice(6, turns), 3), (slice(turns, end), 9)):
         both = inputs[:, columns].reshape(len(inputs), -1, 2, width)
         out[:, columns] = both[:, :, ::-1].reshape(len(inputs), -1)
     return out

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.criteria.cross_validation import preferred
 from kmp.criteria.direct import DirectSelection
@@ -21,10 +22,12 @@ from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import features
+from service.core.skill.task_clock import TaskClock
 from service.learning.choice import selection_of
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of
 from service.learning.gate import CEILING_M
+from service.learning.methods.clock import Tempo, clock_of, paired, remark_on
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
 from service.learning.methods.weights import WEIGHTS, chosen
 from service.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
@@ -38,21 +41,31 @@ LEAST_PERSONS = 3  # hyper-parameters are chosen anew without each block of take
 
 class Inputs(NamedTuple):
     """A kind of inputs: the positions of the hands, rows of their memory, and their orientation; of
-    both hands, or of one that stands for both.
+    both hands, or of one that stands for both; and the clock of the task.
     """
 
     name: str
     order: int = 0  # rows of memory
     turned: bool = False  # true if the orientation is an input
     alone: int | None = None  # the side of the only hand
+    clock: TaskClock | None = None
 
-    def of(self, demonstration: Demonstration) -> Vector:
-        """The inputs (T, I) [m] of a demonstration."""
+    @property
+    def is_rich(self) -> bool:
+        """True if there are other inputs than positions."""
+        return bool(self.order or self.turned or self.clock is not None)
+
+    def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
+        """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
         hands, turns = demonstration.hands, demonstration.turns if self.turned else None
         if self.alone is not None:
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
             turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
-        return features(hands, demonstration.period_s, self.order, turns)
+        found = features(hands, demonstration.period_s, self.order, turns)
+        if self.clock is None:
+            return found
+        assert tempo is not None
+        return np.column_stack([found, self.clock.weight * tempo.seconds(self.clock, self.alone)])
 
 
 POSITIONS = Inputs("positions")
@@ -62,6 +75,9 @@ KINDS = (  # from simple to rich
     Inputs("orientations", turned=True),
     Inputs("memory", order=ORDER),
 )
+CLOCKS = {True: ", and a clock that waits for resting hands", False: ", and a clock"}  # names; the first is simpler
+WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
+CLOCK_ERROR_SHARE = 0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
 
 
 @dataclass(frozen=True)
@@ -84,15 +100,24 @@ class HandInputs:
         takes, earlier = taught.new, taught.earlier
         remarks = [self.why_not_staged] if self.why_not_staged else []
         points, ell = self.options.points, self.options.ell
-        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, points, progress)
+        tempos = [Tempo.of(take.demonstration) for take in taught.all]
+        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
         kind = found.kind
+        if kind.clock is not None:
+            remarks.append(
+                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.rest_s:.1f} s, where demonstrations begin "
+                "or after the task, starts it anew"
+            )
         if kind.alone is not None:
             remarks.append(
                 f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
                 "makes no difference, and may be absent"
             )
-        inputs = [take.hands if ell is not None else kind.of(take.demonstration) for take in takes]
-        before = [kind.of(take.demonstration) for take in earlier]
+        inputs = [
+            take.hands if ell is not None else kind.of(take.demonstration, tempo)
+            for take, tempo in zip(taught.all, tempos, strict=True)
+        ]
+        inputs, before = inputs[: len(takes)], inputs[len(takes) :]
         weight, weights = chosen(found.by_weight_m)
         if math.isinf(weight):
             earlier, before = [], []
@@ -108,12 +133,12 @@ class HandInputs:
             def refitted(kept: list[int]) -> HandsKMP:
                 some, known = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
                 others = refit(kind, some, known, points, ell, earlier=len(earlier), weight=weight)
-                return HandsKMP(others(None), kind.turned)
+                return HandsKMP(others(None), kind.turned, kind.clock)
 
             timed = refitted_errors(takes, inputs, refitted)
             held_out = [one._replace(timed=errors) for one, errors in zip(held_out, timed, strict=True)]
         return Fitted(
-            HandsKMP(primitive, kind.turned),
+            HandsKMP(primitive, kind.turned, kind.clock),
             held_out,
             gate,
             conductor=kind.alone,
@@ -124,12 +149,16 @@ class HandInputs:
         )
 
 
-def _weighted(kind: Inputs, taught: Taught, weight: float, points: int) -> DirectSelection:
-    """The selection of a mean of this kind of inputs with this weight of new takes."""
+def _weighted(
+    kind: Inputs, taught: Taught, tempos: Sequence[Tempo], weight: float, points: int, blocks: NDArray[np.intp]
+) -> DirectSelection:
+    """The selection of a mean of this kind of inputs with this weight of new takes, where the takes
+    of a block (H,) are held out at once.
+    """
     earlier = taught.earlier if math.isfinite(weight) else []
     takes = [*taught.new, *earlier]
-    pairs = [(kind.of(take.demonstration), take.position) for take in takes]
-    return selection_of(pairs, points, persons=persons_of(takes), rich=True, earlier=len(earlier), factor=weight)
+    pairs = [(kind.of(take.demonstration, tempo), take.position) for take, tempo in zip(takes, tempos, strict=False)]
+    return selection_of(pairs, points, persons=blocks[: len(takes)], rich=True, earlier=len(earlier), factor=weight)
 
 
 def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
@@ -161,7 +190,7 @@ def refit(
 
     The last `earlier` takes are of a skill that is refined; a new one has this weight against them.
     """
-    is_rich = bool(kind.order or kind.turned)
+    is_rich = kind.is_rich
     pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
     count, persons = RICH_TIMES * points if is_rich else points, persons_of(takes)
     choice = selection_of(
@@ -180,16 +209,56 @@ class Chosen(NamedTuple):
     by_weight_m: Mapping[float, float]
 
 
-def _chosen(taught: Taught, points: int, progress: Progress) -> Chosen:
-    """The simplest kind of inputs that is as good as any, each with its best weight."""
-    kinds, weights = candidates([take.demonstration for take in taught.all]), WEIGHTS if taught.earlier else WEIGHTS[:1]
-    errors_m: dict[str, dict[float, float]] = {}
+def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Progress) -> Chosen:
+    """The simplest kind of inputs that is as good as any, each with its best weight.
+
+    A clock is tried with positions, and with the best kinds without it. For it, the blocks of
+    `paired` are held out; if a skill is refined, the new takes show the pace that counts, and are
+    held out one by one.
+    """
+    persons = persons_of(taught.all)
+    blocks = persons if taught.earlier else paired(persons)
+
+    def error_m(kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
+        return _weighted(kind, taught, tempos, weight, points, held_out).best_mean(may_be_linear=True)[0]
+
+    def by_weight_m(kind: Inputs) -> dict[float, float]:
+        weights = WEIGHTS if taught.earlier else WEIGHTS[:1]
+        return {weight: error_m(kind, weight, persons) for weight in weights}
+
+    kinds, errors_m = candidates([take.demonstration for take in taught.all]), dict[str, dict[float, float]]()
     for kind in kinds:
         progress(f"trying {kind.name}")
-        errors_m[kind.name] = {
-            weight: _weighted(kind, taught, weight, points).best_mean(may_be_linear=True)[0] for weight in weights
-        }
-    tried_m = {name: min(by_weight.values()) for name, by_weight in errors_m.items()}
-    least_m = min(tried_m.values())
-    kind = preferred(kinds, list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
-    return Chosen(kind, tried_m, errors_m[kind.name])
+        errors_m[kind.name] = by_weight_m(kind)
+    tried_m = {name: min(found.values()) for name, found in errors_m.items()}
+    simplest = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
+    if not blocks.any():
+        return Chosen(simplest, tried_m, errors_m[simplest.name])
+    best = min(kinds, key=lambda kind: tried_m[kind.name])
+    first = next(kind for kind in kinds if kind.alone == simplest.alone)
+    bases, timed = sorted({first, simplest, best}, key=kinds.index), list[Inputs]()
+    weights = {kind: min(found := errors_m[kind.name], key=found.__getitem__) for kind in bases}
+    limit_m = clock_limit_m(min(error_m(kind, weights[kind], blocks) for kind in bases))
+    for kind in bases:
+        for waits, name in CLOCKS.items():
+            progress(f"trying {kind.name}{name}")
+            clock = clock_of(tempos, kind.alone, waits=waits)
+            weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
+            with_clock_m = [error_m(one, weights[kind], blocks) for one in weighted]
+            weighed = preferred(weighted, with_clock_m, AS_GOOD * min(with_clock_m))
+            tried_m[weighed.name] = error_m(weighed, weights[kind], persons)
+            timed += [weighed] * (min(with_clock_m) < limit_m)
+    if not timed:
+        return Chosen(simplest, tried_m, errors_m[simplest.name])
+    kind = _simplest(timed, [tried_m[kind.name] for kind in timed])
+    return Chosen(kind, tried_m, by_weight_m(kind))
+
+
+def clock_limit_m(least_m: float) -> float:
+    """The error [m] that a clock must go below, if the least one without a clock is this."""
+    return min(CLOCK_ERROR_SHARE * least_m, least_m - AS_GOOD_M)
+
+
+def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
+    """The first of the kinds whose error is as good as the least of theirs."""
+    return preferred(kinds, errors_m, max(AS_GOOD * min(errors_m), min(errors_m) + AS_GOOD_M))

@@ -27,9 +27,10 @@ from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP
+from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, rows_of
 from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
+from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
 from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration
@@ -45,8 +46,9 @@ from service.learning.division import (
     via_points_never_reached,
 )
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
+from service.learning.methods.clock import Tempo, paired, remark_on, stage_clock_of
 from service.learning.methods.held_out import held_out_takes
-from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, LEAST_TURN_RAD, POSITIONS, refit
+from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, CLOCKS, LEAST_TURN_RAD, POSITIONS, clock_limit_m, refit
 from service.learning.methods.weights import WEIGHTS, chosen
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, Weights, persons_of
 from service.learning.regions import blocks_of
@@ -60,6 +62,8 @@ LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for 
 CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
 SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the way to a corner that was demonstrated
 UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration has
+KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the clock at which it is known
+CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
@@ -79,9 +83,9 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 
 class Samples(NamedTuple):
-    """The samples that are learned from: their rows in each demonstration, inputs (N, 2 + K),
-    outputs (N, OUTPUTS), and the numbers (N,) of their demonstrations, of which the first `new` are
-    held out and judged.
+    """The samples that are learned from: their rows in each demonstration, inputs (N, 2 + K), with
+    a clock (N, 2 + K + 1), outputs (N, OUTPUTS), and the numbers (N,) of their demonstrations, of
+    which the first `new` are held out and judged.
     """
 
     encoded: Sequence[Encoded]
@@ -90,10 +94,11 @@ class Samples(NamedTuple):
     outputs: Vector
     owner: Indices
     new: int
+    clock: TaskClock | None = None
 
     @classmethod
     def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
-        """The samples of demonstrations; the first `new` ones are no earlier ones."""
+        """The samples of demonstrations, of which the first `new` are new, without a clock."""
         count = len(encoded[0].stages)
         counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
         each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
@@ -104,6 +109,15 @@ class Samples(NamedTuple):
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
         return cls(encoded, each, inputs_of(shares, labels, count), outputs, owner, new)
 
+    def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
+        """The samples with a clock as the last input."""
+        times = [
+            tempo.in_stages(rows_of(clock, one.stages), one.labels)[rows]
+            for tempo, one, rows in zip(tempos, self.encoded, self.rows, strict=True)
+        ]
+        inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
+        return self._replace(inputs=inputs, clock=clock)
+
     def best(self, weight: float) -> Hyperparameters:
         """The hyper-parameters of this weight with the least error of held-out demonstrations."""
         errors_m = {
@@ -113,16 +127,16 @@ class Samples(NamedTuple):
         }
         return min(errors_m, key=errors_m.__getitem__)
 
-    def held_out(self, ell: float, noises: Sequence[float], weight: float) -> Vector:
-        """The tool's errors (J, N, 3) [m] at the samples of held-out new demonstrations, with these
-        noises (J,) and this weight.
+    def held_out(self, ell: float, noises: Sequence[float], weight: float, block_of: Indices | None = None) -> Vector:
+        """The tool's errors (J, N, 3) [m] at the samples of new demonstrations, with these noises
+        (J,) and this weight. Each demonstration is held out, or its block (H,).
         """
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
-        is_new = self.owner < self.new
+        is_new, held_out = self.owner < self.new, self.owner if block_of is None else block_of[self.owner]
         roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None]
         # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
         kernel, targets = np.exp(-ell * squares) / (roots * roots.T), (self.outputs - PRIOR) / roots
-        missed = roots * held_out_residuals(kernel, np.array(noises), self.owner, lambda _: targets)
+        missed = roots * held_out_residuals(kernel, np.array(noises), held_out, lambda _: targets)
         found = (self.outputs - missed)[:, is_new]
         errors = np.empty((*found.shape[:2], 3))
         for h, (one, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
@@ -144,11 +158,31 @@ class Samples(NamedTuple):
             representation="dense",
         )
         at, shares = self._known([one for i, one in enumerate(self.encoded) if i not in without])
+        if self.clock is not None:
+            at, shares = self._timed(at, shares, self.clock)
         wanted = np.column_stack([shares, np.zeros((len(at), OUTPUTS - 1))])
         known = Gaussians(wanted, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(at), 1, 1)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)
             return primitive.adapt(at, known, tolerance=0.0)
+
+    def _timed(self, at: Vector, shares: Vector, clock: TaskClock) -> tuple[Vector, Vector]:
+        """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
+
+        Where a clock runs on, the tool may still be on its way when the hands are at the end of a
+        stage, so it is known there when the clock ends; and at the begin of a stage when the clock
+        begins. All else is known at any time.
+        """
+        moves = self.encoded[0].stages["square"][at[:, 2:].argmax(axis=1)] > STAYS
+        ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
+        found = [
+            (row, share, time)
+            for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
+            for time in KNOWN_TIMES
+            if clock.waits or not (is_end or is_begin) or time == float(is_end)
+        ]
+        rows, kept, times = (np.array(column) for column in zip(*found, strict=True))
+        return np.column_stack([rows, clock.weight * clock.longest_s * times]), kept
 
     @staticmethod
     def _known(shown: Sequence[Encoded]) -> tuple[Vector, Vector]:
@@ -214,27 +248,34 @@ class _Prediction(NamedTuple):
     belief: Vector
     errors: Vector
     inputs: Vector
+    tempos: Vector  # (T, 3) as in `Placed.mean`
 
     @classmethod
-    def of(cls, one: Encoded, placed: Placed, delay_s: float, step: int) -> Self:
+    def of(
+        cls, one: Encoded, placed: Placed, delay_s: float, tempo: Tempo | None, clock: TaskClock | None, step: int
+    ) -> Self:
         """The prediction at one of every `step` samples."""
         belief = np.zeros((len(one.tool), MOST_STAGES))
         recognised(one.moving, one.period_s, placed.stages, belief)
         hands = one.moving[:, 0]
         if delay_s > 0.0:
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
+        times = np.zeros(len(hands))
+        if clock is not None and tempo is not None:
+            times = tempo.in_stages(rows_of(clock, placed.stages), belief.argmax(axis=1))
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
-        belief, stillness = belief[::step], one.stillness[::step]
-        errors = one.tool[::step] - placed.mean(hands, belief, stillness)
+        belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
+        errors = one.tool[::step] - placed.mean(hands, belief, tempos)
         found = np.empty((len(hands), 4))
-        along_all(hands, stillness, belief.argmax(axis=1), placed.stages, found)
+        along_all(hands, np.ascontiguousarray(tempos[:, :2]), belief.argmax(axis=1), placed.stages, found)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
-        return cls(hands, belief, errors, np.hstack([found[:, :2], beside]))
+        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * times[:, None]])]
+        return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
         """Errors (M, 6) at about `count` samples: shares (2,), stage, and error (3,) [m]."""
         rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
-        stages = self.inputs[rows, 2:].argmax(axis=1)
+        stages = self.belief[rows].argmax(axis=1)
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
 
 
@@ -251,6 +292,7 @@ class Candidate(NamedTuple):
     samples: Samples
     off: Vector
     parameters: Hyperparameters
+    tempos: Sequence[Tempo] = ()  # needed with a clock
 
     @classmethod
     def of(
@@ -269,12 +311,21 @@ class Candidate(NamedTuple):
         samples = Samples.of(encoded, len(new))
         return cls(task, delay_s, encoded, samples, _off_m(encoded), samples.best(weight))
 
+    def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
+        """The candidate with a clock as the last input, and the best parameters with it."""
+        samples = self.samples.clocked(tempos, clock)
+        return self._replace(samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos)
+
     def without(self, block: Sequence[int], primitive: KMP, step: int = 1) -> dict[int, _Prediction]:
         """The predictions, by a primitive without them, of a block's demonstrations at one of every
         `step` samples.
         """
-        placed = {h: Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS) for h in block}
-        return {h: _Prediction.of(self.encoded[h], placed[h], self.delay_s, step) for h in block}
+        clock, found = self.samples.clock, dict[int, _Prediction]()
+        for h in block:
+            placed = Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS, clock)
+            tempo = None if clock is None else self.tempos[h]
+            found[h] = _Prediction.of(self.encoded[h], placed, self.delay_s, tempo, clock, step)
+        return found
 
     def squares(self, blocks: Sequence[Sequence[int]]) -> Vector:
         """The mean squared errors (H,) [m²] of the held-out demonstrations, at some samples."""
@@ -329,6 +380,8 @@ class Staged:
         blocks = blocks_of(persons_of(takes))
         best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
         task, encoded, off = best.task, best.encoded, best.off
+        if best.samples.clock is not None:
+            remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each stage")
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
             progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
@@ -343,13 +396,14 @@ class Staged:
             off,
             np.concatenate(errors),
             delay.mean_s,
+            clock=best.samples.clock,
         )
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(task, encoded[h].at, off, model.primitive, others)
+                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, model.clock)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
@@ -372,8 +426,8 @@ class Staged:
     def _chosen(
         self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
     ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
-        """The candidate that predicts held-out new takes best, its delay, the errors [m] of the ways
-        in which the tool may turn and the name of the one taken, and of the weights.
+        """The candidate that predicts held-out new takes best, its delay, the errors [m] of all that
+        was tried, the name of what is taken, and the weights.
         """
         new, earlier = (
             [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
@@ -389,7 +443,13 @@ class Staged:
         taken = preferred(list(tried_m), list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
         if taken in turning:
             best, delay, tried_m[taken] = with_delay(turning[taken], new, blocks)
-        if not turning:
+        clocked = _with_clocks(best, taught, progress)
+        errors_m = {taken + name: math.sqrt(one.squares(blocks).mean()) for name, one in clocked.items()}
+        if errors_m and min(errors_m.values()) < clock_limit_m(tried_m[taken]):
+            best = clocked[preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))]
+            taken = next(name for name, one in zip(errors_m, clocked.values(), strict=True) if one is best)
+        tried_m |= errors_m
+        if len(tried_m) == 1:
             tried_m = {}
         if not earlier:
             return best, delay, tried_m, taken, None
@@ -401,6 +461,9 @@ class Staged:
             )
             for weight in WEIGHTS
         }
+        if (clock := best.samples.clock) is not None:
+            tempos = [Tempo.of(take.demonstration) for take in taught.all]
+            weighted = {weight: one.clocked(tempos[: len(one.encoded)], clock) for weight, one in weighted.items()}
         weight, weights = chosen({one: math.sqrt(it.squares(blocks).mean()) for one, it in weighted.items()})
         return weighted[weight], delay, tried_m, taken, weights
 
@@ -417,6 +480,34 @@ class Staged:
         return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
 
 
+def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
+    """The candidate with those clocks that may predict clearly better, by the clock's name.
+
+    What is compared here leaves out where the tool is known to be, and holds out the blocks of
+    `paired`; if a skill is refined, the new takes show the pace that counts, and are held out one
+    by one.
+    """
+    persons = persons_of(taught.new)
+    block_of = persons if taught.earlier else paired(persons)
+    if not block_of.any():
+        return {}
+
+    def error_m(samples: Samples) -> float:
+        return min(map(rms, samples.held_out(best.parameters.ell, NOISES, 1.0, block_of)))
+
+    tempos = [Tempo.of(take.demonstration) for take in taught.new]
+    limit_m, out = clock_limit_m(error_m(best.samples)), dict[str, Candidate]()
+    stages, labels = [one.stages for one in best.encoded], [one.labels for one in best.encoded]
+    for waits, name in CLOCKS.items():
+        progress(f"trying {POSITIONS.name}{name}")
+        clock = stage_clock_of(tempos, stages, labels, waits=waits)
+        tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
+        errors_m = [error_m(best.samples.clocked(tempos, one)) for one in tried]
+        if min(errors_m) < limit_m:
+            out[name] = best.clocked(tempos, preferred(tried, errors_m, AS_GOOD * min(errors_m)))
+    return out
+
+
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
     """The distances (K, 2) [m] of the hands from their segments, root mean square, in each stage;
     in all stages where no demonstration has this one.
@@ -428,7 +519,7 @@ def _off_m(encoded: Sequence[Encoded]) -> Vector:
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
     """The record of a take with the covariance from other blocks' errors, in `placed`."""
-    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, one.stillness, strict=True)
+    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.tempos, strict=True)
     return HeldOut(
         take,
         found.errors,

@@ -14,6 +14,7 @@ import numpy as np
 
 from service.core.intake.hand_estimator import STILL
 from service.core.numerics import MOTION_STEP_S
+from service.core.skill.model import NO_CLOCK
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Earlier, Prediction, Skill
 from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
@@ -74,6 +75,7 @@ class Rival(Skill):
         belief: Array | None = None,
         period_s: float = 0.0,
         lead_s: float = 0.0,
+        clock: Array = NO_CLOCK,
     ) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
         said = self.says(hands.reshape(6), velocities.reshape(6), accelerations.reshape(6))

@@ -1,0 +1,142 @@
+"""Clock of a task, or of each of its stages: how long ago the hands began it.
+
+The clock starts when a hand first moves faster than CLOCK_START_MPS after rest, and advances at a
+rate r that follows its goal g with the time constant CLOCK_LAG_S:
+
+    dt/dt' = r,   dr/dt' = (g - r) / CLOCK_LAG_S
+
+* g = 1 for a clock that runs; g = 1 - s for one that waits, with the stillness s of the hand that
+  is less still.
+* g = 0 once t has reached `longest_s`, the end of the longest demonstration.
+* g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. The next motion
+  starts the clock anew if the hands are where demonstrations begin, or if the task may be over (t
+  at least `over_s`). Elsewhere the user has paused, and the clock goes on.
+* If the task has stages, the clock starts anew in each: it is 0 from a change of the most probable
+  stage to the next motion.
+
+So the clock is continuous while hands move, and constant where nothing was demonstrated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.compiled import compiled
+from service.core.frame import Records, Vector
+from service.core.numerics import MEMORY_STEP_S
+from service.core.skill import MAX_SKILL_DISTANCE_M
+from service.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS
+from service.core.vectors import norm, squared_distance
+
+CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE = range(5)  # entries of `task_clock` in the state
+WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, NEAR_AT = 0, 2, 3, 4, 5  # entries of `TaskClock.numbers`
+LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
+
+
+class TaskClock(NamedTuple):
+    """Parameters of the clock that is an input of a skill."""
+
+    waits: bool  # true if the clock waits while both hands rest
+    weight: float  # as an input, a second counts as this length [m], or this share of a stage
+    longest_s: float  # the clock stops there
+    over_s: float  # from here on the task may be over
+    rest_s: float  # a longer rest ends the task, or is a pause
+    near_m: float  # hands within this distance of `begin` are where demonstrations begin
+    begin: tuple[float, ...]  # (6,) [m] mean hands at the begin of the demonstrations
+
+    @property
+    def numbers(self) -> Vector:
+        """The parameters (12,) as one array, as compiled functions and a skill's file have them."""
+        return np.array([*self[:-1], *self.begin], np.float64)
+
+    @staticmethod
+    def of(numbers: Iterable[float]) -> TaskClock:
+        """The clock with these `numbers`. Raises ValueError if they are no clock's."""
+        values = [float(number) for number in numbers]
+        if len(values) != 12:
+            raise ValueError(f"task_clock has {len(values)} numbers, 12 needed")
+        waits, weight, longest_s, over_s, rest_s, near_m, *begin = values
+        largest = (1.0, MOST_CLOCK_WEIGHT, *3 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
+        if not all(abs(value) <= most for value, most in zip(values, largest, strict=True)) or min(values[:6]) < 0.0:
+            raise ValueError(f"task_clock is {values}: numbers from 0 to {largest[:6]} and a begin [m] needed")
+        return TaskClock(waits > 0.0, weight, longest_s, over_s, rest_s, near_m, tuple(begin))
+
+
+@compiled
+def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> None:
+    """Advance a clock (5,) by one period Δ, for hands (6,) [m] whose faster one has this speed
+    [m/s], and whose less still one this stillness; see the equations of this module.
+
+    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may go on resting, and
+    the stage. `rows` (K, 12) are `TaskClock.numbers` in each stage; a task without stages has one.
+    """
+    numbers = rows[stage]
+    if clock[CLOCK_STAGE] != stage:
+        clock[:] = 0.0
+        clock[CLOCK_STAGE] = stage
+    if speed > CLOCK_START_MPS:
+        if clock[REST_LEFT_S] <= 0.0:
+            near, square = True, numbers[NEAR_AT] ** 2
+            for side in range(2):
+                here = slice(3 * side, 3 * side + 3)
+                near = near and squared_distance(hands[here], numbers[6:][here]) <= square
+            if near or clock[CLOCK_S] >= numbers[OVER_AT]:
+                clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
+        clock[REST_LEFT_S] = numbers[REST_AT]
+    else:
+        clock[REST_LEFT_S] = max(clock[REST_LEFT_S] - period_s, 0.0)
+    goal = 0.0
+    if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
+        goal = 1.0 - still if numbers[WAITS_AT] > 0.0 else 1.0
+    clock[CLOCK_RATE] += (1.0 - math.exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
+    clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
+    clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
+
+
+@compiled
+def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
+    """Advance the clock in the state by `count`, with the speeds of the hands `sides` (2,) without
+    their tremor, in the most probable stage.
+    """
+    state, hands, speed, still, stage = states[0], np.empty(6), 0.0, 1.0, 0
+    for i in range(2):
+        hands[3 * i : 3 * i + 3] = state.hands[sides[i], 0]
+        speed = max(speed, norm(state.hand_velocity_lowpass[sides[i]]))
+        still = min(still, state.hand_stillness[sides[i]])
+    for k in range(len(rows)):
+        if state.stage_belief[k] > state.stage_belief[stage]:
+            stage = k
+    count(hands, speed, still, passed_s, stage, rows, state.task_clock)
+
+
+@compiled
+def _counted(moving: Vector, stages: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector) -> None:
+    clock = np.zeros(5)
+    for t in range(len(moving)):
+        for step in range(steps if t else 0):
+            now = moving[t - 1] + (step + 1) / steps * (moving[t] - moving[t - 1])
+            count(now[:6], now[6], now[7], period_s / steps, stages[t], rows, clock)
+        out[t] = clock[CLOCK_S]
+
+
+def counted(
+    hands: Vector,
+    speeds: Vector,
+    stillness: Vector,
+    period_s: float,
+    rows: Vector,
+    stages: NDArray[np.int64] | None = None,
+) -> Vector:
+    """The clock (T,) [s] along hands (T, 6) [m] with the speeds (T,) [m/s] of the faster one and
+    the stillness (T,) of the less still one, in these stages (T,); `rows` are those of `count`.
+    """
+    out, steps = np.empty(len(hands)), max(1, math.ceil(period_s / MEMORY_STEP_S))
+    if stages is None:
+        stages = np.zeros(len(hands), np.int64)
+    _counted(np.column_stack([hands, speeds, stillness]), stages, period_s, steps, rows, out)
+    return out

@@ -1,0 +1,131 @@
+"""Clock of a task along demonstrations, as the core would count it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.contract.messages import BASE, PoseStamped
+from service.core.frame import Records, Vector, blank, state_layout
+from service.core.intake.stage import Intake
+from service.core.skill.staged import rows_of
+from service.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
+from service.core.skill.tuning import CLOCK_START_MPS
+from service.learning.demonstration import Demonstration
+from service.learning.regions import blocks_of
+from service.settings.config import Settings
+
+LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
+LEAST_NEAR_M = 0.1  # hands within this distance of where demonstrations begin have returned there
+NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of a demonstration's hands
+MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
+LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
+FIRST_STAMP_NS = 1_000_000_000
+
+
+class Tempo(NamedTuple):
+    """Hands (T, 6) [m], their speeds (T, 2) [m/s] without tremor, and their stillness (T, 2) along
+    a demonstration, as the core's intake estimates them.
+    """
+
+    hands: Vector
+    speeds: Vector
+    stillness: Vector
+    period_s: float
+
+    @classmethod
+    def of(cls, demonstration: Demonstration) -> Self:
+        """The tempo of a demonstration, sample by sample."""
+        step = max(1, math.floor(1.0 / (MOST_TEMPO_HZ * demonstration.period_s)))
+        settings = Settings()
+        intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
+        intake.begin(state)
+        state["tick"], ticked, found = 0, 0, []
+        since_ns = demonstration.stamps_ns - demonstration.stamps_ns[0] + FIRST_STAMP_NS
+        left, right = demonstration.left[::step].tolist(), demonstration.right[::step].tolist()
+        for stamp_ns, *both in zip(since_ns[::step].tolist(), left, right, strict=True):
+            tick = round((stamp_ns - FIRST_STAMP_NS) * 1e-9 / settings.period_s)
+            intake.advance(state, tick - ticked)
+            ticked = tick
+            for side, row in enumerate(both):
+                intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
+            found.append(np.hstack([np.linalg.norm(state["hand_velocity_lowpass"], axis=1), state["hand_stillness"]]))
+        at, known = demonstration.seconds, (since_ns[::step] - FIRST_STAMP_NS) * 1e-9
+        columns = np.stack([np.interp(at, known, column) for column in np.array(found).T], axis=1)
+        return cls(demonstration.hands, columns[:, :2], columns[:, 2:], demonstration.period_s)
+
+    def seconds(self, clock: TaskClock, alone: int | None) -> Vector:
+        """The clock (T,) [s]; `alone` is the side of the only hand that matters."""
+        hands, sides = self.hands, slice(None) if alone is None else [alone]
+        if alone is not None:
+            hands = np.tile(hands[:, 3 * alone :][:, :3], 2)
+        return counted(
+            hands,
+            self.speeds[:, sides].max(axis=1),
+            self.stillness[:, sides].min(axis=1),
+            self.period_s,
+            clock.numbers[None],
+        )
+
+    def in_stages(self, rows: Vector, stages: NDArray[np.int64]) -> Vector:
+        """The clock (T,) [s] in these stages (T,), with the parameters `rows` of `rows_of`."""
+        return counted(self.hands, self.speeds.max(axis=1), self.stillness.min(axis=1), self.period_s, rows, stages)
+
+    def longest_rest_s(self, alone: int | None) -> float:
+        """The longest time [s] without motion after the first motion, also at the end."""
+        sides = slice(None) if alone is None else [alone]
+        moving = np.flatnonzero(self.speeds[:, sides].max(axis=1) > CLOCK_START_MPS)
+        if not len(moving):
+            return 0.0
+        return float(np.diff([*moving, len(self.speeds)]).max()) * self.period_s
+
+
+def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
+    """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
+    begins = np.array([one.hands[0] if alone is None else np.tile(one.hands[0, 3 * alone :][:3], 2) for one in tempos])
+    begin = begins.mean(axis=0)
+    off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
+    near_m = max(LEAST_NEAR_M, NEAR_TIMES * off_m)
+    rest_s = LONGER * max(one.longest_rest_s(alone) for one in tempos)
+    free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, near_m, tuple(begin.tolist()))
+    ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
+    return free._replace(longest_s=max(ends_s), over_s=min(ends_s), rest_s=max(rest_s, 1.0))
+
+
+def stage_clock_of(
+    tempos: Sequence[Tempo], placed: Sequence[Records], labels: Sequence[NDArray[np.int64]], *, waits: bool
+) -> TaskClock:
+    """The clock of the stages (K,) of demonstrations with these tempos and labels (T,), with a
+    weight of 1. Only where a stage begins does a rest start it anew.
+    """
+    rest_s = LONGER * max(one.longest_rest_s(None) for one in tempos)
+    free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, LEAST_NEAR_M, (0.0,) * 6)
+    ends_s = [
+        float(tempo.in_stages(rows_of(free, stages), label).max())
+        for tempo, stages, label in zip(tempos, placed, labels, strict=True)
+    ]
+    return free._replace(longest_s=max(ends_s), over_s=LONGEST_CLOCK_S, rest_s=max(rest_s, 1.0))
+
+
+def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The numbers (H,) of blocks of at least two takes that follow each other, by the takes'
+    persons (H,). Such takes are often of one person, whose pace others need not have. All are 0 if
+    there would be fewer than LEAST_PAIRS blocks.
+    """
+    out, blocks = np.zeros_like(persons), blocks_of(persons, len(persons) // 2)
+    for number, block in enumerate(blocks if len(blocks) >= LEAST_PAIRS else ()):
+        out[block] = number
+    return out
+
+
+def remark_on(clock: TaskClock) -> str:
+    """The remark on a skill that has a clock."""
+    rests = "waits while the hands rest" if clock.waits else "runs on while the hands rest"
+    return (
+        f"the tool partly follows a timetable: a clock, which starts when a hand moves faster than {CLOCK_START_MPS} "
+        f"m/s, predicts it better. It {rests}, and stops after {clock.longest_s:.1f} s"
+    )

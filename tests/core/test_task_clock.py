@@ -1,0 +1,197 @@
+"""The clock of a task: when it starts, waits, ends and starts anew; that it is learned as it counts
+live; and that `learn` takes it for a timetable and for nothing else.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.contract.requests import ViaPoint
+from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.staged import StagedKMP
+from service.core.skill.task_clock import (
+    CLOCK_CHANGE,
+    CLOCK_RATE,
+    CLOCK_S,
+    REST_LEFT_S,
+    TaskClock,
+    count,
+    counted,
+)
+from service.learning.demonstration import Demonstration
+from service.learning.learn import learn
+from service.learning.methods.clock import Tempo, clock_of
+from service.learning.records import Figures
+from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+
+RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
+WAITS = RUNS._replace(waits=True)
+HOME, AWAY = np.array(RUNS.begin), np.array(RUNS.begin) + 0.5
+PERIOD_S = 0.01
+
+
+def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S) -> np.ndarray:
+    """The clock (T, 5) while the hands move or rest for these times at these positions."""
+    state, out = np.zeros(5), []
+    for what, lasts_s, hands in parts:
+        for _ in range(round(lasts_s / period_s)):
+            moves = what == "move"
+            count(hands, 0.3 * moves, 1.0 - moves, period_s, 0, clock.numbers[None], state)
+            out.append(state.copy())
+    return np.array(out)
+
+
+@pytest.mark.parametrize(
+    ("clock", "parts", "seconds"),
+    [
+        (RUNS, [("rest", 3.0, HOME)], 0.0),
+        (RUNS, [("rest", 3.0, HOME), ("move", 1.0, AWAY)], 0.9),
+        (RUNS, [("move", 1.0, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 2.9),
+        (WAITS, [("move", 1.0, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 1.9),
+        (RUNS, [("move", 20.0, AWAY)], 5.1),  # it ends with the longest demonstration
+        (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY)], 3.0),  # a pause, not the end of the task
+        (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
+        (WAITS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 1.9),
+        (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, HOME), ("move", 1.0, HOME)], 0.9),  # begun again
+        (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),  # the task was over
+        (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),  # too short a rest
+    ],
+)
+def test_a_clock_counts_from_the_first_motion(
+    clock: TaskClock, parts: list[tuple[str, float, np.ndarray]], seconds: float
+) -> None:
+    assert along(clock, *parts)[-1, CLOCK_S] == pytest.approx(seconds, abs=0.06)
+
+
+@pytest.mark.parametrize("clock", [RUNS, WAITS])
+def test_its_rate_and_change_are_its_derivatives(clock: TaskClock) -> None:
+    found = along(clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3)
+    assert np.abs(np.diff(found[:, CLOCK_S]) / 1e-3 - found[1:, CLOCK_RATE]).max() < 1e-9
+    assert np.quantile(np.abs(np.diff(found[:, CLOCK_RATE]) / 1e-3 - found[:-1, CLOCK_CHANGE]), 0.99) < 0.1
+    assert found[:, REST_LEFT_S].min() >= 0.0
+
+
+@pytest.mark.parametrize("rate_hz", [24, 100, 500])
+def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
+    times = np.arange(0.0, 4.0, 1.0 / rate_hz)
+    speeds, stillness = np.where(times > 1.0, 0.3, 0.0), np.where(times > 1.0, 0.0, 1.0)
+    shown = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])
+    live = along(RUNS, ("rest", 1.0, AWAY), ("move", 3.0, AWAY), period_s=0.002)[:, CLOCK_S]
+    assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - shown).max() < 0.05
+
+
+def test_numbers_of_a_file_that_are_no_clock_are_refused() -> None:
+    assert TaskClock.of(RUNS.numbers) == RUNS
+    for bad in (RUNS.numbers[:-1], -RUNS.numbers, np.full(12, np.nan), np.full(12, 1e9)):
+        with pytest.raises(ValueError, match="task_clock"):
+            TaskClock.of(bad)
+
+
+def takes(count: int, *, timetable: bool) -> list[Demonstration]:
+    """Hands that come at different speeds and then rest; the tool moves on while they rest, or goes
+    with the left hand.
+    """
+    out, times = [], np.arange(0.0, 7.0, 0.02)
+    for i in range(count):
+        rng = np.random.default_rng(i)
+        share = np.clip((times - 0.4 - 0.3 * rng.random()) / rng.uniform(0.7, 1.6), 0.0, 1.0)
+        began = times - times[np.argmax(share > 0)]
+        way = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
+        left = np.array((0.6, -0.2, 0.2)) + (1.0 - way) * (0.0, 0.25, 0.0) + rng.normal(0.0, 0.01, 3)
+        right = np.array((0.7, 0.3, 0.2)) + 0.0 * left + rng.normal(0.0, 0.01, 3)
+        late = np.clip((began - 4.0) / 1.5, 0.0, 1.0)[:, None] if timetable else way
+        tool = np.array((0.5, 0.1, 0.4)) + late * np.array((0.0, 0.3, 0.1)) + 0.0 * left
+        turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+        poses = [np.hstack([at + rng.normal(0.0, 0.0005, at.shape), turn]) for at in (left, right, tool)]
+        out.append(Demonstration((times * 1e9).astype(np.int64), poses[0], poses[1], poses[2]))
+    return out
+
+
+def clock(skill: StoredSkill) -> TaskClock | None:
+    assert isinstance(skill.model, HandsKMP)
+    return skill.model.clock
+
+
+def test_the_intake_finds_when_hands_begin_to_move() -> None:
+    for shown in takes(3, timetable=True):
+        moves = np.linalg.norm(np.gradient(shown.left[:, :3], shown.period_s, axis=0), axis=1) > 0.1
+        tempo = Tempo.of(shown)
+        starts_s = shown.seconds[np.argmax(tempo.seconds(clock_of([tempo], None, waits=False), None) > 0.0)]
+        assert shown.seconds[np.argmax(moves)] - 0.1 < starts_s < shown.seconds[np.argmax(moves)] + 0.2
+
+
+def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
+    skill = learn(takes(6, timetable=True))
+    figures = msgspec.json.decode(skill.figures, type=Figures)
+    found = clock(skill)
+    assert found is not None
+    assert not found.waits
+    assert figures.taken.endswith("and a clock")
+    assert figures.all.error_mm < 30.0
+    assert any("timetable" in text for text in figures.warnings)
+    assert clock(learn(takes(6, timetable=False))) is None
+    back = decoded(skill.file, origin="again")
+    assert clock(back) == clock(skill)
+    hands, still = takes(1, timetable=True)[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
+    there = [one.predict(hands, still, still, clock=np.array([6.0, 1.0, 0.0])) for one in (skill, back)]
+    np.testing.assert_array_equal(there[0].position, there[1].position)
+    early = skill.predict(hands, still, still, clock=np.array([3.0, 1.0, 0.0]))
+    assert np.linalg.norm(there[0].position - early.position) > 0.15
+    moved = skill.predict(hands, still, still, clock=np.array([4.8, 1.0, 0.0]))
+    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.01, 0.01))
+    np.testing.assert_allclose(moved.velocity, (ahead.position - behind.position) / 0.02, atol=2e-3)
+
+
+def named(count: int, *, timetable: bool) -> list[Demonstration]:
+    """These takes, with the via-points at which they begin and end."""
+    out = []
+    for one in takes(count, timetable=timetable):
+        rows = [
+            {"name": name, "left": one.left[at, :3].tolist(), "right": one.right[at, :3].tolist()}
+            | {"tool": one.tool[at, :3].tolist()}
+            for name, at in (("start", 0), ("end", -1))
+        ]
+        out.append(one._replace(places=msgspec.convert(rows, tuple[ViaPoint, ...])))
+    return out
+
+
+def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
+    shown = named(6, timetable=True)
+    skill = learn(shown)
+    figures = msgspec.json.decode(skill.figures, type=Figures)
+    assert isinstance(skill.model, StagedKMP)
+    assert skill.model.clock is not None
+    assert not skill.model.clock.waits
+    assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
+    assert any("anew in each stage" in text for text in figures.warnings)
+    plain = learn(named(6, timetable=False)).model
+    assert isinstance(plain, StagedKMP)
+    assert plain.clock is None
+    back = decoded(skill.file, origin="again")
+    assert isinstance(back.model, StagedKMP)
+    assert back.model.clock == skill.model.clock
+    hands, still = shown[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
+    early, moving, late = (skill.predict(hands, still, still, clock=np.array([t, 1.0, 0.0])) for t in (3.0, 4.8, 7.0))
+    assert np.linalg.norm(late.position - shown[0].tool[-1, :3]) < 0.02
+    assert np.linalg.norm(late.position - early.position) > 0.2
+    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.02, 0.02))
+    np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
+
+
+def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
+    rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(5), []
+    for speed, stage in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
+        count(AWAY, speed, float(speed == 0.0), PERIOD_S, stage, rows, state)
+        seconds.append(state[CLOCK_S])
+    assert seconds[199] == pytest.approx(1.9, abs=0.05)
+    assert not any(seconds[200:300])
+    assert seconds[-1] == pytest.approx(0.9, abs=0.05)
+
+
+def test_a_file_with_a_broken_clock_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    skill = learn(takes(6, timetable=True))
+    monkeypatch.setattr(TaskClock, "numbers", np.full(12, np.inf))
+    with pytest.raises(SkillError, match="task_clock"):
+        decoded(with_file(skill).file, origin="broken")
