@@ -426,8 +426,8 @@ class Staged:
     def _chosen(
         self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
     ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
-        """The candidate that predicts held-out new takes best, its delay, the errors [m] of all that
-        was tried, the name of what is taken, and the weights.
+        """The candidate that predicts held-out new takes best, its delay, the errors [m] of all
+        candidates, the name of the one taken, and the weights.
         """
         new, earlier = (
             [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
