@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from service.core.skill.stages import (
     PLACED,
     SEEN,
     along_both,
+    elsewhere,
     expected,
     off_all,
     predicted,
@@ -40,6 +41,16 @@ from service.core.skill.via_points import pulls_through
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
+
+
+class Unknown(NamedTuple):
+    """What the tool's position may be where a skill was never shown it: its standard deviation on
+    each axis [m] away from all demonstrations, and the covariances (N, 3, 3) [m²] of the tool at
+    the N via-points in the demonstrations, for via-points that are not known in a scene.
+    """
+
+    std_m: float
+    scatters: Vector
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,16 +80,28 @@ class Placed(Immutable):
             frozen(part)
 
     @classmethod
-    def of(cls, task: Task, at: NamedViaPoints, off: Vector, primitive: KMP, errors: Vector) -> Placed:
+    def of(
+        cls,
+        task: Task,
+        at: NamedViaPoints,
+        off: Vector,
+        primitive: KMP,
+        errors: Vector,
+        unknown: Unknown | None = None,
+    ) -> Placed:
         """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
         from their segments, root mean square; `errors` (M, 6) those of the primitive.
         """
-        sizes = structured(1, PLACED)
+        sizes, stages = structured(1, PLACED), task.stages(at, off)
+        if unknown is not None:
+            sizes["unknown_std"] = unknown.std_m
+            scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
+            stages["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
         sizes["scale"], sizes["likeness"] = scale_of(primitive), likeness(primitive)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
         along, stage = primitive.centres[:, :2], primitive.centres[:, 2:].argmax(axis=1)
         rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS)])
-        return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), NO_PULLS)
+        return cls(stages, sizes, rows, np.array(errors, order="C"), NO_PULLS)
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
@@ -118,7 +141,7 @@ class Placed(Immutable):
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
         tools = self._tools(hands, still, belief, NO_PULLS)
-        scatter(hands, still, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
+        scatter(hands, still, belief, self.stages, tools, self.errors, self.sizes[0], out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
@@ -143,6 +166,7 @@ class StagedKMP:
     * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
     * `errors` (M, 6): inputs and the tool's errors [m] in held-out demonstrations, see `Placed`.
     * `delay_s`: delay of the demonstrated tool behind the hands.
+    * `unknown`: scatter of what was not shown; None: as where it was shown.
     """
 
     primitive: KMP
@@ -152,6 +176,7 @@ class StagedKMP:
     errors: Vector
     delay_s: float
     via_points: tuple[ViaPoint, ...] = ()
+    unknown: Unknown | None = None
 
     measure: ClassVar[str] = "the distance of a hand from its segments"
     formats: ClassVar[tuple[int, ...]] = (5,)
@@ -184,7 +209,7 @@ class StagedKMP:
     def _unpulled(self) -> Placed:
         """Stages between the via-points in force, without pulls."""
         at = self.nominal.moved(self.via_points)
-        return Placed.of(self.task, at, self.off, self.primitive, self.errors)
+        return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.unknown)
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
@@ -203,6 +228,10 @@ class StagedKMP:
         errors = at.errors if known is None else NO_ERRORS
         gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
+
+    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+        at = self.placed
+        return elsewhere(now, stillness, period_s, belief, unprimed, at.stages, at.sizes, at.rows)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names))
@@ -257,7 +286,10 @@ class StagedKMP:
         return replace(self, via_points=())
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        return self.task.to_arrays() | {
+        out = self.task.to_arrays()
+        if self.unknown is not None:
+            out |= {"unknown_std": np.array(self.unknown.std_m), "scatters": self.unknown.scatters}
+        return out | {
             "nominal": self.nominal.at,
             "off_ways": self.off,
             "seen": np.ascontiguousarray(self.errors[:, :3]),
@@ -278,5 +310,8 @@ class StagedKMP:
         check_shapes(arrays, shapes)
         errors = np.hstack([arrays["seen"], arrays["errors"]])
         off, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
-        nominal = NamedViaPoints(task.names, arrays["nominal"])
-        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points)
+        nominal, unknown = NamedViaPoints(task.names, arrays["nominal"]), None
+        if "unknown_std" in arrays:
+            check_shapes(arrays, {"scatters": (count, 3, 3)})
+            unknown = Unknown(float(arrays["unknown_std"]), np.ascontiguousarray(arrays["scatters"], np.float64))
+        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points, unknown)

@@ -26,7 +26,7 @@ from service.learning.division import task_of
 from service.learning.gate import CEILING_M
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
 from service.learning.records import Fitted, Options, Progress, Take, persons_of
-from service.learning.regions import refitted_errors
+from service.learning.regions import local_errors, refitted_errors
 
 AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
@@ -96,6 +96,7 @@ class HandInputs:
         primitive = fit(None)
         held_out = held_out_takes(takes, inputs, fit, progress)
         gate = gate_of(primitive, held_out, kind.order, CEILING_M)
+        errors = None
         if len({take.person for take in takes}) >= LEAST_PERSONS:
             progress("calibrating the covariance")
 
@@ -103,10 +104,10 @@ class HandInputs:
                 others = refit(kind, [takes[i] for i in kept], [inputs[i] for i in kept], points, ell)
                 return HandsKMP(others(None), kind.turned)
 
-            timed = refitted_errors(takes, inputs, refitted)
-            held_out = [one._replace(timed=errors) for one, errors in zip(held_out, timed, strict=True)]
+            timed, errors = local_errors(refitted_errors(takes, inputs, refitted), inputs, takes, primitive)
+            held_out = [one._replace(timed=found) for one, found in zip(held_out, timed, strict=True)]
         return Fitted(
-            HandsKMP(primitive, kind.turned),
+            HandsKMP(primitive, kind.turned, errors),
             held_out,
             gate,
             conductor=kind.alone,

@@ -25,8 +25,8 @@ from kmp.criteria.cross_validation import held_out_residuals, rms
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import Placed, StagedKMP
-from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
+from service.core.skill.staged import Placed, StagedKMP, Unknown
+from service.core.skill.stages import MOST_STAGES, NONE, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.learning.demonstration import Demonstration, lag
@@ -35,7 +35,7 @@ from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, n
 from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import POSITIONS, refit
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, persons_of
-from service.learning.regions import blocks_of
+from service.learning.regions import blocks_of, unknown_std
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
@@ -229,16 +229,24 @@ class Staged:
                 placed = Placed.of(self.task, encoded[h].at, off, primitive, np.empty((0, 6)))
                 predictions[h] = _Prediction.of(encoded[h], placed, delay.mean_s)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
+        unknown = Unknown(unknown_std(takes), _scatters(self.task, encoded))
+        known = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
-            samples.fitted(parameters), self.task, self._nominal(takes), off, np.concatenate(errors), delay.mean_s
+            samples.fitted(parameters),
+            self.task,
+            self._nominal(takes),
+            off,
+            np.concatenate(errors),
+            delay.mean_s,
+            unknown=unknown,
         )
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(self.task, encoded[h].at, off, model.primitive, others)
+                placed = Placed.of(self.task, encoded[h].at, off, model.primitive, others, known)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
@@ -259,6 +267,18 @@ class Staged:
         inputs = [take.hands for take in takes]
         fit = refit(POSITIONS, takes, inputs, self.options.points, None)
         return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
+
+
+def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
+    """The covariances (N, 3, 3) [m²] of the tool at each via-point over the demonstrations; of its
+    offset from the hand, where it follows one.
+    """
+    at = np.array([one.at.at[[one.at.names.index(name) for name in task.names]] for one in encoded])
+    for n, side in enumerate(task.follow.tolist()):
+        if side != NONE:
+            at[:, n, 6:] -= at[:, n, 3 * side : 3 * side + 3]
+    off = at[:, :, 6:] - at[:, :, 6:].mean(axis=0)
+    return np.asarray(np.einsum("dni,dnj->nij", off, off) / max(len(encoded) - 1, 1))
 
 
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
