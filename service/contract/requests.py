@@ -220,6 +220,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     closure: float | None = None  # predicted closure of the gripper, 0 to 1
     stage: tuple[str, ...] = ()  # the via-points at which the stage begins and ends; empty: unknown
     stage_belief: float = 0.0  # probability of that stage
+    error_probability: float | None = None  # probability that the tool belongs more than 10 cm from its target
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
     command_heard: bool = True  # True if somebody subscribes to `joints/command`

@@ -18,7 +18,8 @@ from typing import Self
 import msgspec
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.reader import Summary, make_reader
+from mcap.reader import make_reader
+from mcap.summary import Summary
 
 from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
@@ -242,8 +243,10 @@ class Recording:
         checksums of frames come before the first frame.
         """
         contents, joints = self._summary(), len(self.settings.joints.names)
+        if contents is None:
+            return
         names = channels.keys_by_topic(self.settings.cell, ("state", "frame"))
-        for channel in contents.channels.values() if contents else ():
+        for channel in contents.channels.values():
             if (name := names.get(channel.topic)) is not None:
                 self.recorded_as[name] = layout_in(contents.schemas.get(channel.schema_id), joints, name)
 

@@ -17,8 +17,8 @@ other. The second factor widens a region until it holds on blocks of takes that 
 
 The error probability, that the tool is farther than UNSURE_M from its prediction, follows from the
 quantiles of |e|² / tr C of the published covariances C. The skill is unsure where it is above the
-alarm, the smallest probability that is exceeded at FALSE_ALARMS of the moments at which the tool is
-nearer; or a larger one that is still exceeded at TOLD of those at which it is farther.
+alarm: the smallest probability that is exceeded at FALSE_ALARM_SHARE of the moments at which the
+tool is nearer; or a larger one that is still exceeded at ALARM_SHARE of the other moments.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
 WIDEST = 100.0  # a region's squared radius is widened at most by this factor
 LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as this one
 LEAST_RADIUS = 1e-9  # a squared radius is at least this large
-FALSE_ALARMS, TOLD = 0.12, 0.95  # shares of the right and of the wrong moments at which the skill is unsure
+FALSE_ALARM_SHARE, ALARM_SHARE = 0.12, 0.95  # shares of the right and of the wrong moments at which the skill is unsure
 LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
 ALARMS = (0.005, 0.5)  # what is that improbable is no alarm, and what is more probable than not is one
-ERRORS_RETAINED = 300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
+LOCAL_ERRORS_RETAINED = 300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
 LEAST_RETAINED = 4  # errors of a demonstration
 
 
@@ -110,10 +110,10 @@ def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
     """The error probability above which a skill with these errors is unsure."""
     found, wrong = [one.probabilities(regions) for one in errors], [one.is_wrong for one in errors]
     right = [values[~is_wrong] for values, is_wrong in zip(found, wrong, strict=True) if not is_wrong.all()]
-    alarm = _quantile(right, 1.0 - FALSE_ALARMS) if right else ALARMS[0]
+    alarm = _quantile(right, 1.0 - FALSE_ALARM_SHARE) if right else ALARMS[0]
     among = np.concatenate(found)[np.concatenate(wrong)]
     if len(among) >= LEAST_WRONG:
-        alarm = max(alarm, float(np.quantile(among, 1.0 - TOLD)))
+        alarm = max(alarm, float(np.quantile(among, 1.0 - ALARM_SHARE)))
     return min(max(alarm, ALARMS[0]), ALARMS[1])
 
 
@@ -123,7 +123,7 @@ def local_errors(
     """The errors of takes with inputs (T, I), each with covariances by the errors of the other
     blocks; and those that a model with this primitive keeps.
     """
-    each, persons = max(LEAST_RETAINED, ERRORS_RETAINED // len(takes)), persons_of(takes)
+    each, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
     at = [values[_rows(len(values))] for values in inputs]
     kept = [np.unique(np.linspace(0, len(values) - 1, min(each, len(values))).round().astype(int)) for values in at]
     unknown_std_m = unknown_std(takes)

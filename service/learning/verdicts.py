@@ -21,7 +21,7 @@ CAUGHT, CAUGHT_UNSAFE = 95.0, 50.0  # [%] limits of the wrong samples that the g
 COVERAGE = {"50": (30.0, 80.0), "95": (88.0, 100.0)}  # [%] ranges of the samples inside the regions of 50 and 95 %
 
 
-WRONG, TOLD = 0.5, 80.0  # [%] from this share of wrong samples on, the skill must be unsure at this share of them
+WRONG, LEAST_TOLD = 0.5, 80.0  # [%] from this share of wrong samples on, the skill must be unsure at this share of them
 
 
 class Subject(NamedTuple):
@@ -157,9 +157,9 @@ RULES = (
         of="regions",
     ),
     Rule(
-        lambda s: s.all.wrong > WRONG and s.all.told is not None and s.all.told < TOLD,
+        lambda s: s.all.wrong > WRONG and s.all.told is not None and s.all.told < LEAST_TOLD,
         "{s.all.wrong:.1f} % of held-out samples are missed by more than 10 cm, and the skill is unsure at "
-        f"{{s.all.told:.0f}} % of these, {TOLD:.0f} % wanted",
+        f"{{s.all.told:.0f}} % of these, {LEAST_TOLD:.0f} % wanted",
     ),
 )
 

@@ -10,12 +10,12 @@ from kmp.arrays.immutable import frozen
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Record, Vector, as_array
 from service.core.intake.tuning import END_SHARE
+from service.core.numerics import UNPRIMED_DECIDED
 from service.core.skill import ORDER
 from service.core.skill.memory import remember
 from service.core.skill.model import REGION_95, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp
-from service.core.skill.stages import UNPRIMED_DECIDED
 from service.core.skill.step import calibrate, recent, write
 from service.core.skill.support import error_probability
 from service.core.skill.tuning import (

@@ -18,7 +18,7 @@ from kmp.compiled import compiled
 from kmp.loops.kernel_row import add_weighted
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
-from service.core.numerics import MOTION_STEP_S
+from service.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
 from service.core.skill.tuning import (
     AMBIGUOUS_M,
@@ -49,7 +49,6 @@ from service.core.vectors import dot, norm, squared_distance
 
 MOST_STAGES = 64  # stages for which the state has room
 STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
-UNPRIMED_DECIDED = -1.0  # replaces the first probability of `elsewhere` once the stage is known by evidence
 OUTPUTS = 4  # outputs of the primitive: the tool's share of its segment, and its offset x y z [m]
 # One stage as compiled functions read it: segments of the left and the right hand and of the tool.
 STAGE = np.dtype(

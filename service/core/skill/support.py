@@ -15,11 +15,11 @@ from kmp import KMP
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
 from service.core.frame import Vector
+from service.core.numerics import PROBABILITY_ROUND_TO
 from service.core.skill.model import LEVELS
 from service.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
 
 SURVIVAL = -np.log1p(-np.array(LEVELS))  # -log of the share of errors beyond each level
-PROBABILITY_ROUND_TO = 1e6  # error probabilities are rounded to 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +53,7 @@ class LocalErrors(Immutable):
     def covariances(self, inputs: Vector) -> Vector:
         """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
         out = np.empty((len(inputs), 3, 3))
-        for at, found in zip(np.ascontiguousarray(inputs), out, strict=True):
+        for at, found in zip(np.array(inputs, order="C"), out, strict=True):
             local_scatter(at, self.stretch, self.inputs, self.errors, self.unknown_std_m, found)
         return out
 
