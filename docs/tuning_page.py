@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,7 +73,7 @@ def page() -> str:
     state = f"{len(measured)} of {len(known)} numbers have been measured; no session reads {unread} of these."
     if why:
         state += f" *Measured with an earlier version: {why}.*"
-    head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
+    head = HEAD.format(count=len(known), state=textwrap.fill(state, 100) if measured else "None has been measured yet.")
     return head + "".join(
         part
         for stage in STAGES
