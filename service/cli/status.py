@@ -132,6 +132,7 @@ def rows(now: Status) -> dict[str, str]:
         "arm": _arm(now),
         "tool": _at(now.tool_m),
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
+        + _doubt(now)
         if now.target_m is not None
         else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
@@ -155,6 +156,12 @@ def rows(now: Status) -> dict[str, str]:
     if clocks := differing_clocks(now):
         found["latency"] = f"unknown: {clocks}"
     return {name: text for name, text in found.items() if text}
+
+
+def _doubt(now: Status) -> str:
+    """The error probability in words; empty if it is not known."""
+    p = now.error_probability
+    return "" if p is None else f"; off by more than 10 cm with a probability of {100 * p:.{1 if p < 0.1 else 0}f} %"
 
 
 def differing_clocks(now: Status) -> str:

@@ -166,8 +166,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the tool has come no nearer to its target for 0.8 s; the arm looks for a way out",
             "wait, or move the hands elsewhere"),
         Incident(Flag.UNSURE, Mode.FOLLOW, "target uncertain",
-            "the region that contains the right target with a probability of 95 % extends more than 10 cm from the "
-            "predicted one",
+            "the probability that the tool belongs more than 10 cm from its target is above the skill's alarm; for a "
+            "skill without an alarm: the region that contains the right target in 95 of 100 cases extends more than "
+            "10 cm from the predicted one",
             "watch the tool; demonstrate more of what the hands do here"),
         Incident(Condition.OFF_TARGET, None, "tool off its target",
             "the tool has been more than 5 cm from its target for some time",

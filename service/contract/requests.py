@@ -229,6 +229,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     stage: tuple[str, ...] = ()  # the via-points at which the stage begins and ends; empty: unknown
     stage_belief: float = 0.0  # probability of that stage
     task_clock_s: float | None = None  # time since the hands began the task; None: the skill has no clock
+    error_probability: float | None = None  # probability that the tool belongs more than 10 cm from its target
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
     command_heard: bool = True  # True if somebody subscribes to `joints/command`

@@ -15,12 +15,15 @@ from service.core.arm.stage import Arm
 from service.core.controller import Controller
 from service.core.frame import Event, Tick, as_array, order
 from service.core.intake.arm_samples import still_ticks
+from service.core.intake.hand_estimator import STILL
 from service.core.limiter.stage import Limiter
 from service.core.separation.stage import Separation
 from service.core.skill import ORDER, TURNS
 from service.core.skill.memory import delayed, moving_features, turning
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
+from service.core.skill.stages import MOST_STAGES
+from service.core.skill.support import LocalErrors
 from service.core.skill.unseen import deviation_m
 from service.settings.config import Settings
 
@@ -45,6 +48,7 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     )
     for one in (plain, skill):
         one.predict(*np.zeros((3, 2, 3)))
+    plain.elsewhere(np.zeros((2, 3, 3)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
     _rarely(settings, urdf)
     for one in (skill, plain):
         _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
@@ -63,6 +67,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
     Separation(settings, urdf).share(still)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
+    LocalErrors(np.zeros((6, 1)), np.zeros((1, 3)), np.zeros(6), 1.0).covariances(np.zeros((1, 6)))
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.summary import Summary
 
 from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
@@ -28,7 +29,7 @@ from service.core.transforms import Frames
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.files.mcap_reader import FileFault, Messages
 from service.files.pose_streams import ENDINGS
-from service.files.steps import REPLAYED, Gap, Step, steps
+from service.files.steps import REPLAYED, Gap, Step, layout_in, steps
 from service.files.urdf_markers import with_markers
 from service.settings.config import Settings, robot_description
 
@@ -187,7 +188,7 @@ class Recording:
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
         self.faults: list[FileFault] = []  # complete once all steps are read
-        self.recorded_as: dict[str, DType] = {}  # the layout of its states, once one is read
+        self.recorded_as: dict[str, DType] = {}  # the layouts of its states and frames, once one is read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -225,13 +226,29 @@ class Recording:
 
     def ticks(self) -> int | None:
         """The number of ticks in the file's summary; None if the summary is missing."""
-        topic = channels.key(self.settings.cell, "tick")
+        topic, contents = channels.key(self.settings.cell, "tick"), self._summary()
+        if contents is None or contents.statistics is None:
+            return None
+        numbers = [number for number, channel in contents.channels.items() if channel.topic == topic]
+        return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
+
+    def _summary(self) -> Summary | None:
+        """The file's summary; None if it is missing."""
         with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
-            contents = make_reader(stream).get_summary()
-            if contents is not None and contents.statistics is not None:
-                numbers = [number for number, channel in contents.channels.items() if channel.topic == topic]
-                return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
+            return make_reader(stream).get_summary()
         return None
+
+    def _read_layouts(self) -> None:
+        """Put the layouts of states and frames into `recorded_as`, as far as the summary has them:
+        checksums of frames come before the first frame.
+        """
+        contents, joints = self._summary(), len(self.settings.joints.names)
+        if contents is None:
+            return
+        names = channels.keys_by_topic(self.settings.cell, ("state", "frame"))
+        for channel in contents.channels.values():
+            if (name := names.get(channel.topic)) is not None:
+                self.recorded_as[name] = layout_in(contents.schemas.get(channel.schema_id), joints, name)
 
     def steps(self, *, outputs: bool = True, whole: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.
@@ -245,6 +262,7 @@ class Recording:
                 f"{self.path} has checksums instead of frames: thirdhand replay {shlex.quote(str(self.path))} "
                 "--output whole.mcap writes a recording with all frames"
             )
+        self._read_layouts()
         messages = Messages(self.path)
         whole = not self.checksums
         yield from steps(messages, self.settings, outputs=outputs, whole=whole, recorded_as=self.recorded_as)

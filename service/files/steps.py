@@ -15,6 +15,7 @@ from service.contract import cdr, channels
 from service.contract.messages import WireError
 from service.contract.records import definition
 from service.core.frame import (
+    FRAME,
     STATE,
     TIMING,
     DType,
@@ -33,8 +34,13 @@ from service.files.mcap_reader import Messages
 from service.settings.config import Settings
 
 _RECORDS = ("frame", "timing", "state")
-# Fields of a State that recordings of earlier versions lack: these versions behaved as with a 0.
-LATER_FIELDS = {"clutch_until_tick", "gripper_wish", "engaging", "task_clock"}
+# Fields of a State or a Frame that recordings of earlier versions lack: these versions behaved as
+# with a 0.
+LATER_FIELDS = {
+    *("clutch_until_tick", "gripper_wish", "engaging", "task_clock"),
+    *("known_gate_m", "unprimed_belief", "error_probability"),
+}
+_LAYOUTS = {"state": STATE, "frame": FRAME}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
@@ -85,13 +91,14 @@ def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
     return zlib.crc32(b"".join(parts))
 
 
-def _layout_in(schema: Schema | None, joints: int) -> DType:
-    """The layout of the states of a recording, by the definition in it: today's, or one of an
-    earlier version, without some of LATER_FIELDS.
+def layout_in(schema: Schema | None, joints: int, name: str) -> DType:
+    """The layout of a recording's states or frames (`name`), by the definition in it: today's, or
+    one of an earlier version, without some of LATER_FIELDS.
     """
+    today = _LAYOUTS[name]
     text = schema.data.decode(errors="replace") if schema else ""
-    then = tuple(field for field in STATE if field.name not in LATER_FIELDS or f" {field.name}\n" in text)
-    return dtype_of(then, joints) if definition(then, joints) == text else state_layout(joints)
+    then = tuple(field for field in today if field.name not in LATER_FIELDS or f" {field.name}\n" in text)
+    return dtype_of(then if definition(then, joints) == text else today, joints)
 
 
 def steps(
@@ -100,7 +107,8 @@ def steps(
     """Every complete tick in order, after the initial state if there is one.
 
     Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. The
-    layout in which states were recorded is put into `recorded_as`; they are converted from it.
+    layouts in which states and frames were recorded are put into `recorded_as`; they are converted
+    from it.
     Raises RecordingError for messages that cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
@@ -133,10 +141,12 @@ def steps(
             if name is None or (name in _RECORDS and not outputs):
                 continue
             data = message.data
-            if name == "state":
-                then = recorded_as.setdefault("state", _layout_in(schema, joints))
-                if then != layouts["state"]:
-                    data = encode(converted(decode(data, then), layouts["state"]))
+            if name in _LAYOUTS:
+                if name not in recorded_as:
+                    recorded_as[name] = layout_in(schema, joints, name)
+                then = recorded_as[name]
+                if then != layouts[name]:
+                    data = encode(converted(decode(data, then), layouts[name]))
             if name == "tick":
                 yield from finished()
                 index, kinds, lost = cdr.decode_tick(data)

@@ -144,6 +144,8 @@ def _row(
     """The figures of errors (T, 3) [m], of one take or of all."""
     inside = 100 * np.mean([timed.inside(regions) for timed, regions in checked], axis=0)
     expected_m = np.concatenate([timed.expected_m(regions) for timed, regions in checked])
+    is_wrong = np.concatenate([timed.is_wrong for timed, _ in checked])
+    is_unsure = np.concatenate([timed.probabilities(regions) > (regions.alarm or 1.0) for timed, regions in checked])
     return Row(
         name=name,
         error_mm=1000 * rms(errors),
@@ -153,5 +155,8 @@ def _row(
         within_50=float(inside[LEVELS.index(0.5)]),
         within_95=float(inside[LEVELS.index(0.95)]),
         held=100 * float(is_held.mean()),
+        wrong=100 * float(is_wrong.mean()),
+        told=100 * float(is_unsure[is_wrong].mean()) if is_wrong.any() else None,
+        falsely_told=100 * float(is_unsure[~is_wrong].mean()) if not is_wrong.all() else 0.0,
         other_mm={name: 1000 * rms(missed) for name, missed in others.items()},
     )

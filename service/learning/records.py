@@ -15,6 +15,8 @@ from kmp.criteria.cross_validation import mahalanobis
 from service.core.frame import Vector
 from service.core.skill.model import Model, Regions, standard_deviations
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
+from service.core.skill.support import error_probabilities
+from service.core.skill.tuning import UNSURE_M
 from service.learning.demonstration import Demonstration
 from service.learning.gate import Gate
 from service.learning.skill_file import StoredSkill
@@ -102,6 +104,21 @@ class TimedErrors(NamedTuple):
         """The squared Mahalanobis distances (S,) for this standard deviation of the timing."""
         return mahalanobis(self.errors, self.with_timing(std_s))
 
+    @property
+    def is_wrong(self) -> NDArray[np.bool_]:
+        """True where the tool is farther than UNSURE_M from its prediction (S,)."""
+        return np.asarray(np.linalg.norm(self.errors, axis=1) > UNSURE_M)
+
+    def published(self, regions: Regions) -> Vector:
+        """The calibrated covariances (S, 3, 3) [m²]."""
+        return np.asarray(regions.scale * self.with_timing(regions.std_s))
+
+    def probabilities(self, regions: Regions) -> Vector:
+        """The error probabilities (S,)."""
+        out = np.empty(len(self.errors))
+        error_probabilities(self.published(regions), np.array(regions.ratios), out)
+        return out
+
     def expected_m(self, regions: Regions) -> Vector:
         """The expected distances (S,) [m] of tool and prediction, root mean square."""
         return np.asarray(np.sqrt(3 * regions.scale) * standard_deviations(self.with_timing(regions.std_s)))
@@ -184,6 +201,9 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     within_50: float  # [%] of the samples inside the region that should contain 50 %
     within_95: float
     held: float  # [%] of the time in which the gate would hold
+    wrong: float = 0.0  # [%] of the samples at which the tool is more than 10 cm from its prediction
+    told: float | None = None  # [%] of these at which the skill is unsure; None if there are none
+    falsely_told: float = 0.0  # [%] of the other samples at which it is
     other_mm: dict[str, float] = {}  # errors of baselines
 
 

@@ -14,6 +14,11 @@ with the quantile Q_p in which each take counts equally, as the samples of a tak
 other. The second factor widens a region until it holds on blocks of takes that it was found without
 (conformal prediction across folds; Barber et al. 2021). The published covariance is scaled by
 ρ_0.95 / χ²_0.95.
+
+The error probability, that the tool is farther than UNSURE_M from its prediction, follows from the
+quantiles of |e|² / tr C of the published covariances C. The skill is unsure where it is above the
+alarm: the smallest probability that is exceeded at FALSE_ALARM_SHARE of the moments at which the
+tool is nearer; or a larger one that is still exceeded at ALARM_SHARE of the other moments.
 """
 
 from __future__ import annotations
@@ -24,12 +29,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import ViaPointMissed
+from kmp import KMP, ViaPointMissed
 from service.contract.requests import TOLERANCE_M
 from service.core.frame import Vector
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.model import LEVELS, NORMAL, REGION_95, Regions
 from service.core.skill.step import recent
+from service.core.skill.support import LocalErrors
 from service.learning.demonstration import Demonstration
 from service.learning.records import HeldOut, Take, TimedErrors, persons_of
 from service.learning.skill_file import SkillError
@@ -38,10 +44,17 @@ from service.learning.via_points import check_agreement
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
 BLOCKS = 6  # takes that follow each other, often of one person or hour, are held out in so many blocks at most
 SAMPLES = 150  # samples of a take that are judged, at most
-TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)  # candidates for the timing's deviation
+# Candidates for the timing's standard deviation. A larger one explains few large errors by making
+# all motion uncertain.
+TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
 WIDEST = 100.0  # a region's squared radius is widened at most by this factor
 LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as this one
 LEAST_RADIUS = 1e-9  # a squared radius is at least this large
+FALSE_ALARM_SHARE, ALARM_SHARE = 0.12, 0.95  # shares of the right and of the wrong moments at which the skill is unsure
+LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
+ALARMS = (0.005, 0.5)  # what is that improbable is no alarm, and what is more probable than not is one
+LOCAL_ERRORS_RETAINED = 300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
+LEAST_RETAINED = 4  # errors of a demonstration
 
 
 def blocks_of(persons: NDArray[np.intp], most: int = BLOCKS) -> list[list[int]]:
@@ -88,7 +101,52 @@ def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regi
     squares = [one.squares(std_s) for one in errors]
     radii = np.maximum.accumulate([_radius(squares, blocks, level) for level in LEVELS])
     scale = float(radii[LEVELS.index(0.95)]) / REGION_95
-    return Regions(scale, std_s, tuple((radii / scale).tolist()))
+    regions = Regions(scale, std_s, tuple((radii / scale).tolist()))
+    relative = [(one.errors**2).sum(axis=1) / np.trace(one.published(regions), axis1=1, axis2=2) for one in errors]
+    ratios = np.maximum.accumulate([max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS])
+    regions = regions._replace(ratios=tuple(ratios.tolist()))
+    return regions._replace(alarm=_alarm(errors, regions))
+
+
+def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
+    """The error probability above which a skill with these errors is unsure."""
+    found, wrong = [one.probabilities(regions) for one in errors], [one.is_wrong for one in errors]
+    right = [values[~is_wrong] for values, is_wrong in zip(found, wrong, strict=True) if not is_wrong.all()]
+    alarm = _quantile(right, 1.0 - FALSE_ALARM_SHARE) if right else ALARMS[0]
+    among = np.concatenate(found)[np.concatenate(wrong)]
+    if len(among) >= LEAST_WRONG:
+        alarm = max(alarm, float(np.quantile(among, 1.0 - ALARM_SHARE)))
+    return min(max(alarm, ALARMS[0]), ALARMS[1])
+
+
+def local_errors(
+    timed: Sequence[TimedErrors], inputs: Sequence[Vector], takes: Sequence[Take], primitive: KMP
+) -> tuple[list[TimedErrors], LocalErrors]:
+    """The errors of takes with inputs (T, I), each with covariances by the errors of the other
+    blocks; and those that a model with this primitive keeps.
+    """
+    each, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
+    at = [values[_rows(len(values))] for values in inputs]
+    kept = [np.unique(np.linspace(0, len(values) - 1, min(each, len(values))).round().astype(int)) for values in at]
+    unknown_std_m = unknown_std(takes)
+
+    def of(numbers: Sequence[int]) -> LocalErrors:
+        some, errors = (
+            np.concatenate([values[i][kept[i]] for i in numbers]) for values in (at, [one.errors for one in timed])
+        )
+        return LocalErrors.of(primitive, some, errors, unknown_std_m)
+
+    out = list(timed)
+    for block in blocks_of(persons):
+        others = of([i for i in range(len(takes)) if i not in block])
+        for i in block:
+            out[i] = timed[i]._replace(covariance=others.covariances(at[i]))
+    return out, of(range(len(takes)))
+
+
+def unknown_std(takes: Sequence[Take]) -> float:
+    """The standard deviation [m] of the tool's positions on each axis, root mean square."""
+    return float(np.sqrt(np.concatenate([take.position for take in takes]).var(axis=0).mean()))
 
 
 def calibrated_without(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> list[tuple[TimedErrors, Regions]]:

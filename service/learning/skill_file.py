@@ -56,13 +56,15 @@ RANGES = {  # minimum, maximum and unit of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-REGIONS, FARTHEST_RADIUS = "regions", 1e6  # the array holds a scale, a time [s] and squared distances
+# The array holds a scale, a time [s], squared distances, and, of a skill with an alarm, ratios and
+# the alarm.
+REGIONS, FARTHEST_RADIUS = "regions", 1e6
 ALL_RANGES = (
     RANGES
     | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
     | {name: found for model in MODELS for name, found in model.ranges.items()}
 )
-INPUT_ARRAYS = ("base_inputs", "via_inputs")
+INPUT_ARRAYS = ("base_inputs", "via_inputs", "error_inputs")
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
     f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
 }
@@ -131,7 +133,8 @@ def with_file(skill: StoredSkill) -> StoredSkill:
     if skill.conductor is not None:
         arrays["conductor"] = np.array(skill.conductor)
     if skill.regions != NORMAL:
-        arrays[REGIONS] = np.array([*skill.regions[:2], *skill.regions.radii])
+        scale, std_s, radii, ratios, alarm = skill.regions
+        arrays[REGIONS] = np.array([scale, std_s, *radii, *((*ratios, alarm) if alarm else ())])
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
     if skill.demonstrations:
@@ -206,8 +209,9 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
 
 
 def _regions(numbers: list[float]) -> Regions:
-    scale, std_s, *radii = numbers
-    return Regions(scale, std_s, tuple(radii))
+    (scale, std_s), radii, rest = numbers[:2], numbers[2 : 2 + len(LEVELS)], numbers[2 + len(LEVELS) :]
+    regions = Regions(scale, std_s, tuple(radii))
+    return regions._replace(ratios=tuple(rest[:-1]), alarm=rest[-1]) if rest else regions
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
@@ -276,10 +280,15 @@ def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: st
 
 def _no_regions(array: NDArray[Any]) -> Iterator[str]:
     """Faults of the array of regions."""
-    if array.shape != (2 + len(LEVELS),):
-        yield f"regions of shape {array.shape}, ({2 + len(LEVELS)},) needed"
-    elif not (array[0] > 0 and (np.diff(array[2:]) >= 0).all()):
+    count = len(LEVELS)
+    if array.shape not in ((2 + count,), (3 + 2 * count,)):
+        yield f"regions of shape {array.shape}, ({2 + count},) or ({3 + 2 * count},) needed"
+    elif not (array[0] > 0 and (np.diff(array[2 : 2 + count]) >= 0).all()):
         yield f"regions are {array.tolist()}: a scale above 0, a time, and growing radii needed"
+    elif not ((array[2 + count :] > 0).all() and (np.diff(array[2 + count : -1]) >= 0).all()):
+        yield f"regions are {array.tolist()}: growing ratios above 0 needed"
+    elif len(array) > 2 + count and not 0 < array[-1] <= 1:
+        yield f"an alarm at the error probability {array[-1]:g}: above 0, and up to 1, accepted"
     elif abs(array[2 + LEVELS.index(0.95)] - REGION_95) > 0.01:
         yield f"a 95 % region of {array[2 + LEVELS.index(0.95)]:g}: the scale makes it {REGION_95:g}"
 

@@ -42,6 +42,7 @@ def table(found: Figures) -> str:
         f"the gate would hold the arm for {found.all.held:.1f} % of the time, {min(helds):.1f} to {max(helds):.1f} % "
         f"of a demonstration, standard deviation {found.held_std:.1f} %",
         f"the gate, at {found.gate_mm:.0f} mm, would hold it in wrong samples: {_caught(found)}",
+        *_told(found),
         f"{found.ambiguous:.1f} % of the samples contradict others: the same hands, another tool; "
         f"{found.beyond_reach:.1f} % of the tool's path is out of the arm's reach",
     ]
@@ -69,6 +70,15 @@ def table(found: Figures) -> str:
     lines += (f"warning: {text}" for text in found.warnings)
     lines += (f"residual risk: {text}" for text in found.residual)
     return "\n".join([*lines, *(f"unsafe: {text}" for text in found.unsafe)])
+
+
+def _told(found: Figures) -> list[str]:
+    """A line on the samples at which the skill is unsure; none in figures of earlier versions."""
+    if not (found.all.wrong or found.all.falsely_told):
+        return []
+    wrong = f"{found.all.wrong:.1f} % of the samples are missed by more than 10 cm"
+    told = "" if found.all.told is None else f"; the skill is unsure at {found.all.told:.0f} % of these"
+    return [f"{wrong}{told}, and at {found.all.falsely_told:.0f} % of the others"]
 
 
 def _caught(found: Figures) -> str:

@@ -28,6 +28,9 @@ CAUGHT, CAUGHT_RESIDUAL = 95.0, 50.0  # [%] limits of the wrong samples that the
 COVERAGE = {"50": (30.0, 80.0), "95": (88.0, 100.0)}  # [%] ranges of the samples inside the regions of 50 and 95 %
 
 
+WRONG, LEAST_TOLD = 0.5, 80.0  # [%] from this share of wrong samples on, the skill must be unsure at this share of them
+
+
 class Subject(NamedTuple):
     """A skill's figures with what else is judged, and the part of it that a rule looks at."""
 
@@ -186,6 +189,11 @@ RULES = (
         lambda s: not COVERAGE[s.part][0] <= s.value <= COVERAGE[s.part][1],
         "the {s.part} % regions hold {s.value:.0f} % of held-out samples",
         of="regions",
+    ),
+    Rule(
+        lambda s: s.all.wrong > WRONG and s.all.told is not None and s.all.told < LEAST_TOLD,
+        "{s.all.wrong:.1f} % of held-out samples are missed by more than 10 cm, and the skill is unsure at "
+        f"{{s.all.told:.0f}} % of these, {LEAST_TOLD:.0f} % wanted",
     ),
 )
 

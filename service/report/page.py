@@ -87,10 +87,10 @@ def _svg(figure: Figure, salt: str) -> str:
 def _over_time(report: Report) -> Figure:
     """Modes, distances, errors, speeds and timing over time, one above the other."""
     frames, times, timing = report.columns.frames, report.columns.times, report.columns.timing
-    rows = 5 if len(timing) else 4
+    rows = 6 if len(timing) else 5
     figure = Figure(figsize=(10.5, 2 * rows), layout="constrained")
     modes, *others = figure.subplots(rows, 1, sharex=True, height_ratios=(0.35, *(1,) * (rows - 1)))
-    near, errors, speed = others[:3]
+    near, errors, doubt, speed = others[:4]
     for span in report.spans:
         colour = MODE_COLOURS[span.mode]
         modes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, lw=0)
@@ -117,6 +117,11 @@ def _over_time(report: Report) -> Figure:
     errors.set(ylabel="error, deviation [mm]", yscale="log", ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)))
     errors.yaxis.set_major_formatter("{x:g}")
 
+    predicted = following | (frames["error_probability"] > 0)
+    probability = np.where(predicted, 100 * frames["error_probability"], np.nan)
+    _curve(doubt, times, probability, TARGET, "target off by more than 10 cm")
+    doubt.set(ylabel="probability [%]", ylim=(0, 100))
+
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
         found = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
         _curve(speed, times, found, colour, f"{side} hand")
@@ -124,7 +129,7 @@ def _over_time(report: Report) -> Figure:
     speed.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
-    for late in others[3:]:
+    for late in others[4:]:
         at = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
         for name, colour, label in (
             ("latency_us", LATENCY, "hand stamped to command published"),

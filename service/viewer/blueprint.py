@@ -59,6 +59,7 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/gripper", "Gripper closure [%]", 0, 110, True),
             PlotView("/stage", "Stage of the task: number and probability", 0, 8, True),
             PlotView("/deviation", "Uncertainty, and deviation of the hands [mm]", 0, 250),
+            PlotView("/doubt", "Probability that the target is off by more than 10 cm [%]", 0, 110, True),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
             PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
@@ -131,7 +132,7 @@ def blueprint(
     )
     curves = rrb.Vertical(
         rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/stage"), active_tab=0),
-        plot("/deviation"),
+        rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),
         rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
         rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
         modes(),  # below the curves, with the same time axis

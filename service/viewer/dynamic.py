@@ -168,6 +168,7 @@ class DynamicScene:
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
         yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
+        yield from scalars("/doubt/target", np.flatnonzero(known), 100.0 * frames["error_probability"], "/doubt")
         other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
         yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
         if self._gate is not None and len(aimed):

@@ -254,6 +254,7 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/deviation/target", "target, 1 σ [mm]", palette.TARGET),
         ("/deviation/hands", "hands [mm]", palette.OFF),
         ("/deviation/gate", "holds above [mm]", palette.GATE),
+        ("/doubt/target", "target [%]", palette.TARGET),
         ("/speed/tool", "tool [m/s]", palette.TOOL),
         ("/speed/left", "left hand [m/s]", palette.LEFT),
         ("/speed/right", "right hand [m/s]", palette.RIGHT),

@@ -20,6 +20,14 @@ from support.paths import RECORDINGS
 FILES = {"HandsKMP": "experiments/as-paper.npz", "StagedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])
 H = 0.02
+LATER = {
+    "levers",
+    "error_inputs",
+    "error_samples",
+    "error_unknown_std",
+    "unknown_std",
+    "scatters",
+}  # these files lack them
 
 
 @pytest.fixture(params=MODELS, ids=lambda model: model.__name__)
@@ -62,7 +70,7 @@ def test_how_sure_it_is_and_what_the_gate_sees_are_those_of_many_hands(skill: Sk
 
 def test_a_covariance_that_is_known_is_handed_back_and_changes_nothing_else(skill: Skill, hands: Vector) -> None:
     whole = predicted(skill, hands, np.ones(6))
-    again = predicted(skill, hands, np.ones(6), before=(whole.covariance, np.zeros((3, 3)), -1.0))
+    again = predicted(skill, hands, np.ones(6), before=(whole.covariance, np.zeros((3, 3)), -1.0, whole.gate_m))
     assert [np.asarray(part).tobytes() for part in again] == [np.asarray(part).tobytes() for part in whole]
 
 
@@ -81,7 +89,7 @@ def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
 
 def test_stored_and_read_back_it_says_the_same(skill: Skill) -> None:
     model = skill.model
-    assert set(model.own_arrays()) - {"names"} == set(model.ranges) - {"levers"}
+    assert set(model.own_arrays()) - {"names"} == set(model.ranges) - LATER
     back = decoded(skill.file, origin="a file")
     assert type(back.model) is type(model)
     assert back.model.mean(model.hands).tobytes() == model.mean(model.hands).tobytes()

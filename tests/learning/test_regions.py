@@ -64,6 +64,27 @@ def test_errors_as_of_a_normal_leave_a_covariance_as_it_is() -> None:
     assert calibrated(given[:1], np.arange(1)) == NORMAL
 
 
+def places(rng: np.random.Generator) -> TimedErrors:
+    """A demonstration with normal errors of 1 cm, and of 10 cm in a tenth of it, as its covariance
+    says but for its scale.
+    """
+    std = np.where(rng.random(150) < 0.1, 0.1, 0.01)
+    covariance = std[:, None, None] ** 2 * np.eye(3)
+    return TimedErrors(std[:, None] * rng.normal(size=(150, 3)), 0.3 * covariance, np.zeros((150, 3)))
+
+
+def test_a_skill_is_unsure_where_it_is_wrong_and_rarely_elsewhere() -> None:
+    rng = np.random.default_rng(4)
+    regions = calibrated([places(rng) for _ in range(12)], np.arange(12))
+    asked = [places(rng) for _ in range(40)]
+    wrong = np.concatenate([one.is_wrong for one in asked])
+    found = np.concatenate([one.probabilities(regions) for one in asked])
+    assert found.mean() == pytest.approx(wrong.mean(), abs=0.02)
+    assert (found > regions.alarm)[wrong].mean() > 0.9
+    assert (found > regions.alarm)[~wrong].mean() < 0.15
+    assert found[wrong].mean() > 5 * found[~wrong].mean()
+
+
 def test_a_demonstration_is_judged_by_regions_that_it_had_no_part_in() -> None:
     rng = np.random.default_rng(2)
     usual = [apart(rng) for _ in range(12)]
@@ -129,6 +150,8 @@ def test_what_is_learned_says_how_sure_it_is_with_its_lag_left_in(learned: Store
     assert figures.all.within_95 == pytest.approx(95, abs=3)
     stored = decoded(learned.file, origin="memory")
     assert stored.regions == learned.regions != NORMAL
+    assert 0.0 < learned.regions.alarm <= 0.5
+    assert figures.all.falsely_told < 20.0
 
 
 def test_a_file_without_regions_has_those_of_a_normal_and_one_with_others_is_refused(learned: StoredSkill) -> None:
@@ -140,6 +163,8 @@ def test_a_file_without_regions_has_those_of_a_normal_and_one_with_others_is_ref
         learned.regions._replace(radii=learned.regions.radii[::-1]),
         learned.regions._replace(radii=learned.regions.radii[1:]),
         learned.regions._replace(radii=tuple(2 * radius for radius in learned.regions.radii)),
+        learned.regions._replace(ratios=learned.regions.ratios[::-1]),
+        learned.regions._replace(alarm=1.5),
     ):
-        with pytest.raises(SkillError, match=r"region|radii"):
+        with pytest.raises(SkillError, match=r"region|radii|alarm"):
             decoded(with_file(replace(learned, regions=spoilt)).file, origin="memory")

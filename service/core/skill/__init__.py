@@ -14,7 +14,8 @@ STATE = (
     Field("covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample [m²]; zeros: none
     Field("orientation_covariance", "float64", (3, 3)),  # of the prediction at the newest hand sample [rad²]
     Field("closure", "float64"),  # of the gripper, as predicted at the newest hand sample
-    Field("unsure", "uint8"),  # 1: the 95 % region of the prediction reaches too far
+    Field("known_gate_m", "float64"),  # `gate_m` at the newest hand sample [m]
+    Field("unsure", "uint8"),  # 1: the tool may be too far from its target
     Field("trail", "float64", (3,)),  # lowpass of the predicted positions [m]
     Field("trail_tick", "int64"),  # tick of the newest prediction in `trail`
     Field("sure_tick", "int64"),  # the last tick at which the stage of the task was unambiguous
@@ -24,6 +25,7 @@ STATE = (
     Field("stage_belief", "float64", (64,)),  # probability of each stage of the task; zeros: not yet known
     Field("turns", "float64", (TURNS, 2, 9)),  # cascaded filters of the hands' rotation matrices
     Field("task_clock", "float64", (5,)),  # seconds since the hands began task or stage; see `task_clock.count`
+    Field("unprimed_belief", "float64", (64,)),  # belief in each stage if none is the first
 )
 FRAME = (
     Field("target", "float64", (3,)),  # predicted position, clamped to workspace and reach [m]
@@ -37,4 +39,5 @@ FRAME = (
     Field("closure", "float64"),  # predicted closure of the gripper, 0 to 1; -1: the skill has no gripper
     Field("stage", "int64"),  # the most probable stage of the task; -1: not yet known, or the task has none
     Field("stage_belief", "float64"),  # probability of that stage
+    Field("error_probability", "float64"),  # probability that the tool is more than 10 cm from where it belongs
 )

@@ -4,6 +4,7 @@ optionally their past and their orientation, to the tool's position.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.geometry import round_to
-from service.core.skill import ORDER, TURNS
+from service.core.skill import MAX_SKILL_DISTANCE_M, ORDER, TURNS
 from service.core.skill.memory import moving_features
 from service.core.skill.model import (
     COVARIANCE_ROUND_TO,
@@ -30,6 +31,8 @@ from service.core.skill.model import (
     standard_deviations,
 )
 from service.core.skill.stages import MOST_STAGES
+from service.core.skill.support import LocalErrors, local_scatter
+from service.core.skill.task import check_shapes
 from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import TURN_WEIGHT_M
 from service.core.skill.via_points import neighbourhoods
@@ -48,16 +51,24 @@ class HandsKMP:
 
     A hand of unknown orientation is assumed to have the mean orientation of the demonstrations.
     Where no clock is known, as at a via-point, it is that of the nearest reference point.
+
+    With the `errors` of held-out demonstrations, the covariance is their local scatter; without
+    them, it is the primitive's. The gate always compares the primitive's.
     """
 
     primitive: KMP
     turned: bool = False  # true if the hands' orientation is an input
     clock: TaskClock | None = None
+    errors: LocalErrors | None = None
 
     measure: ClassVar[str] = "the target's standard deviation"
     formats: ClassVar[tuple[int, ...]] = (1, 2)
     units: ClassVar[str] = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
-    ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {}
+    ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {
+        "error_inputs": (-1e3, 1e3, ""),
+        "error_samples": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
+        "error_unknown_std": (0.0, MAX_SKILL_DISTANCE_M, "m"),
+    }
     gripper_ell: ClassVar[float] = 1000.0  # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
     names: ClassVar[tuple[str, ...]] = ()
     delay_s: ClassVar[float] = 0.0
@@ -107,16 +118,27 @@ class HandsKMP:
         assert covariance is not None
         out = np.empty((6, 3))
         deviation = _rounded(found.mean, found.velocity, found.acceleration, covariance, out)
+        if known is None and self.errors is not None:
+            errors, at = self.errors, np.ascontiguousarray(moving[0])
+            local_scatter(at, errors.stretch, errors.inputs, errors.errors, errors.unknown_std_m, out[3:])
+            round_to(out[3:], COVARIANCE_ROUND_TO)
+        if known is not None and self.errors is not None:
+            deviation = math.nan
         return Motion(out[0], out[1], out[2], out[3:], deviation)
+
+    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+        return 0.0
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.primitive.mean(self.inputs(hands))
 
     def covariances(self, hands: Vector) -> Vector:
+        if self.errors is not None:
+            return self.errors.covariances(self.inputs(hands))
         return self.primitive.predict(self.inputs(hands)).covariance
 
     def gates_m(self, hands: Vector) -> Vector:
-        return standard_deviations(self.covariances(hands))
+        return standard_deviations(self.primitive.predict(self.inputs(hands)).covariance)
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         if not self._is_rich:
@@ -161,13 +183,26 @@ class HandsKMP:
         return replace(self, primitive=self.primitive.base)
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        clock = {} if self.clock is None else {"task_clock": self.clock.numbers}
-        return ({"turned": np.array(1)} if self.turned else {}) | clock
+        out: dict[str, NDArray[Any]] = {"turned": np.array(1)} if self.turned else {}
+        if self.clock is not None:
+            out["task_clock"] = self.clock.numbers
+        if self.errors is not None:
+            out["error_inputs"] = np.ascontiguousarray(self.errors.inputs.T)
+            out["error_samples"] = self.errors.errors
+            out["error_unknown_std"] = np.array(self.errors.unknown_std_m)
+        return out
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> HandsKMP:
+        primitive, errors = from_arrays(arrays), None
         clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
-        return cls(from_arrays(arrays), "turned" in arrays, clock)
+        if "error_inputs" in arrays:
+            count = len(arrays["error_inputs"])
+            shapes = {"error_inputs": (count, primitive.inputs.shape[1]), "error_samples": (count, 3)}
+            check_shapes(arrays, shapes)
+            unknown_std_m = float(arrays["error_unknown_std"])
+            errors = LocalErrors.of(primitive, arrays["error_inputs"], arrays["error_samples"], unknown_std_m)
+        return cls(primitive, "turned" in arrays, clock, errors)
 
 
 @compiled

@@ -19,6 +19,7 @@ MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to mi
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the calibrated regions
 CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # χ² with 3 degrees of freedom
+NORMAL_RATIOS = tuple(square / 3.0 for square in CHI_SQUARE)  # |e|² / tr C of isotropic normal errors
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
 NO_CLOCK = np.zeros(3)
@@ -26,17 +27,24 @@ NO_CLOCK = np.zeros(3)
 
 class Regions(NamedTuple):
     """Calibration of a model's covariance C, so that its confidence regions contain as many errors
-    as they state.
+    as they state, and its errors are as probable as it states.
 
     The published covariance is scale (C + std_s² v vᵀ). v is the tool's mean velocity over the last
     TRAIL_S, and `std_s` the standard deviation of the prediction's timing. `radii` are the squared
     Mahalanobis distances under it that bound the regions of LEVELS; the one of 95 % is always that
     of a normal distribution.
+
+    `ratios` are the quantiles at LEVELS of |e|² / tr C, with the error e of a prediction and its
+    published covariance C: they make an error probability of a covariance. The skill is unsure
+    where that probability is above the `alarm`; without one, where the 95 % region reaches farther
+    than UNSURE_M.
     """
 
     scale: float = 1.0
     std_s: float = 0.0
     radii: tuple[float, ...] = CHI_SQUARE
+    ratios: tuple[float, ...] = NORMAL_RATIOS
+    alarm: float = 0.0
 
 
 NORMAL = Regions()
@@ -50,7 +58,7 @@ class Motion(NamedTuple):
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
-    gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`
+    gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: as before
     ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another stage
 
 
@@ -152,7 +160,13 @@ class Model(Protocol):
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
         """Predict the motion of the tool. A covariance (3, 3) that is `known` is returned as it is,
-        because computing one takes long.
+        because computing one takes long. What the gate compares is then NaN if it is computed from
+        another covariance.
+        """
+
+    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+        """Probability that the task did not begin at its first stage, so that the tool belongs
+        elsewhere, for the hands' motion (3, 6); `unprimed` (MOST_STAGES,) is updated in place.
         """
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:

@@ -125,9 +125,9 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 UNTOLD = np.empty((0, 18))  # orientation of hands if it is not known
 MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
 """All types of models."""
-Earlier: TypeAlias = tuple[Vector, Vector, float]
-"""Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], and closure of the gripper, as
-predicted at the newest sample of a hand."""
+Earlier: TypeAlias = tuple[Vector, Vector, float, float]
+"""Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], closure of the gripper, and
+what the gate compares [m], as predicted at the newest sample of a hand."""
 
 
 class Prediction(NamedTuple):
@@ -213,6 +213,8 @@ class Skill(Immutable):
         told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
         seen = Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s, clock)
         motion = self.model.predict(seen, None if before is None else before[0])
+        if before is not None and math.isnan(motion.gate_m):
+            motion = motion._replace(gate_m=before[3])
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)
         at, velocity = self.model.moving_inputs(seen)
@@ -222,6 +224,13 @@ class Skill(Immutable):
         if self.gripper is None or before is not None:
             return Prediction(*motion, turn, NO_GRIPPER if before is None else before[2])
         return Prediction(*motion, turn, self.gripper.predict(at))
+
+    def elsewhere(self, hands: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+        """See `Model.elsewhere`, for the motion (2, 3, 3) of both hands."""
+        now = self._moving(hands[:, 0], hands[:, 1], hands[:, 2])
+        if self.conductor is not None:
+            stillness = stillness[[self.conductor] * 2]
+        return self.model.elsewhere(now, stillness, period_s, belief, unprimed)
 
     def _moving(self, hands: Vector, velocities: Vector, accelerations: Vector) -> Vector:
         """Motion (3, 6) of both hands: positions, velocities, accelerations."""

@@ -6,15 +6,18 @@ import math
 
 import numpy as np
 
+from kmp.arrays.immutable import frozen
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Record, Vector, as_array
 from service.core.intake.tuning import END_SHARE
+from service.core.numerics import UNPRIMED_DECIDED
 from service.core.skill import ORDER
 from service.core.skill.memory import remember, turn_lag_s
-from service.core.skill.model import Wanted
+from service.core.skill.model import REGION_95, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp
 from service.core.skill.step import calibrate, recent, write
+from service.core.skill.support import error_probability
 from service.core.skill.task_clock import move
 from service.core.skill.tuning import (
     AMBIGUOUS_PROBABILITY,
@@ -38,7 +41,7 @@ class SkillStage:
 
     def _take(self, skill: Skill) -> None:
         """Put a skill into force, with the time constant of the hands' memory that it needs."""
-        self.skill = skill
+        self.skill, self._ratios = skill, frozen(np.array(skill.regions.ratios))
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
@@ -50,7 +53,7 @@ class SkillStage:
         memory of the hands if it has the same filters, and the clock if it has the same clock.
         """
         if skill.model.names != self.skill.model.names:
-            state["stage_belief"] = 0.0
+            state["stage_belief"] = state["unprimed_belief"] = 0.0
         before, turn_before_s = self.skill.model, self._turn_lag_s
         if skill.model.clock != before.clock:
             state["task_clock"] = 0.0
@@ -72,7 +75,9 @@ class SkillStage:
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
         belief = state["stage_belief"]
         is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
-        before = None if is_new else (known, state["orientation_covariance"], float(state["closure"]))
+        before = None
+        if not is_new:
+            before = known, state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
         found = self.skill.predict(
             hands[:, 0],
             hands[:, 1],
@@ -88,14 +93,21 @@ class SkillStage:
         )
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
-            state["closure"] = found.closure
+            state["closure"], state["known_gate_m"] = found.closure, found.gate_m
         target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
         write(frame, found, target)
         passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
         recent_mps = recent(found.position, passed_s, state["trail"])
         reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
         off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
-        state["unsure"] = math.hypot(reach_m, off) > (END_SHARE * UNSURE_M if state["unsure"] else UNSURE_M)
+        frame["error_probability"] = error_probability(frame["covariance"], off**2 / REGION_95, self._ratios)
+        ease, alarm = END_SHARE if state["unsure"] else 1.0, self.skill.regions.alarm
+        if alarm > 0.0:
+            if self.skill.model.names:
+                self._doubt_start(state, frame)
+            state["unsure"] = frame["error_probability"] > ease * alarm
+        else:
+            state["unsure"] = math.hypot(reach_m, off) > ease * UNSURE_M
         frame["closure"] = state["closure"]
         _tell_stage(belief, frame)
         most = AMBIGUOUS_PROBABILITY * (END_SHARE if state["reason"] == AMBIGUOUS else 1.0)
@@ -114,12 +126,23 @@ class SkillStage:
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
         move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
 
+    def _doubt_start(self, state: Record, frame: Record) -> None:
+        """Add to the error probability that the task did not begin at its first stage."""
+        unprimed = state["unprimed_belief"]
+        if unprimed[0] == UNPRIMED_DECIDED:
+            return
+        doubt = self.skill.elsewhere(
+            state["hands"], state["hand_stillness"], self._period_s, state["stage_belief"], unprimed
+        )
+        found = frame["error_probability"]
+        frame["error_probability"] = found + (1.0 - found) * doubt
+
     def set_stage(self, state: Record, name: str) -> None:
         """Set the belief to the stage that begins at the via-point of this name (at the last
         via-point, the stage that ends there). Unknown names are ignored.
         """
         if name in (names := self.skill.model.names):
-            state["stage_belief"] = 0.0
+            state["stage_belief"], state["unprimed_belief"] = 0.0, UNPRIMED_DECIDED
             state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
 
     def nothing(self, state: Record, frame: Record) -> None:

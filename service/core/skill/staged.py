@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from service.core.skill.stages import (
     PLACED,
     SEEN,
     along_both,
+    elsewhere,
     expected,
     off_all,
     predicted,
@@ -43,6 +44,16 @@ from service.core.skill.via_points import pulls_through
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
 RESTING_TEMPO = np.array([*STILL, 0.0])  # tempo of two hands that rest and have not begun
+
+
+class Unknown(NamedTuple):
+    """What the tool's position may be where a skill was never shown it: its standard deviation on
+    each axis [m] away from all demonstrations, and the covariances (N, 3, 3) [m²] of the tool at
+    the N via-points in the demonstrations, for via-points that are not known in a scene.
+    """
+
+    std_m: float
+    scatters: Vector
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,12 +91,17 @@ class Placed(Immutable):
         primitive: KMP,
         errors: Vector,
         clock: TaskClock | None = None,
+        unknown: Unknown | None = None,
     ) -> Placed:
         """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
         from their segments, root mean square; `errors` (M, 6) those of the primitive. Its last
         input is the `clock`, if there is one.
         """
-        sizes = structured(1, PLACED)
+        sizes, stages = structured(1, PLACED), task.stages(at, off)
+        if unknown is not None:
+            sizes["unknown_std"] = unknown.std_m
+            scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
+            stages["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
         sizes["scale"], sizes["likeness"] = scale_of(primitive), likeness(primitive)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
         last, times = 2 + len(off), np.zeros(len(primitive.centres))
@@ -93,7 +109,7 @@ class Placed(Immutable):
             sizes["clock_weight"], times = clock.weight, primitive.centres[:, last]
         along, stage = primitive.centres[:, :2], primitive.centres[:, 2:last].argmax(axis=1)
         rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS), times])
-        return cls(task.stages(at, off), sizes, rows, np.array(errors, order="C"), NO_PULLS)
+        return cls(stages, sizes, rows, np.array(errors, order="C"), NO_PULLS)
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
@@ -134,7 +150,7 @@ class Placed(Immutable):
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
         tools = self._tools(hands, tempo, belief, NO_PULLS)
-        scatter(hands, tempo, belief, self.stages, tools, self.errors, float(self.sizes["std"][0]), out)
+        scatter(hands, tempo, belief, self.stages, tools, self.errors, self.sizes[0], out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
@@ -167,6 +183,8 @@ class StagedKMP:
     * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
     * `errors` (M, 6): inputs and the tool's errors [m] in held-out demonstrations, see `Placed`.
     * `delay_s`: delay of the demonstrated tool behind the hands.
+    * `clock`: of each stage, if it is an input.
+    * `unknown`: scatter of what was not shown; None: as where it was shown.
 
     Where the hands' orientation is unknown, a tool that turns with them only moves with them.
     """
@@ -179,6 +197,7 @@ class StagedKMP:
     delay_s: float
     via_points: tuple[ViaPoint, ...] = ()
     clock: TaskClock | None = None
+    unknown: Unknown | None = None
 
     measure: ClassVar[str] = "the distance of a hand from its segments"
     formats: ClassVar[tuple[int, ...]] = (5,)
@@ -219,7 +238,7 @@ class StagedKMP:
     def _unpulled(self) -> Placed:
         """Stages between the via-points in force, without pulls."""
         at = self.nominal.moved(self.via_points)
-        return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.clock)
+        return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.clock, self.unknown)
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
@@ -241,6 +260,10 @@ class StagedKMP:
         errors = at.errors if known is None else NO_ERRORS
         gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
+
+    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+        at = self.placed
+        return elsewhere(now, stillness, period_s, belief, unprimed, at.stages, at.sizes, at.rows)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
@@ -307,17 +330,18 @@ class StagedKMP:
         return replace(self, via_points=())
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
-        return (
-            self.task.to_arrays()
-            | {
-                "nominal": self.nominal.at,
-                "off_ways": self.off,
-                "seen": np.ascontiguousarray(self.errors[:, :3]),
-                "errors": np.ascontiguousarray(self.errors[:, 3:]),
-                "delay": np.array(self.delay_s),
-            }
-            | ({} if self.clock is None else {"task_clock": self.clock.numbers})
-        )
+        out = self.task.to_arrays()
+        if self.clock is not None:
+            out |= {"task_clock": self.clock.numbers}
+        if self.unknown is not None:
+            out |= {"unknown_std": np.array(self.unknown.std_m), "scatters": self.unknown.scatters}
+        return out | {
+            "nominal": self.nominal.at,
+            "off_ways": self.off,
+            "seen": np.ascontiguousarray(self.errors[:, :3]),
+            "errors": np.ascontiguousarray(self.errors[:, 3:]),
+            "delay": np.array(self.delay_s),
+        }
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> StagedKMP:
@@ -332,6 +356,9 @@ class StagedKMP:
         check_shapes(arrays, shapes)
         errors = np.hstack([arrays["seen"], arrays["errors"]])
         off, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
-        nominal = NamedViaPoints(task.names, arrays["nominal"])
+        nominal, unknown = NamedViaPoints(task.names, arrays["nominal"]), None
         clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
-        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points, clock)
+        if "unknown_std" in arrays:
+            check_shapes(arrays, {"scatters": (count, 3, 3)})
+            unknown = Unknown(float(arrays["unknown_std"]), np.ascontiguousarray(arrays["scatters"], np.float64))
+        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points, clock, unknown)

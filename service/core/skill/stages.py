@@ -18,7 +18,7 @@ from kmp.compiled import compiled
 from kmp.loops.kernel_row import add_weighted
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
-from service.core.numerics import MOTION_STEP_S
+from service.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
 from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
 from service.core.skill.tuning import (
     AMBIGUOUS_M,
@@ -41,6 +41,8 @@ from service.core.skill.tuning import (
     STAGE_CHANGE_PER_S,
     STAGE_CYCLE_PER_S,
     STAGE_END_M,
+    SUPPORT_MASS,
+    UNSURE_M,
     WITH_HAND_POWER,
 )
 from service.core.vectors import dot, norm, squared_distance
@@ -60,6 +62,7 @@ STAGE = np.dtype(
         ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the stage
         ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
         ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
+        ("scatter", np.float64, (2, 3, 3)),  # [m²] covariance of the tool's via-points at begin and end; 0: known
     ]
 )
 # Numbers that hold in all stages, as compiled functions read them.
@@ -69,6 +72,7 @@ PLACED = np.dtype(
         ("likeness", np.float64),  # factor of the kernel for a centre of another stage
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
         ("clock_weight", np.float64),  # as an input, a second in the stage counts as this share of it
+        ("unknown_std", np.float64),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
     ]
 )
@@ -169,7 +173,9 @@ def _likely(moving: Vector, stage: Record) -> float:
 
 
 @compiled
-def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) -> None:
+def recognise(
+    belief: Vector, moving: Vector, period_s: float, stages: Records, first_odds: float = FIRST_STAGE_ODDS
+) -> None:
     """Update the belief (K or more,) in K stages by the hands' motion (3, 6), one period Δ later,
     in place.
 
@@ -184,8 +190,8 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     Evidence, with the log likelihoods L_k of `_likely`: p_k ∝ p_k exp(c L_k), where c = min(Δ /
     SAMPLE_CORRELATION_S, 1), as successive samples are correlated.
 
-    A belief of zeros starts anew: the first stage is FIRST_STAGE_ODDS times as probable as any
-    other, and c = 1.
+    A belief of zeros starts anew: the first stage is `first_odds` times as probable as any other,
+    and c = 1.
     """
     count, hands = len(stages), moving[0]
     total, share = 0.0, min(period_s / SAMPLE_CORRELATION_S, 1.0)
@@ -194,7 +200,7 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records) 
     if total <= 0.0:
         share = 1.0
         for k in range(count):
-            belief[k] = (FIRST_STAGE_ODDS if k == 0 else 1.0) / (count - 1 + FIRST_STAGE_ODDS)
+            belief[k] = (first_odds if k == 0 else 1.0) / (count - 1 + first_odds)
     elif count > 1:
         before = belief[0]
         for k in range(count - 1):
@@ -390,6 +396,16 @@ def _turned_around(turning: Vector, out: Vector) -> None:
 
 
 @compiled
+def _tool_share(tool: Vector, stage: Record) -> float:
+    """Share, 0 to 1, of its segment that a tool (3,) has covered; 1 on a segment without length."""
+    along, square = 0.0, 0.0
+    for i in range(3):
+        along += (tool[i] - stage["tool"][i]) * stage["tool_way"][i]
+        square += stage["tool_way"][i] ** 2
+    return min(max(along / square, 0.0), 1.0) if square > 0.0 else 1.0
+
+
+@compiled
 def scatter(
     hands: Vector,
     still: Vector,
@@ -397,20 +413,26 @@ def scatter(
     stages: Records,
     tools: Vector,
     errors: Vector,
-    std: float,
+    size: Record,
     out: Vector,
 ) -> None:
     """Covariance C (3, 3) [m²] of the expected tool position, written to `out`:
 
-        C = Σ_k p_k ((t_k - t)(t_k - t)ᵀ + E_k) / Σ_k p_k + (std² + LEAST_STD_M²) I
-        E_k = Σ_m g_km e_m e_mᵀ / Σ_m g_km
+        C = Σ_k p_k ((t_k - t)(t_k - t)ᵀ + E_k + P_k) / Σ_k p_k + (std² + LEAST_STD_M²) I
+        E_k = (ν σ² I + Σ_m g_km e_m e_mᵀ) / (ν + Σ_m g_km),   ν = SUPPORT_MASS
         g_km = exp(-½ |x_k - x_m|² / ERROR_WIDTH²), times OTHER_STAGE_ERROR_WEIGHT in another stage
 
     t_k are the stages' tool positions (K, 3) with the mean t; x_k are the hands' shares (2,) of
     stage k. `errors` (M, 6) are rows of x_m (2), stage and the tool's error e_m (3) [m] in held-out
-    demonstrations. `std` [m] is the standard deviation of the via-points. Stages below
-    LEAST_STAGE_PROBABILITY are left out.
+    demonstrations. Away from all of them, E_k grows to σ², σ = `unknown_std`; if σ is 0, ν is 0.
+    `std` [m] is the standard deviation of the via-points.
+
+    P_k = (1 - s)² P_0 + s² P_1 for the tool's share s of its segment, with the covariances P_0 and
+    P_1 of the via-points at its ends in the demonstrations; 0 for a via-point of this scene.
+
+    Stages below LEAST_STAGE_PROBABILITY are left out.
     """
+    mass = SUPPORT_MASS if size["unknown_std"] > 0.0 else 0.0
     out[:] = 0.0
     mean, weights, in_all = np.empty(3), np.empty(len(errors)), 0.0
     expected(belief, tools, mean)
@@ -419,24 +441,73 @@ def scatter(
             continue
         in_all += belief[k]
         one, other = along_both(hands, still, stages[k])
-        total = 1e-9
+        total = 1e-9 + mass
         for m in range(len(errors)):
             square = (one - errors[m, 0]) ** 2 + (other - errors[m, 1]) ** 2
             weights[m] = math.exp(-0.5 * square / ERROR_WIDTH**2) * (
                 1.0 if errors[m, 2] == k else OTHER_STAGE_ERROR_WEIGHT
             )
             total += weights[m]
+        share = _tool_share(tools[k], stages[k]) if mass else 0.0
         for i in range(3):
             for j in range(i, 3):
                 found = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j])
                 for m in range(len(errors)):
                     found += weights[m] * errors[m, 3 + i] * errors[m, 3 + j] / total
+                if mass:
+                    found += mass * size["unknown_std"] ** 2 / total if i == j else 0.0
+                    begin, end = stages[k]["scatter"][0, i, j], stages[k]["scatter"][1, i, j]
+                    found += (1.0 - share) ** 2 * begin + share**2 * end
                 out[i, j] += belief[k] * found
     for i in range(3):
         for j in range(i, 3):
             out[i, j] /= in_all
             out[j, i] = out[i, j]
-        out[i, i] += std**2 + LEAST_STD_M**2
+        out[i, i] += size["std"] ** 2 + LEAST_STD_M**2
+
+
+@compiled
+def elsewhere(
+    now: Vector,
+    still: Vector,
+    period_s: float,
+    belief: Vector,
+    unprimed: Vector,
+    stages: Records,
+    sizes: Records,
+    rows: Vector,
+) -> float:
+    """Probability that the task did not begin at its first stage, and the tool belongs more than
+    UNSURE_M from where the most probable stage k has it:
+
+        Σ_j q_j [|t_j - t_k| > UNSURE_M]
+
+    q (K or more,), `unprimed`, is the belief by the hands' motion (3, 6) alone, for which no stage
+    is the first; it is updated in place. Once it agrees with the `belief`, the evidence has decided
+    and UNPRIMED_DECIDED replaces its first number. The clock of each stage is at its
+    begin here, and a tool does not turn.
+    """
+    if unprimed[0] == UNPRIMED_DECIDED:
+        return 0.0
+    recognise(unprimed, now, period_s, stages, 1.0)
+    count, most, apart = len(stages), 0, 0.0
+    for k in range(count):
+        apart = max(apart, abs(unprimed[k] - belief[k]))
+        if belief[k] > belief[most]:
+            most = k
+    if apart < LEAST_STAGE_PROBABILITY:
+        unprimed[0] = UNPRIMED_DECIDED
+        return 0.0
+    either, tools, tempo = np.empty(count), np.empty((count, 3)), np.zeros(3)
+    tempo[:2] = still
+    for k in range(count):
+        either[k] = max(unprimed[k], 1.0 if k == most else 0.0)
+    tools_at(now[0], tempo, either, stages, sizes, rows, np.empty((0, 9)), tools)
+    out = 0.0
+    for k in range(count):
+        if unprimed[k] >= LEAST_STAGE_PROBABILITY and squared_distance(tools[k], tools[most]) > UNSURE_M**2:
+            out += unprimed[k]
+    return out
 
 
 @compiled
@@ -485,7 +556,7 @@ def predicted(
         out[2, i] = min(max(acceleration, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
     if len(errors):
-        scatter(hands[1], tempo, belief, stages, tools[1], errors, sizes[0]["std"], out[3:])
+        scatter(hands[1], tempo, belief, stages, tools[1], errors, sizes[0], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
     return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])

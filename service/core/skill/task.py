@@ -29,6 +29,8 @@ TASK_RANGES = {
     "errors": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "delay": (0.0, 1.0, "s"),
     "levers": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
+    "unknown_std": (0.0, MAX_SKILL_DISTANCE_M, "m"),
+    "scatters": (-(MAX_SKILL_DISTANCE_M**2), MAX_SKILL_DISTANCE_M**2, "m²"),
 }
 """Minimum, maximum and unit of the numbers in the arrays of a task's model."""
 Indices = NDArray[np.int64]

@@ -51,6 +51,10 @@ AMBIGUOUS_S = 0.3  # shorter ambiguity is a transition between stages
 ERROR_WIDTH = 0.2  # width, in the inputs, of the neighbourhood in which errors are averaged
 # 0 to 0.5. More: stages share their errors. Less: stages have their own errors.
 OTHER_STAGE_ERROR_WEIGHT = 0.05  # weight of an error in another stage
+# 0.01 to 0.5. More: regions grow sooner away from what was shown. Less: they grow later.
+SUPPORT_MASS = 0.1  # a place is supported where errors of demonstrations weigh more than this
+# 1 to 16. More: errors are local. Less: errors are averaged wider.
+SUPPORT_SHARPNESS = 4.0  # sharpness of the kernel of errors / of the primitive's kernel, over the hands' inputs
 # 1e-3 to 0.01. More: the region is larger. Less: the region is smaller.
 LEAST_STD_M = 0.003  # lower limit of the standard deviation on each axis
 # 0.05 to 0.3. More: fewer targets are unsure. Less: more targets are unsure.

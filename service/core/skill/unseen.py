@@ -45,7 +45,7 @@ def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
     left out.
     """
     by_m = math.sqrt(REGION_95) * deviation_m(as_array(state), side, period_s)
-    known = state["covariance"], state["orientation_covariance"], float(state["closure"])
+    known = state["covariance"], state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
 
     def tool(hands: Vector) -> Vector:
         """Predicted position (3,) [m] of the tool for hands (2, 3) [m] at rest."""

@@ -31,7 +31,7 @@ from service.learning.methods.clock import Tempo, clock_of, paired, remark_on
 from service.learning.methods.held_out import Fit, gate_of, held_out_takes
 from service.learning.methods.weights import WEIGHTS, chosen
 from service.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
-from service.learning.regions import refitted_errors
+from service.learning.regions import local_errors, refitted_errors
 
 AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
@@ -127,6 +127,7 @@ class HandInputs:
         primitive = fit(None)
         held_out = held_out_takes(takes, inputs, fit, progress)
         gate = gate_of(primitive, held_out, kind.order, CEILING_M)
+        errors = None
         if len({take.person for take in takes}) >= LEAST_PERSONS:
             progress("calibrating the covariance")
 
@@ -135,10 +136,10 @@ class HandInputs:
                 others = refit(kind, some, known, points, ell, earlier=len(earlier), weight=weight)
                 return HandsKMP(others(None), kind.turned, kind.clock)
 
-            timed = refitted_errors(takes, inputs, refitted)
-            held_out = [one._replace(timed=errors) for one, errors in zip(held_out, timed, strict=True)]
+            timed, errors = local_errors(refitted_errors(takes, inputs, refitted), inputs, takes, primitive)
+            held_out = [one._replace(timed=found) for one, found in zip(held_out, timed, strict=True)]
         return Fitted(
-            HandsKMP(primitive, kind.turned, kind.clock),
+            HandsKMP(primitive, kind.turned, kind.clock, errors),
             held_out,
             gate,
             conductor=kind.alone,

@@ -27,8 +27,8 @@ from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, rows_of
-from service.core.skill.stages import MOST_STAGES, OUTPUTS, STAYS
+from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, Unknown, rows_of
+from service.core.skill.stages import MOST_STAGES, NONE, OUTPUTS, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
@@ -51,7 +51,7 @@ from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, CLOCKS, LEAST_TURN_RAD, POSITIONS, clock_limit_m, refit
 from service.learning.methods.weights import WEIGHTS, chosen
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, Weights, persons_of
-from service.learning.regions import blocks_of
+from service.learning.regions import blocks_of, unknown_std
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
@@ -388,6 +388,8 @@ class Staged:
             primitive = best.samples.fitted(best.parameters, _left_out(blocks, block))
             predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
+        unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
+        known = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
         progress(f"learning from all {len(takes)}")
         model = StagedKMP(
             best.samples.fitted(best.parameters),
@@ -397,13 +399,14 @@ class Staged:
             np.concatenate(errors),
             delay.mean_s,
             clock=best.samples.clock,
+            unknown=unknown,
         )
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, model.clock)
+                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, model.clock, known)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
@@ -506,6 +509,18 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
         if min(errors_m) < limit_m:
             out[name] = best.clocked(tempos, preferred(tried, errors_m, AS_GOOD * min(errors_m)))
     return out
+
+
+def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
+    """The covariances (N, 3, 3) [m²] of the tool at each via-point over the demonstrations; of its
+    offset from the hand, where it follows one; zeros, where it also turns with that hand.
+    """
+    at = np.array([one.at.at[[one.at.names.index(name) for name in task.names]] for one in encoded])
+    for n, side in enumerate(task.follow.tolist()):
+        if side != NONE:
+            at[:, n, 6:] -= at[:, n, 6:] if task.levers is not None else at[:, n, 3 * side : 3 * side + 3]
+    off = at[:, :, 6:] - at[:, :, 6:].mean(axis=0)
+    return np.asarray(np.einsum("dni,dnj->nij", off, off) / max(len(encoded) - 1, 1))
 
 
 def _off_m(encoded: Sequence[Encoded]) -> Vector:

@@ -1,0 +1,124 @@
+"""Errors of held-out demonstrations, and how far a prediction is supported by them.
+
+A prediction is as uncertain as predictions at like inputs were wrong. Where no demonstration was,
+the tool may be wherever demonstrations had it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kmp import KMP
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.compiled import compiled
+from service.core.frame import Vector
+from service.core.numerics import PROBABILITY_ROUND_TO
+from service.core.skill.model import LEVELS
+from service.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
+
+SURVIVAL = -np.log1p(-np.array(LEVELS))  # -log of the share of errors beyond each level
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LocalErrors(Immutable):
+    """Errors e_m of held-out demonstrations at inputs x_m of a primitive.
+
+    * `inputs` (I, M): one row an input.
+    * `errors` (M, 3) [m].
+    * `stretch` (I,): factors c_i of the kernel exp(-Σ_i (c_i (x_i - x_mi))²).
+    * `unknown_std_m`: standard deviation of the tool on each axis where no demonstration was.
+    """
+
+    inputs: Vector
+    errors: Vector
+    stretch: Vector
+    unknown_std_m: float
+
+    def __post_init__(self) -> None:
+        for part in (self.inputs, self.errors, self.stretch):
+            frozen(part)
+
+    @classmethod
+    def of(cls, primitive: KMP, inputs: Vector, errors: Vector, unknown_std_m: float) -> LocalErrors:
+        """Errors (M, 3) [m] at inputs (M, I) of a primitive, whose kernel is made
+        SUPPORT_SHARPNESS times as sharp.
+        """
+        scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
+        factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
+        return cls(np.array(inputs.T, order="C"), np.array(errors, order="C"), factors, unknown_std_m)
+
+    def covariances(self, inputs: Vector) -> Vector:
+        """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
+        out = np.empty((len(inputs), 3, 3))
+        for at, found in zip(np.array(inputs, order="C"), out, strict=True):
+            local_scatter(at, self.stretch, self.inputs, self.errors, self.unknown_std_m, found)
+        return out
+
+
+@compiled
+def local_scatter(
+    at: Vector, stretch: Vector, inputs: Vector, errors: Vector, unknown_std_m: float, out: Vector
+) -> None:
+    """Covariance C (3, 3) [m²] of the tool at an input x (I,), written to `out`:
+
+        C = (ν σ² I + Σ_m g_m e_m e_mᵀ) / (ν + Σ_m g_m) + LEAST_STD_M² I
+        g_m = exp(-Σ_i (c_i (x_i - x_mi))²),   ν = SUPPORT_MASS,   σ = `unknown_std_m`
+
+    So it is the scatter of the errors e_m (M, 3) at like inputs x_m (I, M) where there are some,
+    and grows to σ² away from all of them: the posterior mean of a variance whose prior weighs as
+    much as ν errors.
+    """
+    count = errors.shape[0]
+    squares = np.zeros(count)
+    for i in range(len(at)):
+        for m in range(count):
+            squares[m] += (stretch[i] * (at[i] - inputs[i, m])) ** 2
+    out[:] = 0.0
+    total = SUPPORT_MASS
+    for m in range(count):
+        weight = math.exp(-squares[m])
+        total += weight
+        for i in range(3):
+            for j in range(i, 3):
+                out[i, j] += weight * errors[m, i] * errors[m, j]
+    for i in range(3):
+        out[i, i] += SUPPORT_MASS * unknown_std_m**2
+        for j in range(i, 3):
+            out[i, j] /= total
+            out[j, i] = out[i, j]
+        out[i, i] += LEAST_STD_M**2
+
+
+@compiled
+def error_probability(covariance: Vector, added: float, ratios: Vector) -> float:
+    """Probability, rounded, that the tool is farther than UNSURE_M from its prediction, whose
+    calibrated covariance C is (3, 3) [m²]. A variance that is `added` [m²] counts beside tr C.
+
+    `ratios` (L,) are the quantiles of |e|² / tr C at LEVELS. With u = UNSURE_M² / tr C, -log of the
+    probability is interpolated linearly in log u between them, and beyond the last ones with their
+    slope. Below the first one, the share of smaller errors is proportional to u.
+    """
+    trace = covariance[0, 0] + covariance[1, 1] + covariance[2, 2] + added
+    if trace <= 0.0:
+        return 0.0
+    ratio = UNSURE_M**2 / trace
+    if ratio <= ratios[0]:
+        found = 1.0 - LEVELS[0] * ratio / ratios[0]
+    else:
+        k = 1
+        while k < len(ratios) - 1 and ratio > ratios[k]:
+            k += 1
+        width = max(math.log(ratios[k] / ratios[k - 1]), 1e-3)
+        along = math.log(ratio / ratios[k - 1]) / width
+        found = math.exp(-(SURVIVAL[k - 1] + along * (SURVIVAL[k] - SURVIVAL[k - 1])))
+    return float(np.rint(found * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO)
+
+
+@compiled
+def error_probabilities(covariances: Vector, ratios: Vector, out: Vector) -> None:
+    """Error probabilities of calibrated covariances (T, 3, 3) [m²], written to `out` (T,)."""
+    for t in range(len(covariances)):
+        out[t] = error_probability(covariances[t], 0.0, ratios)

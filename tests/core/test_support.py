@@ -1,0 +1,157 @@
+"""Predictions are as uncertain as errors at like inputs, and more where no error is near."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kmp import KMP, GaussianKernel, Gaussians
+from service.core.controller import start_state
+from service.core.frame import blank, frame_layout
+from service.core.numerics import UNPRIMED_DECIDED
+from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.model import LEVELS, NORMAL_RATIOS, Regions
+from service.core.skill.skill import Skill
+from service.core.skill.stage import SkillStage
+from service.core.skill.staged import StagedKMP, Unknown
+from service.core.skill.support import LocalErrors, error_probability
+from service.core.skill.tuning import LEAST_STD_M, UNSURE_M
+from service.files.shipped import shipped_skill
+from service.learning.skill_file import decoded, with_file
+from service.settings.config import Settings
+from sim.scene import Scene
+from support.paths import RECORDINGS
+
+FAR_STD_M = 0.3
+STILL = np.zeros((2, 3))
+
+
+@pytest.fixture(scope="module")
+def errors() -> LocalErrors:
+    """Errors of 2 cm along x at inputs about the origin, and of 5 cm along y a metre away."""
+    primitive = KMP.fit(
+        np.random.default_rng(1).normal(size=(8, 2)),
+        Gaussians(np.zeros((8, 3)), np.tile(np.eye(3), (8, 1, 1))),
+        kernel=GaussianKernel(5.0),
+        lambda_mean=1.0,
+    )
+    inputs = np.concatenate([np.zeros((20, 2)), np.ones((20, 2))])
+    off = np.concatenate([np.tile([0.02, 0.0, 0.0], (20, 1)), np.tile([0.0, 0.05, 0.0], (20, 1))])
+    return LocalErrors.of(primitive, inputs, off, FAR_STD_M)
+
+
+def test_the_covariance_is_the_scatter_of_near_errors_and_away_from_all_that_of_the_tool(errors: LocalErrors) -> None:
+    least = LEAST_STD_M**2 * np.eye(3)
+    near, other, far = errors.covariances(np.array([[0.0, 0.0], [1.0, 1.0], [6.0, -6.0]])) - least
+    prior = 0.1 / 20.1 * FAR_STD_M**2
+    np.testing.assert_allclose(near, np.diag([0.02**2, 0.0, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(other, np.diag([0.0, 0.05**2, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(far, FAR_STD_M**2 * np.eye(3), atol=1e-9)
+    away = np.linspace(0.0, 3.0, 30)[:, None] * [1.0, -1.0]
+    grows = np.trace(errors.covariances(away), axis1=1, axis2=2)
+    assert (np.diff(grows) >= -1e-12).all()
+
+
+def test_an_error_probability_is_the_share_of_errors_beyond_each_level_and_grows_with_the_covariance() -> None:
+    ratios = np.array(NORMAL_RATIOS)
+    at_levels = [error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios]
+    np.testing.assert_allclose(at_levels, 1.0 - np.array(LEVELS), atol=1e-6)
+    stds = np.geomspace(0.005, 3.0, 60)
+    found = [error_probability(std**2 * np.eye(3), 0.0, ratios) for std in stds]
+    assert (np.diff(found) >= 0.0).all()
+    assert found[0] < 1e-4
+    assert found[-1] > 0.99
+    drawn = np.linalg.norm(0.05 * np.random.default_rng(2).normal(size=(20_000, 3)), axis=1) > UNSURE_M
+    assert error_probability(0.05**2 * np.eye(3), 0.0, ratios) == pytest.approx(drawn.mean(), abs=0.02)
+    assert error_probability(0.05**2 * np.eye(3), 0.0075, ratios) == error_probability(0.005 * np.eye(3), 0.0, ratios)
+    assert error_probability(np.zeros((3, 3)), 0.0, ratios) == 0.0
+
+
+def staged(**more: object) -> StagedKMP:
+    model = shipped_skill().model
+    assert isinstance(model, StagedKMP)
+    return replace(model, **more)  # type: ignore[arg-type]
+
+
+def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are_uncertain() -> None:
+    known = staged()
+    count = len(known.names)
+    scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
+    model = staged(unknown=Unknown(FAR_STD_M, scatters))
+    at_last, last = known.hands[-1:], known.names[-1:]
+
+    def covariance(one: StagedKMP, hands: np.ndarray) -> np.ndarray:
+        belief = np.zeros(64)
+        belief[count - 2] = 1.0
+        return one.placed.covariance(hands[0], belief)
+
+    given = model.through(Scene().via_points()[-1:], tolerance=0.05, weight=1.0)
+    assert given.via_points[0].name == last[0]
+    added = covariance(model, at_last) - covariance(known, at_last)
+    assert np.diag(added) == pytest.approx([0.02, 0.03, 0.01], rel=0.2)
+    assert np.abs(covariance(given, at_last) - covariance(known, at_last)).max() < 2e-3
+    few = staged(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=known.errors[known.errors[:, 2] < 0.5])
+    alone = staged(errors=few.errors)
+    assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this stage"
+
+
+def test_a_skill_of_the_hands_inputs_gates_by_its_primitive_whatever_its_covariance() -> None:
+    plain = decoded((RECORDINGS / "experiments/as-paper.npz").read_bytes(), origin="as-paper.npz")
+    assert isinstance(plain.model, HandsKMP)
+    hands = plain.hands[::10]
+    off = 0.01 * np.random.default_rng(3).normal(size=(len(hands), 3))
+    local = LocalErrors.of(plain.model.primitive, plain.model.inputs(hands), off, FAR_STD_M)
+    skill = decoded(with_file(replace(plain, model=replace(plain.model, errors=local))).file, origin="memory")
+    one, other = (s.predict(hands[3].reshape(2, 3), STILL, STILL) for s in (skill, plain))
+    assert one.gate_m == other.gate_m
+    np.testing.assert_allclose(one.covariance, local.covariances(hands[3:4])[0], atol=1e-9)
+    before = one.covariance, np.zeros((3, 3)), -1.0, one.gate_m
+    again = skill.predict(hands[3].reshape(2, 3), STILL, STILL, before=before)
+    assert (again.gate_m, again.covariance.tobytes()) == (one.gate_m, one.covariance.tobytes())
+    apart = skill.predict(hands[3].reshape(2, 3) + 1.0, STILL, STILL)
+    assert np.trace(apart.covariance) == pytest.approx(3 * (FAR_STD_M**2 + LEAST_STD_M**2), rel=1e-3)
+
+
+def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], list[bool], float]:
+    """Error probabilities and flags of hands (2, 3) that rest, and the last unprimed belief in the
+    first stage."""
+    settings = Settings()
+    stage, state = SkillStage(settings, skill), start_state(settings, skill)
+    frame = blank(frame_layout(len(settings.joints.names)))
+    state["hands"][:, 0], state["hand_stillness"] = hands, 1.0
+    found, unsure = [], []
+    for tick in range(1, ticks + 1):
+        state["tick"], state["hand_ticks"] = tick, tick
+        stage.step(state, frame)
+        found.append(float(frame["error_probability"]))
+        unsure.append(bool(state["unsure"]))
+    return found, unsure, float(state["unprimed_belief"][0])
+
+
+def test_a_task_that_may_have_begun_in_another_stage_is_unsure_until_the_hands_tell() -> None:
+    shipped = shipped_skill()
+    regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
+    model = staged()
+    begin, at = model.hands[0].reshape(2, 3), model.nominal.at.copy()
+    at[2, :6] = model.hands[0]  # the hands return to where they began, and the tool is elsewhere then
+    at[2, 6:] = at[0, 6:] + (0.0, 0.3, 0.0)
+    apart = model.task._replace(corners=np.tile(np.arange(len(at))[:, None], 2))
+    again = replace(model, task=apart, nominal=model.nominal._replace(at=at))
+    alike = replace(shipped, model=again, regions=regions)
+    told, unsure, _ = doubts(alike, begin, 5)
+    assert told[-1] > 0.3
+    assert unsure[-1]
+    _, unsure, decided = doubts(replace(shipped, regions=regions), begin, 600)
+    assert decided == UNPRIMED_DECIDED
+    assert not unsure[-1]
+
+
+def test_a_skill_without_an_alarm_has_an_error_probability_and_the_flag_that_it_had() -> None:
+    shipped = shipped_skill()
+    assert shipped.regions == Regions(*shipped.regions[:3])
+    told, unsure, decided = doubts(shipped, shipped.hands[0].reshape(2, 3), 3)
+    assert 0.0 < told[-1] < 0.01
+    assert not unsure[-1]
+    assert decided == 0.0
