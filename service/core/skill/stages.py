@@ -58,6 +58,8 @@ STAGE = np.dtype(
         ("tool", np.float64, (3,)),  # [m] the tool's first via-point
         ("tool_way", np.float64, (3,)),  # [m] the tool's segment
         ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the stage
+        ("pulled", np.int64, (2,)),  # first row of the pulls of this stage alone, and the row after the last one
+        ("sharpness", np.float64),  # [1/m²] sharpness of these pulls
     ]
 )
 # Numbers that hold in all stages, as compiled functions read them.
@@ -67,6 +69,7 @@ PLACED = np.dtype(
         ("likeness", np.float64),  # factor of the kernel for a centre of another stage
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
+        ("pulls", np.int64),  # number of pulls that act in all stages; they are the first rows
     ]
 )
 # The hands' motion as compiled functions read it: see `model.Seen`.
@@ -263,8 +266,8 @@ def _tool_in(
         tool = t + s u + δ
 
     t and u are the tool's first via-point and its segment. Added are the hands that the tool
-    follows (`add_followed`) and the `pulls` (X, 9) of other via-points
-    (`via_points.pulls_through`).
+    follows (`add_followed`) and the `pulls` (X, 9) of other via-points, those that act in all
+    stages and those of stage k (`via_points.pulls_through`).
     """
     stage, found = stages[k], np.empty(OUTPUTS)
     one, other = along_both(hands, still, stage)
@@ -280,7 +283,8 @@ def _tool_in(
         out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
     add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
-        add_weighted(hands, pulls, PULL_SHARPNESS_PER_M2, out)
+        add_weighted(hands, pulls[: size["pulls"]], PULL_SHARPNESS_PER_M2, out)
+        add_weighted(hands, pulls[stage["pulled"][0] : stage["pulled"][1]], stage["sharpness"], out)
 
 
 @compiled
