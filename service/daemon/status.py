@@ -24,6 +24,7 @@ from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEY_OF_SOURCE
+from service.learning.corrections import offer_of
 from service.settings.config import Settings
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
@@ -95,6 +96,8 @@ class CellStatus(NamedTuple):
             stage_belief=round(float(frame["stage_belief"]), 3),
             deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
+            guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
+            offer=offer_of(skill),
             **more,
         )
 
