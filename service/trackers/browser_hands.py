@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import time
 from collections.abc import Callable
 
@@ -21,7 +22,7 @@ from service.client import Client, Tracker
 from service.contract.incidents import ORDERS
 from service.contract.messages import WireError
 from service.trackers import web_server
-from service.trackers.cell_view import Latest, carried_out
+from service.trackers.cell_view import Latest, carried_out, corrected
 from service.trackers.hand_message import PageHands, decode_hands, is_ping, pong
 from service.trackers.pinch import Pinches
 
@@ -31,6 +32,7 @@ PAGE_SILENCE_S = 10.0  # a page that sends nothing for this long is disconnected
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
 MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
 PAGE_STATUS_S = 0.1  # interval of the status
+CORRECTION = re.compile(r"correct (undo|(?:-?\d{1,2}(?:\.\d{1,6})?(?: |$)){3})")
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
 NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
@@ -104,8 +106,9 @@ class BrowserHands:
                 if not self._publish(page, hands):
                     return await web_server.close(page, 409, TAKEN)
             elif message.type == WSMsgType.TEXT:
-                if message.data not in ORDERS:
-                    return await web_server.close(page, 400, f"Refused: {' or '.join(ORDERS)} needed as text")
+                if message.data not in ORDERS and not CORRECTION.fullmatch(message.data):
+                    needed = f"{' or '.join(ORDERS)}, or correct with undo or three numbers,"
+                    return await web_server.close(page, 400, f"Refused: {needed} needed as text")
                 if not orders:  # a page waits for the answer to its last order
                     orders.add(order := asyncio.create_task(self._order(page, message.data)))
                     order.add_done_callback(orders.discard)
@@ -150,7 +153,9 @@ class BrowserHands:
                 await asyncio.sleep(PAGE_STATUS_S)
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
-        """Carry out an order, even if the page disconnects meanwhile."""
-        is_done, text = await asyncio.to_thread(carried_out, self._client, order)
+        """Carry out an order or a correction, even if the page disconnects meanwhile."""
+        found = CORRECTION.fullmatch(order)
+        work, given = (corrected, found[1]) if found else (carried_out, order)
+        is_done, text = await asyncio.to_thread(work, self._client, given)
         with contextlib.suppress(ConnectionError):
             await page.send_str(json.dumps({"answer": text, "done": is_done}))
