@@ -23,7 +23,7 @@ HOLD_ENDED = "the hold ended while this was computed; nothing was changed. Hold 
 Moment = tuple[Frame, Record]
 
 
-class Led(NamedTuple):
+class LedTool(NamedTuple):
     """The hands (6,) [m] and the stage (-1: none) that a correction belongs to, the tool (3,) [m]
     with its orientation, and the arm's joints (J,) [rad] now.
     """
@@ -44,14 +44,14 @@ class Corrections:
         self._arm: Arm | None = None
         self._replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
 
-    def led(self, request: Correct, skill: Skill) -> Led:
+    def led(self, request: Correct, skill: Skill) -> LedTool:
         """The hands and the tool of a correction that is requested now. Raises RequestError."""
         frame, state = self._moment()
         self.check_held()
         hands, stage = self._hands(request, skill, frame, state)
         joints = np.array(state["joints"][0])
         if request.tool is not None:
-            return Led(hands, stage, np.array(request.tool), None, joints)
+            return LedTool(hands, stage, np.array(request.tool), None, joints)
         settings = self._settings
         if settings.arm.source == "assumed":
             raise RequestError("$.tool: missing; needed, as this daemon assumes where the arm is and measures nothing")
@@ -70,7 +70,7 @@ class Corrections:
         quaternion_of(here.rotation, quaternion)
         x, y, z, w = (round(value, 6) for value in quaternion.tolist())
         orientation = (x, y, z, w) if request.turned else None
-        return Led(hands, stage, np.array(here.position), orientation, np.array(state["measured"]))
+        return LedTool(hands, stage, np.array(here.position), orientation, np.array(state["measured"]))
 
     def check_held(self) -> None:
         """Raise RequestError unless the arm holds for an operator."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.contract import cdr
-from service.contract.records import Mode, Reason
+from service.contract.records import Flag, Mode, Reason
 from service.core.codes import HELD_SEEN, HELD_UNSEEN
 from service.core.frame import Event, order
 from service.core.skill.skill import Skill
@@ -46,7 +46,6 @@ def test_an_arm_that_is_led_holds_and_starts_again_where_it_was_left(taught: Ski
     assert not led["commanded"][200:].any()  # after the stop of an arm that followed
     np.testing.assert_allclose(led["joints"][-1], loop.joints, atol=1e-2)  # what is drawn is the led arm
     ended = loop.run(300, {0: guided(False)})
-    assert ended["reason"][0] == Reason.ARM_NOT_READY
     assert (ended["reason"][100:] == Reason.OPERATOR).all()
     assert (np.abs(ended["joints"][100:] - loop.joints) < 1e-9).all()
     state = loop.controller.state
@@ -56,7 +55,9 @@ def test_an_arm_that_is_led_holds_and_starts_again_where_it_was_left(taught: Ski
     resumed = loop.run(1500, {0: order("resume")})
     assert (resumed["mode"] == Mode.FOLLOW).all()
     speeds = np.linalg.norm(np.diff(resumed["tool"], axis=0), axis=1) / CELL.period_s
-    assert 0.1 < speeds.max() < CELL.tool.engage_speed + 0.03
+    is_engaging = (resumed["flags"][1:] & int(Flag.ENGAGING)) > 0
+    assert is_engaging.sum() > 50
+    assert 0.1 < speeds[is_engaging].max() < 1.1 * CELL.tool.engage_speed
     assert np.linalg.norm(resumed["tool"][-1] - resumed["target"][-1]) < 2e-3
     assert_limits_hold(resumed)
     assert not loop.controller.state["held"]
