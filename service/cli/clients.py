@@ -35,6 +35,10 @@ def via_points(args: argparse.Namespace) -> int:
             missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
         if point["gripper"]:
             missed += f", gripper {point['gripper']}"
+        if point["stage"]:
+            missed += f", in the stage from {point['stage']} on"
+        if point["corrections"]:
+            missed += f", corrected {point['corrections']} time{'s' * (point['corrections'] != 1)}"
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")

@@ -200,7 +200,7 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
 
 
 def _chosen(node: Any, value: Any) -> Any:
-    """Of several tagged structs, the one that the value's tag names; of a type or null, the type."""
+    """Of tagged structs, the one that the value's tag names; of a type or null, that type."""
     if not isinstance(node, inspect.UnionType):
         return node
     types = [one for one in node.types if not isinstance(one, inspect.NoneType)]

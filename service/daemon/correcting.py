@@ -54,7 +54,7 @@ class Corrections:
             return LedTool(hands, stage, np.array(request.tool), None, joints)
         settings = self._settings
         if settings.arm.source == "assumed":
-            raise RequestError("$.tool: missing; needed, as this daemon assumes where the arm is and measures nothing")
+            raise RequestError("$.tool: none given; needed, as this daemon does not measure where the arm is")
         if state["guided_tick"] < max(state["held_tick"], 1):
             raise RequestError(
                 "the arm was not led in this hold: its driver reported no guiding on `joints/guided`. Switch on hand "

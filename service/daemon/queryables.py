@@ -383,10 +383,16 @@ class Queryables:
                 f"the tool is {1000 * moved_m:.0f} mm from where the skill has it for these hands; "
                 f"{1000 * LEAST_CORRECTION_M:.0f} mm or more needed for a correction"
             )
+        gate_m = float(skill.model.gates_m(skill.conducting(led.hands))[0])
+        if gate_m > skill.threshold:
+            raise RequestError(
+                f"{skill.model.measure} is {gate_m:.3f} m at these hands; at most {skill.threshold:.3f} m accepted, as "
+                "the arm holds there whatever is corrected. Demonstrate this"
+            )
         self._check([point], "$.tool")
         orientation = skill.orientation if led.orientation is None else np.array(led.orientation)
         hands = skill.conducting(led.hands).reshape(2, 3)
-        if not self._skill_worker.way_out(self._settings, led.joints, led.tool, orientation, hands):
+        if not self._skill_worker.has_posture(self._settings, led.joints, led.tool, orientation, hands):
             raise RequestError(
                 f"$.tool: {list(point.tool)}: no posture of the arm has the tool there and keeps clear of these hands, "
                 "of things and of itself"

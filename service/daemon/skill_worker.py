@@ -88,6 +88,12 @@ class SkillWorker:
         found: list[Vector] = self._ask(timeout_s, way_out_of, settings, *arguments)
         return found
 
+    def has_posture(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> bool:
+        """The result of `WayOut.has_posture` for the cell. Raises SkillError, also after
+        `timeout_s` [s].
+        """
+        return bool(self._ask(timeout_s, has_posture_of, settings, *arguments))
+
     def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = WORK_TIMEOUT_S) -> Vector:
         """Distances (M,) [m] of positions (M, 3) beyond the reach, see `learning.reach.beyond_m`.
         Raises SkillError, also after `timeout_s` [s].
@@ -163,6 +169,11 @@ def _receive(channel: socket.socket) -> Any:
 def way_out_of(settings: Settings, *arguments: Vector) -> list[Vector]:
     """The result of `WayOut.find` for the cell."""
     return WayOut(settings, robot_description(settings)).find(*arguments)
+
+
+def has_posture_of(settings: Settings, *arguments: Vector) -> bool:
+    """The result of `WayOut.has_posture` for the cell."""
+    return WayOut(settings, robot_description(settings)).has_posture(*arguments)
 
 
 def skill_of(
