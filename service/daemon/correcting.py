@@ -1,4 +1,4 @@
-"""What an operator corrects: the hands, the stage and the led tool, taken from the loop's state."""
+"""Corrections of an operator: their hands, stage and led tool, taken from the loop's state."""
 
 from __future__ import annotations
 

@@ -84,6 +84,13 @@ def correction_at(
     return Correcting(point, tuple(replaced))
 
 
+def off_m(skill: Skill, correcting: Correcting) -> float:
+    """The distance [m] of a correction's tool from where the skill has it for these hands."""
+    point = correcting.point
+    tool = skill.mean(_hands(point)[None], [rest_of(point, skill.model.names)])[0]
+    return math.dist(point.tool, tool)
+
+
 def newest_correction(via_points: Sequence[ViaPoint]) -> ViaPoint | None:
     """The correction that was made last; None if there is none."""
     return next((point for point in reversed(via_points) if point.corrections), None)
@@ -167,10 +174,3 @@ def _hands(point: ViaPoint) -> Vector:
 def _point(values: Vector) -> tuple[float, float, float]:
     x, y, z = (round(value, 6) for value in values.tolist())
     return x, y, z
-
-
-def off_m(skill: Skill, correcting: Correcting) -> float:
-    """The distance [m] of a correction's tool from where the skill has it for these hands."""
-    point = correcting.point
-    tool = skill.mean(_hands(point)[None], [rest_of(point, skill.model.names)])[0]
-    return math.dist(point.tool, tool)

@@ -30,6 +30,7 @@ from service.trackers.browser_hands import NO_TOKEN
 from sim.scene import HAND_ORIENTATION
 from support import chromium
 from support.cell import Daemon, serving, thirdhand
+from support.chromium import Tab
 from support.dragging import Person
 from support.paths import ROOT
 
@@ -132,6 +133,16 @@ def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_dr
         daemon.until(lambda status: status["mode"] == "follow")
 
 
+def pressed(tab: Tab, button: str) -> str:
+    """The answer to a button; it is pressed again if a busy machine's skill worker was late."""
+    for _ in range(6):
+        tab.ask(f"at('{button}').click()")
+        tab.until("!at('answer').textContent.endsWith(' ...') && at('answer').textContent !== ''")
+        if "the skill worker" not in (answer := str(tab.ask("at('answer').textContent"))):
+            break
+    return answer
+
+
 def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
     """The position of the tool [m], once an operator's hold has brought it to rest."""
     before: list[float] = []
@@ -148,7 +159,7 @@ def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
 def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_undone(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
-    with person_at(url, tmp_path, timeout_s=3 * TIMEOUT_S) as person:
+    with person_at(url, tmp_path, timeout_s=5 * TIMEOUT_S) as person:
         tab = person.tab
         first, second, *_ = (at[0] for at in daemon.client.status().hands_at_m.values())
         halfway = tuple(np.mean([first, second], axis=0).tolist())
@@ -167,8 +178,7 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         there = tuple(json.loads(tab.ask("JSON.stringify(dragged)")))
         assert math.dist(there[:2], (x + 0.02, y + 0.06)) < 0.005
         tab.picture(tmp_path / "dragged.png")
-        tab.ask("at('correct').click()")
-        tab.until("at('answer').textContent.startsWith('correction-1 in force: it moves the tool by ')")
+        assert pressed(tab, "correct").startswith("correction-1 in force: it moves the tool by ")
         (point,) = daemon.client.places()
         assert math.dist(point.tool, there) < 1e-3
         assert math.dist(point.left, halfway) < 5e-3
@@ -177,11 +187,9 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         tab.until("at('correcting').hidden && dragged === null")
         tab.ask("at('hold').click()")
         tab.until("!at('correcting').hidden")
-        tab.ask("at('undo').click()")
-        tab.until("at('answer').textContent.startsWith('correction-1 undone: it no longer moves the tool by ')")
+        assert pressed(tab, "undo").startswith("correction-1 undone: it no longer moves the tool by ")
         assert daemon.client.places() == ()
-        tab.ask("at('undo').click()")
-        tab.until("at('answer').textContent === 'correct was NOT carried out: no correction is in force'")
+        assert pressed(tab, "undo") == "correct was NOT carried out: no correction is in force"
         tab.ask("at('resume').click()")
         daemon.until(lambda status: status["mode"] == "follow")
 
