@@ -33,6 +33,7 @@ GROUPS = {
         "other-recordings",
         "arrays",
         "places",
+        "correct",
         "pose",
         "unseen-hands",
         "hardware",

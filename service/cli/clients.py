@@ -1,4 +1,4 @@
-"""`thirdhand via-points`, `stage`, `hold`, `resume`, `reset`: requests to a running daemon."""
+"""`thirdhand via-points`, `stage`, `correct`, `hold`, `resume`, `reset`: requests to a daemon."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from service.cli.usage import UsageError, added_in, reached
 from service.client import Client
 from service.contract.incidents import in_brief, what_to_do
 from service.contract.records import SIDES
+from service.contract.requests import Correction
 
 
 def via_points(args: argparse.Namespace) -> int:
@@ -34,6 +35,10 @@ def via_points(args: argparse.Namespace) -> int:
             missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
         if point["gripper"]:
             missed += f", gripper {point['gripper']}"
+        if point["stage"]:
+            missed += f", in the stage from {point['stage']} on"
+        if point["corrections"]:
+            missed += f", corrected {point['corrections']} time{'s' * (point['corrections'] != 1)}"
         print(f"{point['name']:<16} tool {tool}   {missed}")
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
@@ -69,6 +74,25 @@ def stage(args: argparse.Namespace) -> int:
     reply = ask(args, "stage", {"name": args.name})
     mode, reason = (reply.get(name, "") for name in ("mode", "reason"))
     print(f"at {args.name} since tick {reply['tick']}: {in_brief(mode, reason)}")
+    return 0
+
+
+def correct(args: argparse.Namespace) -> int:
+    """Correct the tool, or undo the last correction, and print its effect; exit code 0."""
+    request: dict[str, Any] = {"op": "undo"}
+    if not args.undo:
+        request = {"op": "add", "hands": "now" if args.now else "held", "turned": args.turned}
+        request |= {"tool": args.tool} if args.tool else {}
+    elif args.tool or args.now or args.turned:
+        raise UsageError("--undo accepts no other option")
+    reply = ask(args, "correct", request)
+    found = msgspec.convert(reply["correction"], Correction)
+    print(f"{found.name} {'undone' if found.undone else 'in force'} since tick {reply['tick']}: {found.text}")
+    print("Then `thirdhand resume`: the tool approaches its target at [tool] engage_speed.")
+    if note := reply.get("note"):
+        print(note[0].upper() + note[1:])
+    for warning in reply.get("warnings", ()):
+        print(f"warning: {warning}", file=sys.stderr)
     return 0
 
 

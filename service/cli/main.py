@@ -28,7 +28,7 @@ from service.settings.file_content import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
     **dict.fromkeys(("play", "replay", "learn"), "cli.recordings"),
-    **dict.fromkeys(("via-points", "stage", "hold", "resume", "reset"), "cli.clients"),
+    **dict.fromkeys(("via-points", "stage", "correct", "hold", "resume", "reset"), "cli.clients"),
     "report": "cli.report_command",
     "bench": "timing.benchmark",
 }
@@ -38,7 +38,7 @@ ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
-    "teach": ("record", "learn", "via-points", "stage"),
+    "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "bench"),
     "set up": ("arm", "calibrate", "certificates", "completion"),
@@ -295,6 +295,20 @@ def parser() -> argparse.ArgumentParser:
         )
     )
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
+
+    c = _reach(
+        command(
+            "correct",
+            "Corrects the tool while the arm holds: it belongs where you led it by hand.",
+            "thirdhand correct\n  thirdhand correct --tool .55 -.28 .40\n  thirdhand correct --undo",
+        )
+    )
+    at = "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this hold)"
+    c.add_argument("--tool", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
+    now = "correct for the hands of this moment (default: for those at which the hold began, as leading takes a hand)"
+    c.add_argument("--now", action="store_true", help=now)
+    c.add_argument("--turned", action="store_true", help="correct the orientation of the tool too")
+    c.add_argument("--undo", action="store_true", help="undo the last correction")
 
     c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")

@@ -135,6 +135,8 @@ def rows(now: Status) -> dict[str, str]:
         + _doubt(now)
         if now.target_m is not None
         else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
+        "led by hand": "yes, as the arm's driver reports" if now.guided else "",
+        "offer": now.offer,
         "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
         "turned": _turned(now),
         "gripper": now.gripper + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import zenoh
 
@@ -12,6 +12,7 @@ from service.client.presence import living, why_silent
 from service.client.replies import decoded
 from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, check_open, tried
 from service.contract import channels, requests
+from service.contract.messages import Vector3
 from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
@@ -72,6 +73,21 @@ class Client:
     def clear(self) -> Reply:
         """Remove all via-points; returns once that is in force."""
         return self._typed("via_points", requests.Clear(), Reply)
+
+    def correct(
+        self, tool: Vector3 | None = None, *, hands: Literal["held", "now"] = "held", turned: bool = False
+    ) -> Reply:
+        """Correct the tool in a hold: it belongs where the arm was led by hand or, if given, at
+        `tool` [m]; returns once that is in force.
+
+        It holds for the hands at which the hold began, or for those of `now`. If `turned`, the
+        orientation of the led tool is corrected too.
+        """
+        return self._typed("correct", requests.Correct(tool, hands, turned), Reply)
+
+    def undo_correction(self) -> Reply:
+        """Undo the last correction, in a hold; returns once that is in force."""
+        return self._typed("correct", requests.UndoCorrection(), Reply)
 
     def load_skill(self, name: str) -> Reply:
         """Load a file of the daemon's skill folder; returns once it is in force."""

@@ -103,6 +103,14 @@ class Connection(Client, AbstractContextManager["Connection"]):
             raise ValueError(f"clutch: {pressed!r} given; True or False needed")
         self._publish({"clutch": lambda _: cdr.encode_bool(pressed)}, None)
 
+    def guided(self, led: bool) -> None:
+        """Publish that somebody leads the arm by hand, or ends it; while it is led, again with each
+        joint state.
+        """
+        if not isinstance(led, bool):
+            raise ValueError(f"guided: {led!r} given; True or False needed")
+        self._publish({"joints/guided": lambda _: cdr.encode_bool(led)}, None)
+
     def wish_gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
         """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
         self._publish_closure("gripper/wish", closure, stamp_ns)

@@ -200,8 +200,13 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
 
 
 def _chosen(node: Any, value: Any) -> Any:
-    """Of several tagged structs, the one that the value's tag names."""
-    if isinstance(node, inspect.UnionType) and isinstance(value, dict):
+    """Of tagged structs, the one that the value's tag names; of a type or null, that type."""
+    if not isinstance(node, inspect.UnionType):
+        return node
+    types = [one for one in node.types if not isinstance(one, inspect.NoneType)]
+    if len(types) == 1 and value is not None:
+        return types[0]
+    if isinstance(value, dict):
         tagged = (one for one in node.types if isinstance(one, inspect.StructType) and one.tag_field)
         return next((one for one in tagged if value.get(one.tag_field) == one.tag), node)
     return node

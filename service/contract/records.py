@@ -41,6 +41,7 @@ class Reason(enum.IntEnum):
     BLOCKED = 12
     AMBIGUOUS = 13
     CLUTCH = 14
+    GUIDED = 15
 
 
 class Flag(enum.IntFlag):

@@ -14,6 +14,7 @@ from service.contract.records import GONE_S, SIDES
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 STARTING = "starting: "  # begins every answer of a daemon that is not ready yet
 NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
+MAX_REACH_M = 0.4  # hands farther away than this are not examined for the reach of a correction
 TOLERANCE_M = 0.05  # by default, a via-point replaces reference points nearer than this
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
 Point = tuple[Metre, Metre, Metre]
@@ -30,6 +31,9 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     coordinate `radius` away. Their tool position is the same, or moves with the hand named in
     `follow`. `orientation` is the tool's, a quaternion x y z w of norm 1; `gripper` opens or closes
     the gripper there. Both apply to the neighbourhood too.
+
+    With a `stage`, the name of a via-point of the task at which a stage begins, the via-point moves
+    the tool in that stage only. `corrections` is the number of corrections that led to it.
     """
 
     name: Name
@@ -41,6 +45,8 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     follow: Literal["none", "left", "right"] = "none"
     orientation: Orientation | None = None
     gripper: Literal["open", "closed"] | None = None
+    stage: Name | None = None
+    corrections: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 0
 
     def __post_init__(self) -> None:
         if self.orientation is not None and abs(math.hypot(*self.orientation) - 1.0) > NORM_TOLERANCE:
@@ -96,6 +102,30 @@ class StageRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: Name
 
 
+class Correct(_Operation, frozen=True, tag="add"):
+    """State, in a hold, where the tool belongs: where the arm was led by hand, or at `tool` [m].
+
+    The hands that it belongs to are those at which the hold began (`held`), because leading takes a
+    hand, or those of this moment (`now`). If `turned`, the orientation of the led tool is part of
+    the correction.
+    """
+
+    tool: Point | None = None
+    hands: Literal["held", "now"] = "held"
+    turned: bool = False
+
+    def __post_init__(self) -> None:
+        if self.turned and self.tool is not None:
+            raise ValueError("turned: true given with a tool; only an arm that was led has turned the tool")
+
+
+class UndoCorrection(_Operation, frozen=True, tag="undo"):
+    """Undo the last correction that is in force."""
+
+
+CorrectRequest: TypeAlias = Correct | UndoCorrection
+
+
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The empty request of status and reset."""
 
@@ -115,6 +145,31 @@ class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
     missed_by_rad: float | None = None
 
 
+class Correction(msgspec.Struct, frozen=True):
+    """A correction, made or undone: the via-point that it is, and how it moves the tool.
+
+    At the hands that it belongs to, it moves the tool by `moved_m` [m], and by at least half of
+    that while a hand is less than `reach_m` [m] away, which is at most MAX_REACH_M.
+    """
+
+    name: str
+    moved_m: float
+    reach_m: float
+    stage: tuple[str, ...] = ()  # the via-points at which its stage begins and ends; empty: in the whole skill
+    corrections: int = 1  # number of corrections at these hands
+    undone: bool = False
+
+    @property
+    def text(self) -> str:
+        """The correction in words."""
+        stage = f" in the stage {' -> '.join(self.stage)}" if self.stage else ""
+        effect = "no longer moves" if self.undone else "moves"
+        return (
+            f"it {effect} the tool by {100 * self.moved_m:.1f} cm{stage} at these hands, and by half of that or more "
+            f"while a hand is less than {100 * self.reach_m:.0f} cm away"
+        )
+
+
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     """The answer to a request: the tick from which it holds, and the via-points in force.
 
@@ -129,6 +184,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     mode: str = ""
     reason: str = ""
     note: str = ""
+    correction: Correction | None = None
 
 
 class RequestError(ExplainedError, ValueError):
@@ -235,6 +291,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none
     residual_risk: str = ""  # of the skill, and who accepted it; empty: none
+    guided: bool = False  # True while the arm's driver reports that it is led by hand
+    offer: str = ""  # what to learn from corrections that were repeated; empty: nothing
 
     @property
     def needed(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ class Condition(enum.IntFlag):
     STAGE_AMBIGUOUS = 256  # the stage of the task is not known
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
     CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
+    ARM_GUIDED = 2048  # the arm's driver reports that the arm is led by hand
 
 
 class Alternation(enum.IntEnum):
@@ -53,6 +54,13 @@ class Stuck(enum.IntEnum):
 
     NOTICED = 1  # the arm still follows
     HELD = 2  # the arm holds, or moves along a way out
+
+
+class Held(enum.IntEnum):
+    """Knowledge of the hands at the begin of an operator's hold."""
+
+    HANDS_UNSEEN = 1  # a hand that the skill needs was not seen
+    HANDS_SEEN = 2
 
 
 class SetpointStep(enum.IntEnum):
@@ -88,11 +96,12 @@ HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Condition.HANDS), int(Condition.ARM_HEAR
 CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
 ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
 STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.STAGE_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
-CLUTCH_RELEASED = int(Condition.CLUTCH_RELEASED)
+CLUTCH_RELEASED, ARM_GUIDED = int(Condition.CLUTCH_RELEASED), int(Condition.ARM_GUIDED)
 SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
 ALTERNATIONS = tuple(int(order) for order in Alternation)
 STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
 READY, RETURNING = int(ArmReady.READY), int(ArmReady.RETURNING)
+HELD_UNSEEN, HELD_SEEN = int(Held.HANDS_UNSEEN), int(Held.HANDS_SEEN)
 NOTICED, HELD = int(Stuck.NOTICED), int(Stuck.HELD)
 PLANNED, STOPPED, BROKEN = int(SetpointStep.PLANNED), int(SetpointStep.STOPPED), int(SetpointStep.BROKEN)
 NO_BOUND, FINITE_BOUND = int(SetpointBound.NONE), int(SetpointBound.NOT_FINITE)
@@ -104,4 +113,4 @@ NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.
 FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
 OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
 AMBIGUOUS, TOOL_SPEED, CLUTCH = int(Reason.AMBIGUOUS), int(Reason.TOOL_SPEED), int(Reason.CLUTCH)
-ARM_ERROR, ARM_SILENT = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT)
+ARM_ERROR, ARM_SILENT, GUIDED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT), int(Reason.GUIDED)

@@ -60,7 +60,7 @@ from service.settings.config import Settings
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
 ENGAGING = int(Flag.ENGAGING)
-SAMPLES = ("hands/left", "hands/right", "joints/state", "clutch", "gripper/wish")
+SAMPLES = ("hands/left", "hands/right", "joints/state", "joints/guided", "clutch", "gripper/wish")
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -74,6 +75,32 @@ class WayOut:
                 break
         return min((way for way in ways if len(way) <= WAY), key=_length, default=[])
 
+    def has_posture(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> bool:
+        """True if the arm has a collision-free posture with the tool at a position (3,) [m], in an
+        orientation (4,) or any other one, beside hands (2, 3) [m]. It is looked for from `joints`
+        (J,) [rad] on.
+        """
+        random, limits = np.random.default_rng(0), self._around(joints)
+        starts = (np.clip(joints, *limits), *self._starts(joints, limits, random))
+        return any(True for turned in (orientation, None) for _ in self._free(starts, limits, position, turned, hands))
+
+    def _starts(self, joints: Vector, limits: Vector, random: np.random.Generator) -> list[Vector]:
+        """Starts (J,) of the search for postures: the arm's posture in the settings, and STARTS
+        random ones.
+        """
+        drawn = random.uniform(limits[0], limits[1], (STARTS, len(joints)))
+        turns = 2.0 * math.pi * np.rint((joints - self._home) / (2.0 * math.pi))
+        return [self._home + np.where(self._is_continuous, turns, 0.0), *drawn]
+
+    def _free(
+        self, starts: Iterable[Vector], limits: Vector, position: Vector, orientation: Vector | None, hands: Vector
+    ) -> Iterator[Vector]:
+        """Collision-free postures (J,) with the tool at its target, found from these starts."""
+        for start in starts:
+            q = self._solved(start, limits, position, orientation)
+            if q is not None and self._separation.clearance(q, hands)[0] > 0.0:
+                yield q
+
     def _around(self, joints: Vector) -> Vector:
         """Lower and upper limits (2, J) [rad, m] of the search. A continuous joint is searched half
         a turn each way, which covers all its postures.
@@ -94,16 +121,8 @@ class WayOut:
         """Collision-free postures with the tool at its target, at most GOALS, the nearest one to
         `joints` first. Without an `orientation`, any orientation is accepted.
         """
-        drawn = random.uniform(limits[0], limits[1], (STARTS, len(joints)))
-        turns = 2.0 * math.pi * np.rint((joints - self._home) / (2.0 * math.pi))
-        home = self._home + np.where(self._is_continuous, turns, 0.0)
-        found: list[Vector] = []
-        for start in (home, *drawn):
-            q = self._solved(start, limits, position, orientation)
-            if q is not None and self._separation.clearance(q, hands)[0] > 0.0:
-                found.append(q)
-            if len(found) >= 2 * GOALS:
-                break
+        starts = self._starts(joints, limits, random)
+        found = list(itertools.islice(self._free(starts, limits, position, orientation, hands), 2 * GOALS))
         return sorted(found, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
 
     def _solved(self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None) -> Vector | None:

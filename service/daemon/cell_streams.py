@@ -25,6 +25,7 @@ MAX_SAMPLE_BYTES = 4096  # limit of a message of a hand or of joints
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
     ARM_STATE: lambda settings: settings.arm.source == "state",
+    "joints/guided": lambda settings: settings.arm.source == "state",
     "clutch": lambda settings: settings.hands.clutch == "key",
     "gripper/wish": lambda settings: settings.hands.gripper == "key",
 }
@@ -46,8 +47,8 @@ class Arrivals:
         self.why = ""
 
     def take(self, message: PoseStamped | JointState | bool | float, at_ns: int) -> None:
-        """Note a message and its arrival by the system clock [ns]; of a clutch or a wish, which has
-        no stamp, only that it arrived.
+        """Note a message and its arrival by the system clock [ns]; of a clutch, a wish or a
+        report of guiding, which have no stamp, only that it arrived.
         """
         if isinstance(message, PoseStamped | JointState):
             self.newest, self.at_ns = message, at_ns

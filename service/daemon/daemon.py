@@ -21,7 +21,7 @@ from service.contract.messages import Attachment
 from service.contract.records import Reason
 from service.contract.requests import Status, ViaPoint, encode_json
 from service.core.controller import Controller, outgoing, run
-from service.core.frame import STAGES, Event, Frame, Outputs, Tick, blank, frame_layout, order, timed
+from service.core.frame import STAGES, Event, Frame, Outputs, Record, Tick, blank, frame_layout, order, timed
 from service.core.separation import FARTHEST_REPORTED_M
 from service.core.warm_up import warm_up
 from service.daemon import supervised_thread
@@ -129,6 +129,7 @@ class Daemon:
             skills=skills,
             status=self._status.requested,
             frame=lambda: self._frame,
+            moment=self._moment,
             note=self.note,
             keep=scribe.keep,
             failed=self._fail,
@@ -341,14 +342,19 @@ class Daemon:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
 
-    def _status_now(self) -> Status:
-        """The present status."""
-        clock = self._clock
+    def _moment(self) -> tuple[Frame, Record]:
+        """The newest frame, and the state after it."""
         for _ in range(STATUS_TRIES):  # during a tick, the frame and the state are of different ticks
             frame, state = self._frame, self._controller.state
             if frame["tick"] == state["tick"]:
                 break
             time.sleep(0.2 * self._settings.period_s)
+        return frame, state
+
+    def _status_now(self) -> Status:
+        """The present status."""
+        clock = self._clock
+        frame, state = self._moment()
         now_s = time.monotonic()
         sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)

@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -22,6 +23,8 @@ from service.contract.records import Mode
 from service.contract.requests import (
     Add,
     Clear,
+    Correct,
+    Correction,
     HoldRequest,
     List,
     Nothing,
@@ -30,15 +33,26 @@ from service.contract.requests import (
     RequestError,
     SkillRequest,
     StageRequest,
+    UndoCorrection,
     ViaPoint,
     encode_json,
 )
 from service.core.frame import Event, Frame, order
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
+from service.daemon.correcting import HOLD_ENDED, Corrections, Moment
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.status import outcome
+from service.learning.corrections import (
+    LEAST_CORRECTION_M,
+    Effect,
+    correction_at,
+    newest_correction,
+    off_m,
+    offer_of,
+    stage_of,
+)
 from service.learning.reach import accepted, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
@@ -68,16 +82,20 @@ class Requested(Protocol):
 class PendingEvent:
     """An event that waits for the loop, and the tick that took it.
 
-    Either the loop takes the event or the requesting thread withdraws it, never both.
+    Either the loop takes the event or the requesting thread withdraws it, never both. The loop
+    refuses it if `condition` does not hold any more.
     """
 
-    def __init__(self, event: Event) -> None:
-        self._event = event
+    def __init__(self, event: Event, condition: Callable[[], bool] = lambda: True) -> None:
+        self._event, self._condition = event, condition
         self._tick: Future[int] = Future()
 
     def claimed(self, tick: int) -> Event | None:
-        """The event, taken by this tick; None if it was withdrawn. For the loop."""
+        """The event, taken by this tick; None if it was withdrawn or refused. For the loop."""
         if not self._tick.set_running_or_notify_cancel():
+            return None
+        if not self._condition():
+            self._tick.set_exception(RequestError(HOLD_ENDED))
             return None
         self._tick.set_result(tick)
         return self._event
@@ -156,6 +174,7 @@ class Queryables:
         skills: Path,
         status: Requested,
         frame: Callable[[], Frame],
+        moment: Callable[[], Moment],
         note: Callable[[str], None],
         keep: Callable[[bytes], object],
         failed: Callable[[str], None],
@@ -169,6 +188,7 @@ class Queryables:
         self._skills = skills
         self._status = status
         self._frame = frame
+        self._corrections = Corrections(settings, moment)
         self._note = note
         self._keep = keep
         self._failed = failed
@@ -256,6 +276,10 @@ class Queryables:
                 return Reply(int(self._frame()["tick"]), self._in_force)
             case Add() | Remove() | Clear():
                 return self._teach(request)
+            case Correct():
+                return self._correct(request)
+            case UndoCorrection():
+                return self._undo_correction()
             case Nothing() | HoldRequest():
                 if isinstance(reply := order(suffix, getattr(request, "by", "")), RequestError):
                     raise reply
@@ -303,9 +327,9 @@ class Queryables:
             self.inbox.append(pending)
         return pending
 
-    def _through_the_loop(self, event: Event) -> int:
+    def _through_the_loop(self, event: Event, condition: Callable[[], bool] = lambda: True) -> int:
         """Send an event through the loop; returns the tick that took it, after its frame."""
-        pending = PendingEvent(event)
+        pending = PendingEvent(event, condition)
         self.inbox.append(pending)
         return self._taken(pending)
 
@@ -316,8 +340,11 @@ class Queryables:
             time.sleep(TICK_POLL_S)
         return tick
 
-    def _adopt(self, skill: StoredSkill, *, is_loaded: bool = False, remark: str = "") -> Reply:
-        """Have the loop adopt a skill, and save its via-points.
+    def _adopt(
+        self, skill: StoredSkill, *, is_loaded: bool = False, remark: str = "", is_corrected: bool = False
+    ) -> Reply:
+        """Have the loop adopt a skill, and save its via-points. One that `is_corrected` is adopted
+        only while the arm holds, so that the tool then approaches its target at the engaging speed.
 
         Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
         """
@@ -328,7 +355,8 @@ class Queryables:
         self._keep(skill.file)
         draft = self._saved.draft(skill)  # written first, because via-points that cannot be saved are not adopted
         try:
-            tick = self._through_the_loop(Event("skill", skill.file, skill.for_loop()))
+            event, holds = Event("skill", skill.file, skill.for_loop()), lambda: outcome(self._frame())[0] is Mode.HOLD
+            tick = self._through_the_loop(event, holds if is_corrected else lambda: True)
             draft.replace(self._saved.path(skill))
         finally:
             draft.unlink(missing_ok=True)
@@ -370,9 +398,55 @@ class Queryables:
                 points |= {point.name: point for point in added}
         return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
 
-    def _check(self, added: Sequence[ViaPoint]) -> None:
-        """Raise RequestError for too many via-points, and for those outside the skill's
-        workspace.
+    def _correct(self, request: Correct) -> Reply:
+        """Correct the tool for the hands of the operator's hold."""
+        led, skill = self._corrections.led(request, self._skill), self._skill
+        correcting = correction_at(skill, led.hands, led.stage, led.tool, led.orientation)
+        point, moved_m = correcting.point, off_m(skill, correcting)
+        if moved_m < LEAST_CORRECTION_M and not request.turned:
+            raise RequestError(
+                f"the tool is {1000 * moved_m:.0f} mm from where the skill has it for these hands; "
+                f"{1000 * LEAST_CORRECTION_M:.0f} mm or more needed for a correction"
+            )
+        gate_m = float(skill.model.gates_m(skill.conducting(led.hands))[0])
+        if gate_m > skill.threshold:
+            raise RequestError(
+                f"{skill.model.measure} is {gate_m:.3f} m at these hands; at most {skill.threshold:.3f} m accepted, as "
+                "the arm holds there whatever is corrected. Demonstrate this"
+            )
+        self._check([point], "$.tool")
+        orientation = skill.orientation if led.orientation is None else np.array(led.orientation)
+        hands = skill.conducting(led.hands).reshape(2, 3)
+        if not self._skill_worker.has_posture(self._settings, led.joints, led.tool, orientation, hands):
+            raise RequestError(
+                f"$.tool: {list(point.tool)}: no posture of the arm has the tool there and keeps clear of these hands, "
+                "of things and of itself"
+            )
+        after, effect = self._skill_worker.correct(skill, correcting.among(skill.via_points), point)
+        reply = self._adopt(after, is_corrected=True)
+        self._corrections.made(point, correcting.replaced)
+        if request.hands == "held" and led.stage >= 0:  # a hand that led the arm may have looked like another stage
+            self._through_the_loop(order("stage", skill.model.names[led.stage]))
+        return self._of_correction(reply, point, effect, undone=False)
+
+    def _undo_correction(self) -> Reply:
+        """Undo the last correction, with what it replaced."""
+        self._corrections.check_held()
+        if (point := newest_correction(self._skill.via_points)) is None:
+            raise RequestError("no correction is in force")
+        kept = tuple(one for one in self._skill.via_points if one != point)
+        points = (*kept, *self._corrections.replaced_by(point))
+        after, effect = self._skill_worker.correct(self._skill, points, point)
+        return self._of_correction(self._adopt(after, is_corrected=True), point, effect, undone=True)
+
+    def _of_correction(self, reply: Reply, point: ViaPoint, effect: Effect, *, undone: bool) -> Reply:
+        stage, sizes = stage_of(self._skill, point), (round(effect.moved_m, 4), round(effect.reach_m, 3))
+        correction = Correction(point.name, *sizes, stage, point.corrections, undone=undone)
+        return msgspec.structs.replace(reply, correction=correction, note=offer_of(self._skill))
+
+    def _check(self, added: Sequence[ViaPoint], at: str = "") -> None:
+        """Raise RequestError for too many via-points, for those outside the skill's workspace, and
+        for stages that the skill does not have. `at` is the place of the tool in the request.
         """
         all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
         total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
@@ -384,7 +458,10 @@ class Queryables:
         low, high = self._skill.workspace
         distances_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
-            given = f"$.points[{i}].tool: {list(point.tool)}"
+            given = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
+            if point.stage not in (None, *(begins := self._skill.model.names[:-1])):
+                known = ", ".join(begins) or "none"
+                raise RequestError(f"$.points[{i}].stage: no stage begins at {point.stage!r}; stages begin at: {known}")
             if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
                 raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")

@@ -23,6 +23,7 @@ from service.contract.explain import in_words
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.way_out import WayOut
+from service.learning.corrections import Effect, corrected
 from service.learning.reach import beyond_m
 from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.learning.via_points import MAX_GAIN, adapted
@@ -70,12 +71,28 @@ class SkillWorker:
         made: StoredSkill = self._ask(timeout_s, skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
         return made
 
+    def correct(
+        self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint, *, timeout_s: float = WORK_TIMEOUT_S
+    ) -> tuple[StoredSkill, Effect]:
+        """The skill with these via-points and no others, and what that changes at the correction
+        `at`. Raises SkillError, also after `timeout_s` [s].
+        """
+        arguments = skill.file, tuple(via_points), at, self._max_gain
+        made: tuple[StoredSkill, Effect] = self._ask(timeout_s, corrected_skill_of, *arguments)
+        return made
+
     def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> list[Vector]:
         """The result of `WayOut.find` for the cell. Raises SkillError, also after `timeout_s`
         [s].
         """
         found: list[Vector] = self._ask(timeout_s, way_out_of, settings, *arguments)
         return found
+
+    def has_posture(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> bool:
+        """The result of `WayOut.has_posture` for the cell. Raises SkillError, also after
+        `timeout_s` [s].
+        """
+        return bool(self._ask(timeout_s, has_posture_of, settings, *arguments))
 
     def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = WORK_TIMEOUT_S) -> Vector:
         """Distances (M,) [m] of positions (M, 3) beyond the reach, see `learning.reach.beyond_m`.
@@ -154,6 +171,11 @@ def way_out_of(settings: Settings, *arguments: Vector) -> list[Vector]:
     return WayOut(settings, robot_description(settings)).find(*arguments)
 
 
+def has_posture_of(settings: Settings, *arguments: Vector) -> bool:
+    """The result of `WayOut.has_posture` for the cell."""
+    return WayOut(settings, robot_description(settings)).has_posture(*arguments)
+
+
 def skill_of(
     source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
 ) -> StoredSkill:
@@ -170,8 +192,23 @@ def skill_of(
             skill = decoded(content(source, LARGEST_FILE), origin=str(source))
         except (OSError, UnusableError) as error:
             raise SkillError(f"cannot read skill {source}: {in_words(error, named=False)}") from None
+    return prepared(skill)
+
+
+def corrected_skill_of(
+    source: bytes, via_points: Sequence[ViaPoint], at: ViaPoint, max_gain: float
+) -> tuple[StoredSkill, Effect]:
+    """The skill in force (the bytes of its file) with these via-points, and what they change at the
+    correction `at`. Raises SkillError.
+    """
+    skill, effect = corrected(decoded(source, origin="the skill in force"), via_points, at, max_gain=max_gain)
+    return prepared(skill), effect
+
+
+def prepared(skill: StoredSkill) -> StoredSkill:
+    """A skill that has computed and cached everything that is computed once."""
     hands = skill.hands[0].reshape(2, 3)
-    skill.predict(hands, 0 * hands, 0 * hands)  # computes and caches everything that is computed once
+    skill.predict(hands, 0 * hands, 0 * hands)
     _ = skill.tool_positions
     return skill
 

@@ -25,6 +25,7 @@ from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
 from service.core.skill.task_clock import CLOCK_S
 from service.daemon.input_monitor import KEY_OF_SOURCE
+from service.learning.corrections import offer_of
 from service.settings.config import Settings
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
@@ -99,6 +100,8 @@ class CellStatus(NamedTuple):
             error_probability=round(float(frame["error_probability"]), 4) if aimed else None,
             deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
+            guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
+            offer=offer_of(skill),
             **more,
         )
 

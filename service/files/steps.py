@@ -39,6 +39,7 @@ _RECORDS = ("frame", "timing", "state")
 LATER_FIELDS = {
     *("clutch_until_tick", "gripper_wish", "engaging", "task_clock"),
     *("known_gate_m", "unprimed_belief", "error_probability"),
+    *("guided_until_tick", "guided_tick", "held", "held_tick", "held_stage", "held_hands"),
 }
 _LAYOUTS = {"state": STATE, "frame": FRAME}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}

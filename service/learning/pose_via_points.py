@@ -15,6 +15,7 @@ from service.core.frame import Vector
 from service.core.geometry import angles
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import Skill
+from service.core.skill.via_points import rest_of
 from service.learning.pose import flat_gripper, flat_orientation, is_flat
 from service.learning.skill_file import SkillError
 
@@ -84,7 +85,7 @@ def missed_by_rad(skill: Skill, point: ViaPoint) -> float | None:
     """The error [rad] of a via-point's orientation; None if it has none."""
     if point.orientation is None or skill.turn is None:
         return None
-    at = skill.model.inputs(np.array([[*point.left, *point.right]]), [point.name])
+    at = skill.model.inputs(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])
     x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(at)[0].tolist()
     return _angle(point.orientation, (x, y, z, w))
 

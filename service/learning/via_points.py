@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from kmp import ViaPointMissed
 from service.contract.requests import ViaPoint, ViaPointInForce
+from service.core.frame import Vector
 from service.core.skill.skill import Skill
-from service.core.skill.via_points import NEIGHBOURS, neighbourhoods
+from service.core.skill.via_points import NEIGHBOURS, neighbourhoods, rest_of
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, StoredSkill, with_file
 from service.settings.config import ToolSettings
@@ -53,7 +54,7 @@ def adapted(
             # by 1 / N unless it is a mixture's, so the variance of a via-point is scaled, too.
             weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
             skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
-            at = skill.model.inputs(inputs, [point.name for point in owners])
+            at = skill.model.inputs(inputs, [rest_of(point, skill.model.names) for point in owners])
             turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
@@ -86,8 +87,11 @@ def check_agreement(via_points: Sequence[ViaPoint], max_gain: float = MAX_GAIN, 
 
 
 def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
-    """Return whether each pair (V, V) belongs to two via-points of the skill's task."""
-    names = np.array([point.name if point.name in skill.model.names else "" for point in owners])
+    """Return whether each pair (V, V) belongs to two via-points of the skill's task, to via-points
+    of two of its stages, or to one of each.
+    """
+    known = skill.model.names
+    names = np.array([p.name if p.name in known else f"{p.stage} ->" if p.stage in known else "" for p in owners])
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 
@@ -96,7 +100,7 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
     return tuple(
         ViaPointInForce(
             **msgspec.structs.asdict(point),
-            missed_by_m=math.dist(point.tool, skill.mean(np.array([[*point.left, *point.right]]), [point.name])[0]),
+            missed_by_m=math.dist(point.tool, tool_at(skill, point)),
             missed_by_rad=missed_by_rad(skill, point),
         )
         for point in skill.via_points
@@ -120,11 +124,16 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
         if point.missed_by_rad is not None and point.missed_by_rad > NOTED_RAD
     ]
     for point in set(before.via_points) & set(after.via_points):
-        hands = np.array([[*point.left, *point.right]])
-        moved_m = math.dist(before.mean(hands, [point.name])[0], after.mean(hands, [point.name])[0])
+        moved_m = math.dist(tool_at(before, point), tool_at(after, point))
         if moved_m > NOTED_M:
             out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
     return tuple(sorted(out))
+
+
+def tool_at(skill: Skill, point: ViaPoint) -> Vector:
+    """The tool position (3,) [m] for hands that rest at a via-point."""
+    found: Vector = skill.mean(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])[0]
+    return found
 
 
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:

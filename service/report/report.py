@@ -16,6 +16,7 @@ from service.contract.incidents import word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.core.frame import Vector
 from service.files.recording import Recording
+from service.learning.corrections import offer_of
 from service.report.causes import before, why
 from service.report.columns import Columns, read, runs
 from service.report.stages import stages
@@ -129,6 +130,7 @@ class Report:
         self.path, self.columns = recording.path, columns
         self.begins = begins if len(frames) else "never: it holds no tick"  # by the system clock
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
+        self.offer = offer_of(columns.skills[-1].skill) if columns.skills else ""  # of its last skill
         self.lasts_s = lasts_s
         self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))

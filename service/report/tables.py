@@ -189,6 +189,7 @@ def summary(report: Report) -> list[str]:
         f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
         f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}." if lacks else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
+        *([f"{report.offer[0].upper()}{report.offer[1:]}."] if report.offer else []),
     ]
 
 

@@ -15,6 +15,7 @@ import asyncio
 import contextlib
 import functools
 import json
+import re
 import secrets
 import time
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from service.client import Client, Tracker
 from service.contract.incidents import ORDERS
 from service.contract.messages import WireError
 from service.trackers import web_server
-from service.trackers.cell_view import Latest, carried_out
+from service.trackers.cell_view import Latest, carried_out, corrected
 from service.trackers.hand_message import PageHands, decode_hands, is_ping, pong
 from service.trackers.pinch import Pinches
 
@@ -37,6 +38,7 @@ MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show
 MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
 PAGE_STATUS_S = 0.1  # interval of the status
 BY_HANDS = {f"{order} by hands": order for order in ("hold", "resume")}
+CORRECTION = re.compile(r"correct (undo|(?:-?\d{1,2}(?:\.\d{1,6})?(?: |$)){3})")
 FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
 NOT_FOLLOWED = "resume was NOT carried out: the hands of this page are not followed."
@@ -118,8 +120,10 @@ class BrowserHands:
                 if not self._publish(page, hands):
                     return await web_server.close(page, 409, TAKEN)
             elif message.type == WSMsgType.TEXT:
-                if message.data not in ORDERS and message.data not in BY_HANDS:
-                    return await web_server.close(page, 400, f"Refused: {' or '.join(ORDERS)} needed as text")
+                is_order = message.data in ORDERS or message.data in BY_HANDS
+                if not is_order and not CORRECTION.fullmatch(message.data):
+                    needed = f"{' or '.join(ORDERS)}, or correct with undo or three numbers,"
+                    return await web_server.close(page, 400, f"Refused: {needed} needed as text")
                 orders = {name: order for name, order in orders.items() if not order.done()}
                 if not orders or (message.data.startswith("hold") and message.data not in orders):
                     orders[message.data] = asyncio.create_task(self._order(page, message.data))
@@ -165,12 +169,14 @@ class BrowserHands:
                 await asyncio.sleep(PAGE_STATUS_S)
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
-        """Carry out an order, even if the page disconnects meanwhile."""
+        """Carry out an order or a correction, even if the page disconnects meanwhile."""
         if order == "resume by hands" and self._owner is not page:
             is_done, text = False, NOT_FOLLOWED
         else:
             name = self._name if order in BY_HANDS else ""
             carry_out = functools.partial(carried_out, self._client, BY_HANDS.get(order, order), by=name)
+            if found := CORRECTION.fullmatch(order):
+                carry_out = functools.partial(corrected, self._client, found[1])
             is_done, text = await asyncio.get_running_loop().run_in_executor(self._ordering, carry_out)
         with contextlib.suppress(ConnectionError):
             await page.send_str(json.dumps({"order": order, "answer": text, "done": is_done}))

@@ -84,6 +84,23 @@ class Latest:
         return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
 
 
+def corrected(client: Client, given: str) -> tuple[bool, str]:
+    """True if the daemon carried out a page's correction, and its answer in words. `given` is
+    `undo`, or the tool's position x y z [m], for the hands of this moment.
+    """
+    try:
+        if given == "undo":
+            reply = client.undo_correction()
+        else:
+            x, y, z = (float(value) for value in given.split())
+            reply = client.correct((x, y, z), hands="now")
+    except (ExplainedError, ValueError) as error:
+        return False, f"correct was NOT carried out: {error}"
+    found = reply.correction
+    text = "" if found is None else f"{found.name} {'undone' if found.undone else 'in force'}: {found.text}"
+    return True, f"{text}. Resume lets the tool go there" + f"; {reply.note}" * bool(reply.note)
+
+
 def carried_out(client: Client, order: str, by: str = "") -> tuple[bool, str]:
     """True if the daemon carried out hold, resume or reset, and its answer in words. `by` names who
     holds, or ends its own hold.

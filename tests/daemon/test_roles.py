@@ -29,7 +29,7 @@ from support.cell import LEFT, Tracker, thirdhand, told, until
 
 CELL = "bench"
 NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
-INPUTS = ("hands/left", "hands/right", "joints/state", "gripper/state", "tool/pose", *NOT_DEMONSTRATED)
+INPUTS = ("hands/left", "hands/right", "joints/state", "joints/guided", "gripper/state", "tool/pose", *NOT_DEMONSTRATED)
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2

@@ -20,7 +20,7 @@ def take(person: int, hands: np.ndarray, tool: np.ndarray) -> Take:
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(hands), 1))
     left, right, tools = (np.hstack([at, still]) for at in (hands[:, :3], hands[:, 3:], tool))
     shown = Demonstration(np.arange(len(hands)) * 10**7, left, right, tools)
-    return Take(str(person), person, shown, hands, tools, tool, None)
+    return Take(str(person), person, shown, hands, tools, None)
 
 
 def test_a_linear_function_is_found_from_the_others() -> None:

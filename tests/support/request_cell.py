@@ -7,11 +7,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from service.client import Client
 from service.contract import channels, requests
 from service.contract.records import Mode, Reason
+from service.core.controller import start_state
 from service.core.frame import Event
 from service.core.skill.skill import Skill
 from service.daemon.queryables import Queryables
@@ -44,10 +46,12 @@ class Cell:
         self.kept: list[bytes] = []
         self.running = True
         self.mode, self.reason = Mode.HOLD, Reason.NO_HANDS
+        self.state = start_state(self.settings, skill)
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
         tell = {"status": lambda *, published: requests.encode_json(self.status()), "frame": self.frame}
+        tell |= {"moment": lambda: (self.frame(), self.state)}
         tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
         self.requests = Queryables(self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
@@ -76,8 +80,9 @@ class Cell:
         lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
         return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
 
-    def frame(self) -> dict[str, int]:
-        return {"tick": self._tick, "mode": self.mode, "reason": self.reason}
+    def frame(self) -> dict[str, Any]:
+        unseen = {"hand_ages": np.array((-1, -1)), "hands": np.zeros((2, 3))}
+        return {"tick": self._tick, "mode": self.mode, "reason": self.reason, **unseen}
 
     def _drain(self) -> None:
         while not self._end.wait(0.0005):

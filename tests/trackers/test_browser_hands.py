@@ -47,7 +47,14 @@ REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refu
     "no time": (lambda: hands_message(at_ms=math.nan), "hands of no time"),
     "predicted for tomorrow": (lambda: hands_message(ahead_ms=DAY_MS), "ms ahead, 0 to 200 accepted"),
     "predicted for NaN": (lambda: hands_message(ahead_ms=math.nan), "predicted nan ms ahead"),
-    "text that is no order": (lambda: "open", "hold or resume or reset needed"),
+    "text that is no order": (
+        lambda: "open",
+        "hold or resume or reset, or correct with undo or three numbers, needed as",
+    ),
+    "a correction that is no position": (
+        lambda: "correct 0.5 high 0.3",
+        "or correct with undo or three numbers, needed as",
+    ),
 }
 
 

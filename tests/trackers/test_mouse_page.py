@@ -24,12 +24,14 @@ import pytest
 import zenoh
 
 from service.cli.demo import EVENT_TITLES
+from service.client import RefusedError, UnreachableError
 from service.contract.cdr import decode_pose
 from service.contract.messages import BASE, PoseStamped
 from service.trackers.browser_hands import NO_TOKEN
 from sim.scene import HAND_ORIENTATION
 from support import chromium
 from support.cell import Daemon, serving, thirdhand
+from support.chromium import Tab
 from support.dragging import Person
 from support.paths import ROOT
 
@@ -79,9 +81,11 @@ def url(daemon: Daemon) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def person_at(url: str, folder: Path, *, phone: bool = False, **more: Any) -> Iterator[Person]:
+def person_at(
+    url: str, folder: Path, *, phone: bool = False, timeout_s: float = TIMEOUT_S, **more: Any
+) -> Iterator[Person]:
     """A person at the page, once it shows the hands."""
-    with chromium.opened(url, folder, size=(1200, 800), timeout_s=TIMEOUT_S, **more) as tab:
+    with chromium.opened(url, folder, size=(1200, 800), timeout_s=timeout_s, **more) as tab:
         if phone:
             tab.hold_as_phone(390, 844)
         tab.until("typeof hands !== 'undefined' && !!hands.left")
@@ -127,6 +131,73 @@ def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_dr
         daemon.until(lambda status: status["reason"] == "operator")
         person.tab.until("at('mode').textContent.startsWith('hold')")
         person.tab.ask("at('resume').click()")
+        daemon.until(lambda status: status["mode"] == "follow")
+
+
+def pressed(tab: Tab, button: str) -> str:
+    """The answer to a button."""
+    tab.ask(f"at('{button}').click()")
+    tab.until("!at('answer').textContent.endsWith(' ...') && at('answer').textContent !== ''")
+    return str(tab.ask("at('answer').textContent"))
+
+
+def wait_for_the_skill_worker(daemon: Daemon) -> None:
+    """Wait until the skill worker has imported all it needs, which takes long on a busy machine."""
+    for _ in range(5):
+        with contextlib.suppress(RefusedError, UnreachableError):
+            daemon.client.clear()
+            return
+
+
+def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
+    """The position of the tool [m], once an operator's hold has brought it to rest."""
+    before: list[float] = []
+
+    def is_at_rest(status: dict[str, Any]) -> bool:
+        before.append(status["tool_m"])
+        time.sleep(0.1)
+        return status["reason"] == "operator" and before[-2:] == [before[-1]] * 2
+
+    x, y, z = daemon.until(is_at_rest)["tool_m"]
+    return x, y, z
+
+
+def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_undone(
+    daemon: Daemon, url: str, tmp_path: Path
+) -> None:
+    with person_at(url, tmp_path, timeout_s=5 * TIMEOUT_S) as person:
+        tab = person.tab
+        wait_for_the_skill_worker(daemon)
+        first, second, *_ = (at[0] for at in daemon.client.status().hands_at_m.values())
+        halfway = tuple(np.mean([first, second], axis=0).tolist())
+        person.drag("left", halfway)
+        person.arrive("left", halfway)
+        daemon.until(lambda status: status["mode"] == "follow" and "engaging" not in status["flags"])
+        assert tab.ask("at('correcting').hidden")
+        tab.ask("at('hold').click()")
+        tab.until("!at('correcting').hidden && at('correct').disabled && !!tool")
+        x, y, z = resting_tool(daemon)
+        tab.until(f"distance(tool, {[x, y, z]}) < 0.0005")
+        person.along(person.pixel((x, y, z)), person.pixel((x + 0.02, y + 0.06, z)), tab.mouse)
+        tab.ask("keys.add('w')")  # the tool is selected, and the keys lift it
+        tab.until(f"dragged[2] > {z + 0.03}")
+        tab.ask("keys.clear()")
+        there = tuple(json.loads(tab.ask("JSON.stringify(dragged)")))
+        assert math.dist(there[:2], (x + 0.02, y + 0.06)) < 0.005
+        tab.picture(tmp_path / "dragged.png")
+        assert pressed(tab, "correct").startswith("correction-1 in force: it moves the tool by ")
+        (point,) = daemon.client.places()
+        assert math.dist(point.tool, there) < 1e-3
+        assert math.dist(point.left, halfway) < 5e-3
+        tab.ask("at('resume').click()")
+        daemon.until(lambda status: status["mode"] == "follow" and math.dist(status["tool_m"], there) < 5e-3)
+        tab.until("at('correcting').hidden && dragged === null")
+        tab.ask("at('hold').click()")
+        tab.until("!at('correcting').hidden")
+        assert pressed(tab, "undo").startswith("correction-1 undone: it no longer moves the tool by ")
+        assert daemon.client.places() == ()
+        assert pressed(tab, "undo") == "correct was NOT carried out: no correction is in force"
+        tab.ask("at('resume').click()")
         daemon.until(lambda status: status["mode"] == "follow")
 
 

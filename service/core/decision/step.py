@@ -8,6 +8,7 @@ from kmp.compiled import compiled
 from service.core.codes import (
     AMBIGUOUS,
     ARM_ERROR,
+    ARM_GUIDED,
     ARM_HEARD,
     ARM_INSIDE,
     ARM_SILENT,
@@ -19,7 +20,11 @@ from service.core.codes import (
     FAR,
     FAULT,
     FOLLOW,
+    GUIDED,
+    HANDS_KNOWN,
     HELD,
+    HELD_SEEN,
+    HELD_UNSEEN,
     HOLD,
     NO_HANDS,
     NONE,
@@ -69,6 +74,7 @@ def step(
     in this order causes a hold; without one, the arm follows:
 
     * TWO_SOURCES: a hand or the arm is contested.
+    * GUIDED: the arm is led by hand. This is an operator's hold, which lasts afterwards.
     * NOT_READY: the arm is not ready; if it moves back by itself, not while the clutch is released.
     * OPERATOR: the operator holds it.
     * CLUTCH: the clutch is released.
@@ -91,8 +97,11 @@ def step(
     if fault != NONE:
         state.mode, state.reason = FAULT, fault
         return starts, error, speed
+    _note_hold(states, known)
     if known & CONTESTED:
         reason = TWO_SOURCES
+    elif known & ARM_GUIDED and not parameters[0].is_assumed:
+        reason = GUIDED
     elif state.arm_ready != READY and not (state.arm_ready == RETURNING and known & CLUTCH_RELEASED):
         reason = NOT_READY
     elif state.operator_hold:
@@ -120,6 +129,8 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or -1 twice.
 
     * An assumed arm starts at its configured posture and is ready.
+    * An arm that is led by hand is not ready. Its commanded joints come to rest, and then are the
+      measured ones in each tick.
     * Any other arm starts where it reports one posture, once the commanded joints are at rest. If
       it is outside its limits it is RETURNING, else READY. One that is inside of a thing starts
       only after the operator's confirmation (`leaves`), and is RETURNING.
@@ -137,6 +148,10 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     moving = False
     for joint in range(state.joints.shape[1]):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    if known & ARM_GUIDED:
+        state.operator_hold, state.arm_ready, state.leaves, state.guided_tick = 1, 0, 0, state.tick
+        state.stuck = state.way_count = 0
+        return 0 if moving else STARTS_MEASURED, NONE, -1.0, -1.0
     if not state.arm_ready:
         state.stuck = state.way_count = 0
         if not known & ARM_STILL:
@@ -164,6 +179,26 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
         state.slow_tick = state.tick
     fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > TOO_FAST_S else NONE
     return 0, fault, error, speed
+
+
+@compiled
+def _note_hold(states: Records, known: int) -> None:
+    """Note hands and stage at the begin of an operator's hold, and forget them at its end.
+
+    The stage is the most probable one, if its probability is above 1/2.
+    """
+    state = states[0]
+    if state.operator_hold and not state.held:
+        state.held = HELD_SEEN if known & HANDS_KNOWN and not known & sum(UNSEEN) else HELD_UNSEEN
+        state.held_tick, state.held_stage = state.tick, -1
+        for side in range(2):
+            for axis in range(3):
+                state.held_hands[side, axis] = state.hands[side, 0, axis]
+        for stage in range(len(state.stage_belief)):
+            if state.stage_belief[stage] > 0.5:
+                state.held_stage = stage
+    elif not state.operator_hold:
+        state.held = 0
 
 
 @compiled

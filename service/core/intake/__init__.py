@@ -20,6 +20,7 @@ STATE = (
     Field("quickest_stamps_ns", "int64", (2, 2)),  # stamps of minimum delay: this window, the last one
     Field("quickest_ticks", "int64", (2, 2)),  # ticks in which the samples with these stamps arrived
     Field("clutch_until_tick", "int64"),  # the clutch counts as pressed before this tick, unless a message follows
+    Field("guided_until_tick", "int64"),  # the arm counts as led by hand before this tick, unless a message follows
     Field("clock_tick", "int64", (2,)),  # begin of this window; -1: no sample yet
     Field("kept", "int64", (2,)),  # number of retained samples
     Field("kept_newest", "int64", (2,)),  # index of the newest sample in all rings `kept_*`

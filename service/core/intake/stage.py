@@ -1,5 +1,5 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
-at the tick. The clutch and the wish for the gripper are taken in here too.
+at the tick. The clutch, the wish for the gripper and reports of hand guiding are taken in here too.
 
 `plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
 """
@@ -75,7 +75,7 @@ class Intake:
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names = settings.joints.names
-        self._clutch_ticks = _stale_ticks("clutch", settings)
+        self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
@@ -124,6 +124,8 @@ class Intake:
                     self.take_arm(state, event.value)
                 case "clutch":
                     state["clutch_until_tick"] = state["tick"] + self._clutch_ticks if event.value else 0
+                case "joints/guided":
+                    state["guided_until_tick"] = state["tick"] + self._guided_ticks if event.value else 0
                 case "gripper/wish":
                     state["gripper_wish"] = event.value
                 case _:

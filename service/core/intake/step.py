@@ -8,7 +8,17 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.contract.records import SOURCES, Cause
-from service.core.codes import ARM_HEARD, ARM_STILL, CLUTCH_RELEASED, CONTESTED, FAULT, HANDS_KNOWN, TWO_SOURCES, UNSEEN
+from service.core.codes import (
+    ARM_GUIDED,
+    ARM_HEARD,
+    ARM_STILL,
+    CLUTCH_RELEASED,
+    CONTESTED,
+    FAULT,
+    HANDS_KNOWN,
+    TWO_SOURCES,
+    UNSEEN,
+)
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO
 from service.core.intake import KEPT
@@ -254,8 +264,8 @@ def take_hand(
 @compiled
 def report(states: Records, frames: Records, parameters: Records) -> int:
     """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Condition`
-    that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL, CONTESTED,
-    CLUTCH_RELEASED.
+    that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL,
+    ARM_GUIDED, CONTESTED, CLUTCH_RELEASED.
     """
     frame, state, config = frames[0], states[0], parameters[0]
     left, right = state.hand_ticks[0], state.hand_ticks[1]
@@ -278,6 +288,8 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= config.still_ticks:
             known |= ARM_STILL
+        if state.tick < state.guided_until_tick:
+            known |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
         known |= CLUTCH_RELEASED
     contested = is_contested(states, state.reason == TWO_SOURCES)

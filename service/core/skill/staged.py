@@ -39,7 +39,7 @@ from service.core.skill.stages import (
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
 from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
-from service.core.skill.via_points import pulls_through
+from service.core.skill.via_points import pulls_through, sharpness_between
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
 NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
@@ -110,6 +110,26 @@ class Placed(Immutable):
         along, stage = primitive.centres[:, :2], primitive.centres[:, 2:last].argmax(axis=1)
         rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS), times])
         return cls(stages, sizes, rows, np.array(errors, order="C"), NO_PULLS)
+
+    def pulled(self, pulls: Vector) -> Placed:
+        """These stages with pulls (X, 9) that act in all of them."""
+        sizes = self.sizes.copy()
+        sizes["pulls"] = len(pulls)
+        return replace(self, sizes=sizes, pulls=pulls)
+
+    def pulled_in(self, stage: int, ends: Vector, via_points: Sequence[ViaPoint]) -> Placed:
+        """These stages with pulls through via-points in one stage, which leave the tool as it is at
+        the hands `ends` (2, 6) of the stage.
+        """
+        belief = np.zeros(MOST_STAGES)
+        belief[stage] = 1.0
+        sharpness, stages = sharpness_between(ends, via_points), self.stages.copy()
+        more = np.hstack(
+            pulls_through(lambda hands: self.mean(hands, np.tile(belief, (len(hands), 1))), ends, via_points, sharpness)
+        )
+        stages["pulled"][stage] = len(self.pulls), len(self.pulls) + len(more)
+        stages["sharpness"][stage] = sharpness
+        return replace(self, stages=stages, pulls=np.concatenate([self.pulls, more]))
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
@@ -232,7 +252,13 @@ class StagedKMP:
     def placed(self) -> Placed:
         """Stages between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
-        return replace(self._unpulled, pulls=np.hstack(pulls_through(self._resting, self.hands, others)))
+        everywhere = [point for point in others if point.stage not in self.names[:-1]]
+        pulls = np.hstack(pulls_through(self._resting, self.hands, everywhere))
+        placed = self._unpulled.pulled(pulls)
+        for k, name in enumerate(self.names[:-1]):
+            if of_stage := [point for point in others if point.stage == name]:
+                placed = placed.pulled_in(k, self.hands[k : k + 2], of_stage)
+        return placed
 
     @cached_property
     def _unpulled(self) -> Placed:

@@ -63,6 +63,8 @@ STAGE = np.dtype(
         ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
         ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
         ("scatter", np.float64, (2, 3, 3)),  # [m²] covariance of the tool's via-points at begin and end; 0: known
+        ("pulled", np.int64, (2,)),  # first row of the pulls of this stage alone, and the row after the last one
+        ("sharpness", np.float64),  # [1/m²] sharpness of these pulls
     ]
 )
 # Numbers that hold in all stages, as compiled functions read them.
@@ -74,6 +76,7 @@ PLACED = np.dtype(
         ("clock_weight", np.float64),  # as an input, a second in the stage counts as this share of it
         ("unknown_std", np.float64),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
+        ("pulls", np.int64),  # number of pulls that act in all stages; they are the first rows
     ]
 )
 # The hands' motion as compiled functions read it: see `model.Seen`.
@@ -289,8 +292,8 @@ def _tool_in(
         tool = t + s u + δ
 
     t and u are the tool's first via-point and its segment. Added are the hands that the tool
-    follows (`add_followed`) and the `pulls` (X, 9) of other via-points
-    (`via_points.pulls_through`).
+    follows (`add_followed`) and the `pulls` (X, 9) of other via-points, those that act in all
+    stages and those of stage k (`via_points.pulls_through`).
     """
     stage, found = stages[k], np.empty(OUTPUTS)
     one, other = along_both(hands, tempo, stage)
@@ -307,7 +310,8 @@ def _tool_in(
         out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
     add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
-        add_weighted(hands[:6], pulls, PULL_SHARPNESS_PER_M2, out)
+        add_weighted(hands[:6], pulls[: size["pulls"]], PULL_SHARPNESS_PER_M2, out)
+        add_weighted(hands[:6], pulls[stage["pulled"][0] : stage["pulled"][1]], stage["sharpness"], out)
 
 
 @compiled

@@ -1,0 +1,114 @@
+"""Requests to correct the tool: refused with a reason, carried out in a hold alone, and undone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.client import RefusedError
+from service.contract.records import Mode
+from service.contract.requests import RequestError
+from service.core.codes import HELD_SEEN, HELD_UNSEEN
+from service.core.frame import order
+from service.core.skill.skill import Skill
+from service.daemon.correcting import HOLD_ENDED
+from service.daemon.queryables import PendingEvent
+from service.learning.via_points import adapted
+from support.request_cell import PLACES, Cell
+
+ADD = {"op": "add"}
+
+
+@pytest.fixture(scope="module")
+def taught(skill: Skill) -> Skill:
+    """The shipped skill as the cell has it, with the via-points of the nominal scene."""
+    return adapted(skill, PLACES, tolerance=0.05)
+
+
+@pytest.fixture
+def held(cell: Cell, taught: Skill) -> Cell:
+    """A cell whose arm holds, with the hands halfway to the handover, and was led away."""
+    cell.client.add(PLACES)
+    state, hands = cell.state, taught.model.hands
+    state["tick"], state["arm_tick"], state["held_tick"], state["guided_tick"] = 1000, 1000, 900, 990
+    state["operator_hold"], state["held"], state["held_stage"] = 1, HELD_SEEN, 0
+    state["held_hands"] = (0.5 * (hands[0] + hands[1])).reshape(2, 3)
+    state["measured"] = cell.settings.arm.posture
+    state["measured"][0] += 0.2
+    return cell
+
+
+@pytest.mark.timeout(300)
+def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> None:
+    state = held.state
+    right = taught.mean(state["held_hands"].reshape(1, 6), ["handover"])[0].tolist()
+    cases: tuple[tuple[dict[str, Any], dict[str, Any], str], ...] = (
+        ({"operator_hold": 0}, ADD, "the arm does not hold for an operator"),
+        ({"operator_hold": 0}, {"op": "undo"}, "the arm does not hold for an operator"),
+        ({"held": HELD_UNSEEN}, ADD, "the hands were not seen when the hold began"),
+        ({"guided_tick": 0}, ADD, "the arm was not led in this hold"),
+        ({"guided_tick": 899}, ADD, "the arm was not led in this hold"),
+        ({"arm_tick": 500}, ADD, "the arm's joints are not measured now"),
+        ({"measured_velocities": 0.3}, ADD, "the arm moves at 0.30 rad/s; 0.05 rad/s accepted"),
+        ({"held_stage": -1}, ADD, "the stage of the task was not known"),
+        ({}, ADD | {"tool": right}, "the tool is 0 mm from where the skill has it for these hands; 5 mm or more"),
+        ({"held_hands": 0.3}, ADD, "the distance of a hand from its segments is "),
+        ({}, ADD | {"tool": [0.5, 0.0, 2.0]}, "$.tool: [0.5, 0.0, 2.0] outside the skill's workspace"),
+        ({}, ADD | {"tool": [0.6, 0.0, -0.02]}, "$.tool: [0.6, 0.0, -0.02]"),
+        (
+            {},
+            ADD | {"tool": [0.8, -0.31, 0.19]},
+            "no posture of the arm has the tool there and keeps clear",
+        ),
+        ({}, ADD | {"tool": [0.5, 0.0]}, "$.tool: 2 numbers, 3 needed"),
+        ({}, ADD | {"tool": right, "turned": True}, "turned: true given with a tool"),
+        ({}, ADD | {"hands": "later"}, "$.hands: 'later' given; held, now accepted"),
+        ({}, ADD | {"hands": "now"}, "$.hands: 'now' given, but the hands are not seen now"),
+        ({}, ADD | {"name": "mine"}, "$: unknown field 'name'; known are op, tool, hands, turned"),
+        ({}, {"op": "redo"}, "$.op: 'redo' given; add, undo accepted"),
+        ({}, {"op": "undo"}, "no correction is in force"),
+    )
+    for change, request, words in cases:
+        before = {name: np.array(state[name]) for name in change}
+        for name, value in change.items():
+            state[name] = value
+        assert words in held.refusal("correct", request), (change, request)
+        for name, value in before.items():
+            state[name] = value
+    held.mode = Mode.FAULT
+    assert "the arm is in a fault" in held.refusal("correct", ADD)
+    held.mode = Mode.FOLLOW
+    assert "the arm does not hold" in held.refusal("correct", ADD)
+
+
+@pytest.mark.timeout(300)
+def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> None:
+    first = held.client.correct()
+    assert first.correction is not None
+    assert (first.correction.name, first.correction.stage) == ("correction-1", ("start", "handover"))
+    assert held.kinds()[-2:] == ["skill", "stage"]  # the stage of the hold, whatever the hand did that led
+    one = held.client.places()
+    held.state["measured"][0] += 0.1
+    second = held.client.correct()
+    assert second.correction is not None
+    assert (second.correction.name, second.correction.corrections) == ("correction-2", 2)
+    two = held.client.places()
+    assert [point.name for point in two] == [*(point.name for point in PLACES), "correction-2"]
+    undone = held.client.undo_correction().correction
+    assert undone is not None
+    assert (undone.name, undone.undone) == ("correction-2", True)
+    assert held.client.places() == one
+    held.client.undo_correction()
+    assert [point.name for point in held.client.places()] == [point.name for point in PLACES]
+    with pytest.raises(RefusedError, match="no correction is in force"):
+        held.client.undo_correction()
+    assert not held.failures
+
+
+def test_an_event_whose_condition_no_longer_holds_is_not_taken() -> None:
+    pending = PendingEvent(order("hold"), lambda: False)
+    assert pending.claimed(7) is None
+    with pytest.raises(RequestError, match=HOLD_ENDED):
+        pending.wait()

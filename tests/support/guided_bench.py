@@ -1,0 +1,83 @@
+"""The bench with an arm that a person may lead by hand, as its driver reports."""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import zenoh
+
+from service.client import publisher
+from service.contract import cdr
+from service.core.frame import Vector
+from service.daemon.clock import Deadlines
+from service.settings.config import Settings
+from sim.bench import Bench
+from sim.network import Bridge, Led, Live
+from sim.scene import Scene
+from sim.script import HandScript
+
+LED_RADPS = 0.5
+SETTLED_RAD = 0.003
+
+
+class GuidedBench:
+    """A simulated arm in a thread: it follows the cell's commands, or is led by `lead`."""
+
+    def __init__(self, session: zenoh.Session, settings: Settings) -> None:
+        self._session, self._settings = session, settings
+        self._goal: Vector | None = None
+        self._joints = np.zeros(len(settings.joints.names))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def lead(self, by: Vector) -> None:
+        """Lead the arm from where it is by so much (J,) [rad], and hold it there; its driver
+        reports that.
+        """
+        self._goal = self._joints + by
+
+    @property
+    def is_led_there(self) -> bool:
+        """True once the arm is where it was led to."""
+        return self._goal is not None and bool(np.abs(self._goal - self._joints).max() < SETTLED_RAD)
+
+    def let_go(self) -> None:
+        """End guiding: the arm stands where it is, and follows commands again."""
+        self._goal = None
+
+    def _run(self) -> None:
+        said = publisher(self._session, self._settings.cell, "joints/guided")
+        with Bench(HandScript(Scene(), seed=1), settings=self._settings) as bench:
+            bridge = Bridge(self._session, Live(cell=self._settings.cell), bench.joint_names)
+            drive, deadlines, before = (
+                Led(bench, bridge.commands, bridge.gripper),
+                Deadlines(self._settings.rate_hz),
+                -1,
+            )
+            while not self._stop.is_set():
+                index = deadlines.wait()[0]
+                if (goal := self._goal) is None:
+                    seen = drive.step(index - before)[0]
+                else:
+                    step = goal - self._joints
+                    step *= min(1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9))
+                    seen = bench.step(tuple((self._joints + step).tolist()))
+                    drive = Led(bench, bridge.commands, bridge.gripper)  # it begins anew where the arm is let go
+                    bridge.commands.queued()
+                before, self._joints = index, np.array(seen.joints)
+                bridge.publish_joints(seen)
+                said.put(cdr.encode_bool(goal is not None))
+            bridge.close()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
