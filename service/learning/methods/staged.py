@@ -269,7 +269,7 @@ class _Prediction(NamedTuple):
         found = np.empty((len(hands), 4))
         along_all(hands, np.ascontiguousarray(tempos[:, :2]), belief.argmax(axis=1), placed.stages, found)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
-        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * times[:, None]])]
+        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
