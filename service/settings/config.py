@@ -82,7 +82,7 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
-    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.15  # [m/s] until the tool reaches its target; 0: off
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.0  # [m/s] until the tool reaches its target; 0: off
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
