@@ -33,6 +33,8 @@ from service.files.urdf_markers import with_markers
 from service.settings.config import Settings, robot_description
 
 OBJECTS_NOTE = "objects"
+# Settings that earlier recordings lack, with the values at which these versions behaved.
+EARLIER_SETTINGS = {"tool": {"engage_speed": 0.0}}
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
 FORMAT = "2"  # a recording with another layout of State or Frame cannot be replayed
 _LATCHED_QOS = (
@@ -212,7 +214,11 @@ class Recording:
                 f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by another version?"
             )
         try:
-            settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
+            given = msgspec.json.decode(parts["settings.json"])
+            for section, values in EARLIER_SETTINGS.items():
+                if isinstance(given, dict) and isinstance(given.get(section), dict):
+                    given[section] = values | given[section]
+            settings = validated(given, Settings)
         except (msgspec.DecodeError, InvalidError) as error:
             raise RecordingError(f"the settings in {path} are not valid: {in_words(error, named=False)}") from None
         return cls(path, settings, parts, about)

@@ -34,7 +34,7 @@ from service.settings.config import Settings
 
 _RECORDS = ("frame", "timing", "state")
 # Fields of a State that recordings of earlier versions lack: these versions behaved as with a 0.
-LATER_FIELDS = {"clutch_until_tick", "gripper_wish", "engaging"}
+LATER_FIELDS = {"clutch_until_tick", "gripper_wish", "engaging", "followed_tick"}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 

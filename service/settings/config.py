@@ -82,7 +82,7 @@ class ToolSettings(Section, frozen=True):
 
     plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
-    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.0  # [m/s] until the tool reaches its target; 0: off
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.15  # [m/s] until the tool reaches its target; 0: off
     max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
     max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
     fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
@@ -96,8 +96,8 @@ class ToolSettings(Section, frozen=True):
 
     @property
     def engaging_speed(self) -> float:
-        """Speed limit of the setpoint [m/s] from the start of following until it is at its target
-        for the first time: `engage_speed`, but at most `max_speed`, which also holds for an
+        """Speed limit of the setpoint [m/s] after a start or a hold until it is at its target for
+        the first time: `engage_speed`, but at most `max_speed`, which also holds for an
         `engage_speed` of 0.
         """
         return min(self.engage_speed or self.max_speed, self.max_speed)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -19,7 +20,7 @@ from service.core.frame import STATE, Event, Frame, Tick, converted, definitions
 from service.core.skill.skill import Skill
 from service.files import mcap_file
 from service.files.mcap_file import RecordingError
-from service.files.recording import Recorder, Recording
+from service.files.recording import EARLIER_SETTINGS, Recorder, Recording
 from service.files.replay import replay, ticks
 from service.files.steps import LATER_FIELDS, checksum
 from service.learning.via_points import adapted
@@ -159,6 +160,27 @@ def test_a_recording_without_the_later_fields_of_a_state_replays_identically(
         result = replay(path)
         assert result.exact, result.text()
         assert result.ticks == len(steps)
+
+
+def test_settings_that_an_earlier_recording_lacks_are_as_they_were_then(
+    tmp_path: Path, skill: Skill, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attach = Recorder.attach
+
+    def attach_fewer(self: Recorder, name: str, data: bytes, time_ns: int) -> None:
+        if name == "settings.json":
+            settings = msgspec.json.decode(data)
+            for section, values in EARLIER_SETTINGS.items():
+                settings[section] = {key: value for key, value in settings[section].items() if key not in values}
+            data = msgspec.json.encode(settings)
+        attach(self, name, data, time_ns)
+
+    monkeypatch.setattr(Recorder, "attach", attach_fewer)
+    slow = msgspec.structs.replace(ASSUMED, tool=msgspec.structs.replace(ASSUMED.tool, max_speed=0.1))
+    Recorder(tmp_path / "earlier.mcap", settings=slow, skill=skill.file).close()
+    earlier = Recording.open(tmp_path / "earlier.mcap").settings
+    assert slow.tool.engage_speed > slow.tool.max_speed
+    assert earlier.tool == msgspec.structs.replace(slow.tool, engage_speed=0.0)
 
 
 def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:

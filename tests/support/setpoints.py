@@ -11,7 +11,7 @@ from support.explained import Explained
 from support.wam import STATE
 
 PERIOD_S = 0.002
-TOOL = ToolSettings()
+TOOL = ToolSettings(engage_speed=0.0)  # at full speed from the start: engaging has tests of its own
 BOX = np.array([[0.2, -0.6, 0.05], [1.0, 0.6, 0.8]])
 MIDDLE = np.array([0.6, 0.0, 0.4])
 FREE = np.zeros((3, 3, 7))  # no joint limits
