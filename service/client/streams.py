@@ -162,7 +162,7 @@ class _Received(AbstractContextManager[Any]):
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
         self.rejected, self.reason = 0, ""
-        self._came, self._is_closed = threading.Condition(), False
+        self._session, self._came, self._is_closed = session, threading.Condition(), False
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
         self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
@@ -211,7 +211,7 @@ class Watch(_Received, Iterator[Any]):
             raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
         decode = channels.BY_KEY[suffix].codec.decode
         self._decode = functools.partial(decoded, kind=Status) if suffix == "status" else decode
-        self._timeout_s, self._session = timeout_s, session
+        self._timeout_s = timeout_s
         super().__init__(session, cell, suffix)
 
     def __next__(self) -> Any:
@@ -253,7 +253,7 @@ class Follower(_Received):
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
-        self._names, self._session = tuple(names), session
+        self._names = tuple(names)
         self._state = publisher(session, cell, "joints/state", express=True)
         super().__init__(session, cell, "joints/command")
 

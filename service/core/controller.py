@@ -238,7 +238,7 @@ class Controller:
             moved = self._limiter.step(state, frame, own, np.zeros(len(own)), separation)
         self._here = moved.here
         lap("limiter")
-        self._setpoint.begin(state, frame, moved.here)
+        self._setpoint.begin(state, frame, moved.here, engages=not self.decision.is_brief(state))
         lap("setpoint")
 
     def _at(self) -> Kinematics:

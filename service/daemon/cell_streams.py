@@ -129,8 +129,8 @@ class CellStreams:
         """
         events: list[Event] = []
         for suffix, source in self._subscribers:
-            payloads = (sample.payload for sample in _waiting(source, _most(suffix)))
-            arrived = [event for payload in payloads if (event := self._decoded(suffix, payload))]
+            waiting = _waiting(source, _most(suffix))
+            arrived = [event for sample in waiting if (event := self._decoded(suffix, sample.payload))]
             events += arrived[-1:] if suffix == ARM_STATE else arrived
         for by_frame, source in self._transforms:
             for suffix, poses in self._poses(by_frame, source).items():

@@ -252,10 +252,11 @@ class _Comparison:
         seen = converted(frame, self.recording.recorded_as.get("frame", frame.dtype))
         different = {} if step.frame is None else differences(converted(step.frame, seen.dtype), seen)
         state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
-        if step.state is not None and state is not None:
-            different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
-        outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
         then = state if state is None else converted(state, self.recording.recorded_as.get("state", state.dtype))
+        if step.state is not None and then is not None:
+            recorded = converted(step.state, then.dtype)
+            different |= {f"state.{name}": value for name, value in differences(recorded, then).items()}
+        outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
         same = not different and (not checksums or checksums.get(tick.index) == checksum(seen, outputs, then))
         if self.recorder:
             self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)

@@ -37,7 +37,7 @@ _RECORDS = ("frame", "timing", "state")
 # Fields of a State or a Frame that recordings of earlier versions lack: these versions behaved as
 # with a 0.
 LATER_FIELDS = {
-    *("clutch_until_tick", "gripper_wish", "engaging", "task_clock"),
+    *("clutch_until_tick", "gripper_wish", "engaging", "followed_tick", "task_clock"),
     *("known_gate_m", "unprimed_belief", "error_probability"),
     *("guided_until_tick", "guided_tick", "held", "held_tick", "held_stage", "held_hands"),
 }

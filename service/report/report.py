@@ -143,7 +143,8 @@ class Report:
         reached = int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
         self.initial_mm = Percentiles.of(lag_mm[:reached])  # tool to target, before it reached the first target
         self.initial_s = reached * columns.period_s
-        self.lag_mm = Percentiles.of(lag_mm[reached:])  # tool to target afterwards, while it follows
+        engaging = following["flags"][reached:] & int(Flag.ENGAGING) > 0
+        self.lag_mm = Percentiles.of(lag_mm[reached:][~engaging])  # tool to target afterwards, once it has engaged
         self.approach = _approach(columns, self.spans)
         self.places = tuple(places(columns))
         self.stages = tuple(stages(columns))

@@ -96,8 +96,8 @@ class ToolSettings(Section, frozen=True):
 
     @property
     def engaging_speed(self) -> float:
-        """Speed limit of the setpoint [m/s] from the start of following until it is at its target
-        for the first time: `engage_speed`, but at most `max_speed`, which also holds for an
+        """Speed limit of the setpoint [m/s] after a start or a hold until it is at its target for
+        the first time: `engage_speed`, but at most `max_speed`, which also holds for an
         `engage_speed` of 0.
         """
         return min(self.engage_speed or self.max_speed, self.max_speed)

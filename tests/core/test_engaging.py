@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from service.contract.records import Flag, Mode
 from service.core.controller import Controller
+from service.core.decision.tuning import BRIEF_HOLD_S
 from service.core.frame import Event, Tick, Vector, order
 from service.core.setpoint.tuning import ENGAGED_GAP_M
 from service.core.skill.skill import Skill
@@ -120,6 +121,48 @@ def test_every_following_begins_slowly_also_after_a_fault(taught: Skill) -> None
     begins = int(np.argmax(again["mode"][400:] == Mode.FOLLOW)) + 400
     assert engages(again)[begins]
     assert tool_speeds(cell(Settings()), again)[engages(again)].max() <= E + TOOL_RISE_MPS
+
+
+@pytest.mark.parametrize(
+    ("unseen_s", "orders", "anew"),
+    [
+        (0.3, {}, False),
+        (BRIEF_HOLD_S, {}, False),
+        (BRIEF_HOLD_S + 0.3, {}, True),
+        (0.3, {0.2: "hold", 0.25: "resume"}, True),
+        (0.3, {0.2: "fault", 0.25: "reset"}, True),
+    ],
+)
+def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
+    taught: Skill, unseen_s: float, orders: dict[float, str], anew: bool
+) -> None:
+    """Unseen hands hold the arm 0.1 s later. They have moved when they are seen again."""
+    loop = Loop(cell(Settings()), taught)
+    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    assert not engages(loop.run(3000))[-1]
+    loop.hands = None
+    unseen = loop.run(round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()})
+    assert unseen["mode"][-1] != Mode.FOLLOW
+    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    seen = loop.run(1000)
+    begins = int(np.argmax(seen["mode"] == Mode.FOLLOW))
+    assert seen["mode"][begins] == Mode.FOLLOW
+    assert engages(seen)[begins + 1] == anew
+    speed = np.linalg.norm(seen["setpoint_velocity"], axis=1)
+    assert speed[engages(seen)].max() <= E if anew else speed.max() > 2 * E
+    assert_limits_hold(loop.frames, cell(Settings()))
+
+
+def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
+    loop = Loop(cell(Settings(), engage_speed=0.02), taught)
+    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    assert engages(loop.run(1000))[-1]
+    moving, loop.hands = loop.hands, None
+    assert loop.run(150)["mode"][-1] == Mode.HOLD
+    loop.hands = moving
+    seen = loop.run(500)
+    assert seen["mode"][-1] == Mode.FOLLOW
+    assert engages(seen)[-1]
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_HZ)

@@ -41,8 +41,8 @@ class Explained(SetpointGenerator):
         self._steps = -1
         self.closest = np.inf  # [m] that a setpoint has come to its bound
 
-    def begin(self, state: Record, setpoint: Vector) -> None:
-        super().begin(state, setpoint)
+    def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
+        super().begin(state, setpoint, engages=engages)
         self._steps = -1
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:

@@ -7,6 +7,7 @@ from service.contract.records import PER_JOINT, Field
 WAY = 24  # largest number of postures of a way out
 STATE = (
     Field("slow_tick", "int64"),  # the last tick at which the tool was below its fault speed
+    Field("followed_tick", "int64"),  # the last tick at which the arm followed
     # Tick from which a duration is measured: without progress of a tool that follows; of a way out;
     # without motion of joints that return out of a thing.
     Field("stuck_tick", "int64"),

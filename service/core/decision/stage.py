@@ -7,12 +7,14 @@ from __future__ import annotations
 import numpy as np
 
 from service.contract.records import Reason
-from service.core.codes import BLOCKED, FAULT, HOLD, NOT_READY, RETURNING
+from service.core.codes import AMBIGUOUS, BLOCKED, FAR, FAULT, HOLD, NOT_READY, RETURNING, STALE_HAND
 from service.core.decision.leave import WayOut
 from service.core.decision.step import step
-from service.core.decision.tuning import RETURN_RADPS
+from service.core.decision.tuning import BRIEF_HOLD_S, RETURN_RADPS
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.settings.config import Settings
+
+BY_THE_HANDS = (STALE_HAND, FAR, AMBIGUOUS)
 
 
 class Decision:
@@ -36,6 +38,7 @@ class Decision:
             engaging_speed=float(settings.tool.engaging_speed),
             per_rad=np.array(limits.per_rad),
         )
+        self._brief_ticks = round(BRIEF_HOLD_S / settings.period_s)
         self._return_speed = RETURN_RADPS * np.array(limits.per_rad)
         self._way_out = WayOut(settings)
         self.measured = (0.0, 0.0)
@@ -64,6 +67,13 @@ class Decision:
             inward: Vector = (q < self._lower).astype(np.float64) - (q > self._upper)
             return self._return_speed * inward
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
+
+    def is_brief(self, state: Record) -> bool:
+        """True during a hold that the hands have caused, in its first BRIEF_HOLD_S. The arm then
+        resumes its motion without engaging anew.
+        """
+        held = int(state["tick"] - state["followed_tick"])
+        return int(state["reason"]) in BY_THE_HANDS and held <= self._brief_ticks
 
     def take(self, state: Record, event: Event) -> None:
         """Apply an event of kind hold, resume, reset, fault or way (a way out). Raises ValueError

@@ -120,6 +120,8 @@ def step(
         state.stuck = _stuck(states, frames, heres, parameters)
         reason = BLOCKED if state.stuck == HELD else NONE
     state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+    if reason == NONE:
+        state.followed_tick = state.tick
     return starts, error, speed
 
 

@@ -15,6 +15,10 @@ RETURN_RADPS = 0.1  # speed at which a joint outside its limits moves back
 # 0.01 to 0.1. More: faults come later. Less: late commands are faults.
 TOO_FAST_S = 0.03  # a tool above fault_speed for this time is a fault; one late command is shorter
 
+# Engaging.
+# 0.5 to 2. More: hands lost for long are followed fast. Less: short dropouts cost time.
+BRIEF_HOLD_S = 1.0  # after a hold this short, which only the hands have caused, the tool does not engage anew
+
 # A tool that is stuck: it comes no nearer to its target.
 # 5e-3 to 0.05. More: fewer tools are stuck. Less: a lag looks stuck.
 STUCK_GAP_M = 0.02  # a tool nearer than this has reached its target; a target that moves farther is a new one

@@ -13,7 +13,7 @@ STATE = (
     Field("orientation", "float64", (4,)),  # orientation setpoint, a quaternion x y z w
     Field("turning", "float64", (3,)),  # angular velocity of the orientation setpoint [rad/s]
     Field("gripper", "uint8"),
-    Field("engaging", "uint8"),  # 1: the setpoint has not been at its target since following began
+    Field("engaging", "uint8"),  # 1: the setpoint has not been at its target since a start or a hold
 )
 FRAME = (
     Field("setpoint", "float64", (3,)),  # position setpoint [m]

@@ -13,8 +13,8 @@ A step is taken only if the stop after it keeps every limit. Otherwise the setpo
 that the step before has checked. So these limits hold by induction, whatever the target does:
 
 * the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
-* from the start of following until the setpoint is within ENGAGED_GAP_M of its target, the norm of
-  its speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
+* after a start or a hold, until the setpoint is within ENGAGED_GAP_M of its target, the norm of its
+  speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
 * the setpoint stays inside the workspace, and within HULL_MARGIN_M of the box around the targets of
   the last HULL_TIME_S. If that box has moved away, or if following began outside of it, the
   setpoint returns at RETURN_SHARE of max_speed or faster. docs/bounds.md has the proof.
@@ -65,9 +65,13 @@ class SetpointGenerator:
         self._engaging["max_speed"] = tool.engaging_speed
         self._engages = tool.engaging_speed < tool.max_speed
 
-    def begin(self, state: Record, setpoint: Vector) -> None:
-        """Start from the motion of the tool (3, 3), which becomes the only known target."""
-        state["setpoint"], state["engaging"] = setpoint, self._engages
+    def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
+        """Start from the motion of the tool (3, 3), which becomes the only known target.
+
+        If it `engages`, it engages anew; otherwise it continues to if it has not yet ended.
+        """
+        state["setpoint"] = setpoint
+        state["engaging"] = self._engages and (engages or state["engaging"])
         state["hull"] = setpoint[0]
         state["hull_ticks"] = 0
 
@@ -119,10 +123,11 @@ class SetpointStage:
         self._costs = np.empty((3, 3, len(settings.joints.names)))
         self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
 
-    def begin(self, state: Record, frame: Record, here: Kinematics) -> None:
+    def begin(self, state: Record, frame: Record, here: Kinematics, *, engages: bool = True) -> None:
         """Start the setpoints where the commanded joints place the tool, at the tool's velocity."""
         velocities = state["joints"][1]
-        self._position.begin(state, np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)]))
+        moving = np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)])
+        self._position.begin(state, moving, engages=engages)
         self._orientation.begin(state, here.rotation, here.jacobian[3:] @ velocities)
         write(as_array(state), as_array(frame))
 
