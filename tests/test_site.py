@@ -29,6 +29,7 @@ UNITS += ("_PER_M2", "_SHARE", "_SHARES", "_SAMPLES", "_STDS", "_WEIGHT", "_POWE
 DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a primitive's inputs
     *("MODE_PRIOR", "TREMOR_DAMPING", "MAX_INNOVATION", "STAGE_DISTANCE", "STAGE_DISTANCE_BESIDE", "REST_SHARPNESS"),
     *("ERROR_WIDTH", "GRIPPER_OPEN_BELOW", "STOP_SECANTS", "PLANNED_BRAKE_LIMITS", "MAX_SQUARED_DEVIATION"),
+    *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `service.client`, for the service's own programs

@@ -352,7 +352,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
             ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
             for who, (_, colour, marker) in SHOWN.items():
-                one = ours.accepted if who == SERVICE else task["methods"][who + ending]
+                one = ours.accepted if who == SERVICE else task["methods"].get(who + ending, {})
                 ax.plot(one.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
             ax.plot(ours.accepted.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
             ax.plot(ours.in_spite.get("rms_mm", np.nan), y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)

@@ -93,7 +93,7 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
     taught = adapted(shipped_skill(), scene.via_points(), tolerance=0.001).for_loop()
     run = rehearse(HandScript(scene, seed=1), lambda _: taught, settings=cell, rate_hz=100)
     assert run.events.success
-    assert max(run.errors_mm) < 12.0, run.errors_mm
+    assert max(run.errors_mm) < 15.0, run.errors_mm
 
 
 def test_the_places_are_those_of_the_demo() -> None:

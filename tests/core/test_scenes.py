@@ -263,7 +263,7 @@ def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], se
 def test_joints_that_change_their_acceleration_slowly_come_to_rest(taught: Skill, number: int, name: str) -> None:
     cell = changed(cell_of("panda"), rate_hz=250, jerk=0.2, orientation="full")
     rest = taught.hands.reshape(-1, 2, 3)[taught.model.names.index(name)]
-    settled(cell, taught, free_postures(cell, 1, number)[0], [rest, rest], 16.0)
+    settled(cell, taught, free_postures(cell, 1, number)[0], [rest, rest], 24.0)
 
 
 def test_a_clearance_greater_than_the_arms_own_gaps_does_not_swing_it(taught: Skill) -> None:
@@ -271,7 +271,7 @@ def test_a_clearance_greater_than_the_arms_own_gaps_does_not_swing_it(taught: Sk
     cell = replace(cell_of("wam"), rate_hz=250, obstacles=replace(Settings().obstacles, clearance=0.12))
     places = taught.hands.reshape(-1, 2, 3)
     rest = places[np.random.default_rng(12).integers(len(places))]
-    settled(cell, taught, np.array(cell.arm.posture), [rest, rest], 16.0)
+    settled(cell, taught, np.array(cell.arm.posture), [rest, rest], 24.0)
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def staged(**more: object) -> StagedKMP:
 
 
 def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are_uncertain() -> None:
-    known = staged()
+    known = staged(unknown=None)
     count = len(known.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
     model = staged(unknown=Unknown(FAR_STD_M, scatters))
@@ -93,7 +93,7 @@ def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are
     assert np.diag(added) == pytest.approx([0.02, 0.03, 0.01], rel=0.2)
     assert np.abs(covariance(given, at_last) - covariance(known, at_last)).max() < 2e-3
     few = staged(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=known.errors[known.errors[:, 2] < 0.5])
-    alone = staged(errors=few.errors)
+    alone = staged(errors=few.errors, unknown=None)
     assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this stage"
 
 
@@ -150,7 +150,7 @@ def test_a_task_that_may_have_begun_in_another_stage_is_unsure_until_the_hands_t
 
 def test_a_skill_without_an_alarm_has_an_error_probability_and_the_flag_that_it_had() -> None:
     shipped = shipped_skill()
-    assert shipped.regions == Regions(*shipped.regions[:3])
+    shipped = replace(shipped, model=staged(unknown=None), regions=Regions(*shipped.regions[:3]))
     told, unsure, decided = doubts(shipped, shipped.hands[0].reshape(2, 3), 3)
     assert 0.0 < told[-1] < 0.01
     assert not unsure[-1]

@@ -232,7 +232,7 @@ def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Pa
 def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: Path) -> None:
     data = bytearray(recorded.read_bytes())
     path = tmp_path / "damaged.mcap"
-    data[len(data) // 2] ^= 0xFF
+    data[len(data) * 3 // 4] ^= 0xFF  # in a chunk of messages
     path.write_bytes(data)
     result = replay(path)
     assert len(result.missing) == 1
@@ -308,7 +308,7 @@ def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(checked: Pat
 
 def test_what_is_decided_behind_a_gap_is_not_written_as_if_there_were_none(recorded: Path, tmp_path: Path) -> None:
     data = bytearray(recorded.read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    data[len(data) * 3 // 4] ^= 0xFF  # in a chunk of messages
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(data)
     with pytest.raises(RecordingError, match=r"whole\.mcap cannot be written: gap after tick \d+"):

@@ -74,6 +74,7 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
             joints = messages.JointState(at_ns(i), JOINT_NAMES, tuple(frame["joints"].tolist()), ())
             inbox.append(Event("joints/state", cdr.encode_joints(joints), None))
             inbox.append(Event("clutch", cdr.encode_bool(i % 2 == 0), None))
+            inbox.append(Event("joints/guided", cdr.encode_bool(i % 8 == 0), None))
             wish = messages.JointState(at_ns(i), (messages.GRIPPER,), (0.5,), ())
             inbox.append(Event("gripper/wish", cdr.encode_joints(wish), None))
         if i % 100 == 50:
