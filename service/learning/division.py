@@ -25,7 +25,7 @@ from service.core.intake.hand_estimator import stillness_of
 from service.core.skill import TURNS
 from service.core.skill.memory import along as filtered
 from service.core.skill.memory import turn_lag_s
-from service.core.skill.stages import LEFT, MOST_STAGES, NONE, RIGHT, add_followed, along_way, on_way, recognise
+from service.core.skill.stages import LEFT, MOST_STAGES, NONE, RIGHT, add_followed, along_both, on_way, recognise
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
 from service.learning.demonstration import Demonstration
@@ -152,7 +152,8 @@ class Divided:
         return self.demonstration.period_s
 
     def in_task(self, task: Task) -> Divided:
-        """The same stages of a task in which the tool follows other hands, or turns with them."""
+        """The same stages of a task in which other hands lead, or the tool follows
+        others, or turns with them."""
         return replace(self, stages=_stages(task, self.at))
 
     def turns(self, late_s: float) -> Vector:
@@ -301,14 +302,14 @@ def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -
 
 @compiled
 def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """Write the shares of the stages (T,) that hands (T, 6) with this stillness (T, 2) have
+    """Write the shares of the stages (T,) that hands (T, 6 or more) with this stillness (T, 2) have
     covered, and their distances from the segments [m], to `out` (T, 4).
     """
     for t in range(len(hands)):
+        stage = stages[labels[t]]
+        out[t, 0], out[t, 1] = along_both(hands[t], stillness[t], stage)
         for side in range(2):
-            hand = hands[t, 3 * side : 3 * side + 3]
-            out[t, side] = along_way(hand, stillness[t, side], stages[labels[t]], side)
-            _, out[t, 2 + side] = on_way(hand, stages[labels[t]], side)
+            _, out[t, 2 + side] = on_way(hands[t, 3 * side : 3 * side + 3], stage, side)
 
 
 @compiled

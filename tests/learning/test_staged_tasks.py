@@ -20,6 +20,7 @@ from service.core.skill import TURNS
 from service.core.skill.memory import turn_lag_s
 from service.core.skill.skill import Skill
 from service.core.skill.staged import StagedKMP
+from service.core.skill.stages import LEFT, NONE
 from service.learning.demonstration import Demonstration
 from service.learning.division import task_of, via_points_never_reached
 from service.learning.learn import learn
@@ -220,9 +221,55 @@ def test_the_teachers_delay_is_learned_and_the_tool_led_by_less(cyclic: Skill) -
     assert "lead_s" not in table(in_time)
 
 
+def late_right(shown: Demonstration, by_s: float) -> Demonstration:
+    """The demonstration with a right hand that does all later."""
+    steps = round(by_s / shown.period_s)
+    right = shown.right[np.maximum(np.arange(len(shown.right)) - steps, 0)]
+    return shown._replace(right=right)
+
+
 def without_follow(shown: Demonstration) -> Demonstration:
     """A demonstration whose via-points do not state which hand the tool follows."""
     return shown._replace(places=tuple(msgspec.structs.replace(place, follow="none") for place in shown.places))
+
+
+@pytest.fixture(scope="module")
+def on_path() -> list[Demonstration]:
+    """The tool follows the left hand, whatever the right one does."""
+    return [take.demonstration for take in takes("path", people=range(4), each=2)]
+
+
+def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
+    skill = learn(shown, name="path")
+    assert isinstance(skill.model, StagedKMP)
+    assert decoded(skill.file, origin="memory").model.task.leads == skill.model.task.leads
+    return skill.model.task.leads, msgspec.json.decode(skill.figures, type=Figures)
+
+
+def test_a_hand_that_the_tool_follows_leads_if_that_predicts_better(on_path: list[Demonstration]) -> None:
+    leads, figures = lead_of(on_path)
+    assert leads == LEFT
+    assert figures.taken == "positions, shares of the left hand alone"
+    assert figures.tried_mm[figures.taken] < figures.tried_mm["positions"]
+
+
+def test_a_hand_leads_only_where_it_is_followed_or_was_ahead(on_path: list[Demonstration]) -> None:
+    """Unless somebody shows it, the tool waits for the other hand."""
+    free = [without_follow(one) for one in on_path]
+    leads, figures = lead_of(free)
+    assert leads == NONE
+    assert "positions, shares of the left hand alone" not in figures.tried_mm
+    leads, figures = lead_of([*free[4:], *(late_right(one, 4.0) for one in free[:4])])
+    assert "positions, shares of the left hand alone" in figures.tried_mm
+    assert leads == LEFT
+
+
+def test_where_it_waits_it_waits_to_the_end() -> None:
+    skill = learn([take.demonstration for take in takes("three", people=range(3), each=2)], name="three")
+    places = takes("three", people=range(3), each=1)[0].demonstration.places
+    there = adapted(skill, places, tolerance=0.05)
+    left_alone = np.array([[*places[1].left, *places[0].right]])
+    assert np.linalg.norm(there.mean(left_alone)[0] - places[0].tool) < 0.03
 
 
 @pytest.fixture(scope="module")

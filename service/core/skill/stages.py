@@ -59,6 +59,7 @@ STAGE = np.dtype(
         ("off", np.float64, (2,)),  # [m] each hand's distance from its segment, root mean square
         ("tool", np.float64, (3,)),  # [m] the tool's first via-point
         ("tool_way", np.float64, (3,)),  # [m] the tool's segment
+        ("leads", np.int64),  # hand whose share alone counts in this stage; NONE: both count
         ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the stage
         ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
         ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
@@ -138,8 +139,15 @@ def along_way(hand: Vector, still: float, stage: Record, side: int) -> float:
 
 @compiled
 def along_both(hands: Vector, still: Vector, stage: Record) -> tuple[float, float]:
-    """Shares of the stage, by `along_way`, of both hands (6 or more,) with the stillness (2,)."""
-    return along_way(hands[:3], still[0], stage, 0), along_way(hands[3:6], still[1], stage, 1)
+    """Shares of the stage, by `along_way`, of both hands (6 or more,) with the stillness (2,). If
+    one hand leads the stage, its share counts for both.
+    """
+    one, other = along_way(hands[:3], still[0], stage, 0), along_way(hands[3:6], still[1], stage, 1)
+    if stage["leads"] == LEFT:
+        other = one
+    elif stage["leads"] == RIGHT:
+        one = other
+    return one, other
 
 
 @compiled

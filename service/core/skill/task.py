@@ -23,6 +23,7 @@ TASK_UNITS = (
 TASK_RANGES = {
     "corners": (0, MOST_NAMES, ""),
     "follow": (NONE, RIGHT, ""),
+    "leads": (NONE, RIGHT, ""),
     "nominal": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "off_ways": (1e-3, MAX_SKILL_DISTANCE_M, "m"),
     "seen": (-0.001, MOST_STAGES, ""),
@@ -44,12 +45,15 @@ class Task(NamedTuple):
     * `follow` (N,): the hand that the tool follows at each via-point: NONE, LEFT or RIGHT.
     * `levers` (N, 3) [m]: the tool there in the frame of that hand, with which it turns; None if
       the tool moves with the hand but does not turn with it.
+    * `leads`: the hand whose share alone counts in all stages in which it moves: LEFT, RIGHT, or
+      NONE if both count.
     """
 
     names: tuple[str, ...]
     corners: Indices
     follow: Indices
     levers: Vector | None = None
+    leads: int = NONE
 
     def stages(self, points: NamedViaPoints, off: Vector) -> Records:
         """Stages (N - 1,) of STAGE between these via-points. `off` (N - 1, 2) [m] is its field.
@@ -72,6 +76,7 @@ class Task(NamedTuple):
         out["square"] = np.where(square > LEAST_SEGMENT_M**2, square, STAYS)
         out["way"] *= (out["square"] > STAYS)[:, :, None]
         out["off"], out["tool"], out["tool_way"] = off, at[:-1, 6:], np.diff(at[:, 6:], axis=0)
+        out["leads"] = NONE if self.leads == NONE else np.where(out["square"][:, self.leads] > STAYS, self.leads, NONE)
         out["follow"] = np.stack([self.follow[:-1], self.follow[1:]], axis=1)
         if self.levers is not None:
             out["turned"], out["levers"] = 1, np.stack([self.levers[:-1], self.levers[1:]], axis=1)
@@ -81,7 +86,8 @@ class Task(NamedTuple):
         """Arrays of the task in a skill's file."""
         names = np.array(msgspec.json.encode(self.names).decode())
         levers = {} if self.levers is None else {"levers": self.levers}
-        return {"names": names, "corners": self.corners, "follow": self.follow, **levers}
+        leads = {} if self.leads == NONE else {"leads": np.array(self.leads)}
+        return {"names": names, "corners": self.corners, "follow": self.follow, **levers, **leads}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Task:
@@ -95,10 +101,11 @@ class Task(NamedTuple):
         for side in (0, 1):
             if not np.array_equal(np.unique(corners[:, side]), np.arange(corners[:, side].max() + 1)):
                 raise ValueError(f"the hands' positions {corners.tolist()} are not numbered through")
-        if "levers" not in arrays:
-            return Task(names, corners, follow)
-        check_shapes(arrays, {"levers": (count, 3)})
-        return Task(names, corners, follow, np.ascontiguousarray(arrays["levers"], np.float64))
+        levers, leads = None, int(arrays["leads"]) if "leads" in arrays else NONE
+        if "levers" in arrays:
+            check_shapes(arrays, {"levers": (count, 3)})
+            levers = np.ascontiguousarray(arrays["levers"], np.float64)
+        return Task(names, corners, follow, levers, leads)
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:

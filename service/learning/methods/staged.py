@@ -28,7 +28,7 @@ from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
 from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, Unknown, rows_of
-from service.core.skill.stages import MOST_STAGES, NONE, OUTPUTS, STAYS
+from service.core.skill.stages import LEFT, MOST_STAGES, NONE, OUTPUTS, RIGHT, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.task_clock import TaskClock
 from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
@@ -61,7 +61,7 @@ LEAST_OFF_M = 0.03  # hands deviate from their segments by at least this distanc
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
 CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
 SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the way to a corner that was demonstrated
-UNSEEN_SHARES = (0.15, 0.3, 0.45)  # the same for a corner that no demonstration has
+UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
 KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the clock at which it is known
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
@@ -173,7 +173,8 @@ class Samples(NamedTuple):
         stage, so it is known there when the clock ends; and at the begin of a stage when the clock
         begins. All else is known at any time.
         """
-        moves = self.encoded[0].stages["square"][at[:, 2:].argmax(axis=1)] > STAYS
+        stages = self.encoded[0].stages[at[:, 2:].argmax(axis=1)]
+        moves = (stages["square"] > STAYS) | (stages["leads"] != NONE)[:, None]
         ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
         found = [
             (row, share, time)
@@ -191,10 +192,11 @@ class Samples(NamedTuple):
         The share is 1 at the end of a stage and 0 at its start. At a corner it is 0 or 1 if the
         tool usually was at that end, and 0 if no demonstration has the corner.
         """
-        squares = shown[0].stages["square"]
-        both = np.flatnonzero((squares > STAYS).all(axis=1)).tolist()
+        squares, leads = shown[0].stages["square"], shown[0].stages["leads"]
+        both = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
         known: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
-        known += [(*np.where(squares[k] > STAYS, 0.0, 1.0), k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
+        begins = np.where((squares > STAYS) | (leads != NONE)[:, None], 0.0, 1.0)
+        known += [(*begins[k], k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
         for corner in CORNERS:
             is_unseen = _seen(shown, corner, both)[0] < LEAST_SEEN_S
             for k in both:
@@ -219,6 +221,21 @@ def _seen(shown: Sequence[Encoded], corner: tuple[float, float], stages: Sequenc
 def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
     """The inputs (T, 2 + K) for shares (T, 2) of both hands in the stages (T,) of K."""
     return np.hstack([shares, STAGE_DISTANCE * np.eye(count)[labels]])
+
+
+def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
+    """Tasks in which the share of one hand alone counts, by name, unless one conducts anyway: of
+    each hand that was ahead of the other one in the demonstrations, so that they show whether the
+    tool waits, and of a hand that is the only one that the tool follows.
+    """
+    if any(one.demonstration.conducts != "both" for one in shown):
+        return {}
+    both = np.flatnonzero((shown[0].stages["square"] > STAYS).all(axis=1)).tolist()
+    followed = set(task.follow.tolist()) - {NONE}
+    sides = [
+        side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], both)[0] >= LEAST_SEEN_S
+    ]
+    return {f"positions, shares of the {SIDES[side]} hand alone": task._replace(leads=side) for side in sides}
 
 
 def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[str, Task]:
@@ -435,17 +452,22 @@ class Staged:
         new, earlier = (
             [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
         )
+        demonstrations = [take.demonstration for take in taught.new]
         progress(f"choosing the delay over {len(new)} demonstrations")
         best, delay, error_m = with_delay(self.task, new, blocks)
-        tried_m = {POSITIONS.name: error_m}
-        turning = turning_tasks(self.task, [take.demonstration for take in taught.new])
-        for name, task in turning.items():
-            progress(f"trying {name}")
-            tried_m[name] = math.sqrt(Candidate.of(task, new, delay.mean_s).squares(blocks).mean())
-        least_m = min(tried_m.values())
-        taken = preferred(list(tried_m), list(tried_m.values()), max(AS_GOOD * least_m, least_m + AS_GOOD_M))
-        if taken in turning:
-            best, delay, tried_m[taken] = with_delay(turning[taken], new, blocks)
+        taken, tried_m = POSITIONS.name, {POSITIONS.name: error_m}
+        for is_simpler in (True, False):
+            tasks = leading_tasks(best.task, best.encoded) if is_simpler else turning_tasks(best.task, demonstrations)
+            errors_m = {taken: tried_m[taken]}
+            for name, task in tasks.items():
+                progress(f"trying {name}")
+                errors_m[name] = math.sqrt(Candidate.of(task, new, delay.mean_s).squares(blocks).mean())
+            least_m = min(errors_m.values())
+            limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
+            taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
+            if taken in tasks:
+                best, delay, errors_m[taken] = with_delay(tasks[taken], new, blocks)
+            tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
         errors_m = {taken + name: math.sqrt(one.squares(blocks).mean()) for name, one in clocked.items()}
         if errors_m and min(errors_m.values()) < clock_limit_m(tried_m[taken]):
