@@ -51,6 +51,7 @@ SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 OWN = 3  # takes by which a person refines the skill of the others
 DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
+LEAST_TOLD, MOST_FALSELY_TOLD = 90.0, 15.0  # [%] of samples with errors above UNSURE_M, and of others: what is wanted
 GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
 SHOWN = {
     SERVICE: ("service", ADAPTED, "o"),
@@ -228,6 +229,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "recorded": {task: numbers_of(by_task[task]) for task in RECORDED if task in by_task},
         "made": {kind: numbers_of(by_task[kind]) for kind in TASK_KINDS if kind in by_task},
     }
+    for kind in ("recorded", "made"):
+        folds = [fold for task in numbers[kind] for found in by_task[task] for fold in found.service.values()]
+        numbers[f"all_{kind}"] = summary([one for fold in folds for one in fold.accepted if one])
     draw_numbers(results, numbers)
     return numbers
 
@@ -277,8 +281,9 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
         return {"takes": 0}
     count = sum(one.samples for one in rows)
     inside = [one.inside for one in rows if one.inside is not None]
-    held, unsure, told = (
-        [x for x in column if x is not None] for column in zip(*((r.held, r.unsure, r.told) for r in rows), strict=True)
+    held, unsure, told, falsely = (
+        [x for x in column if x is not None]
+        for column in zip(*((r.held, r.unsure, r.told, r.falsely_told) for r in rows), strict=True)
     )
     wrong = sum(one.wrong for one in rows)
     return {
@@ -292,6 +297,7 @@ def summary(rows: Sequence[Judged]) -> dict[str, Any]:
         "unsure": sum(unsure) / count if unsure else None,
         "wrong": wrong / count,
         "told": sum(told) / wrong if told and wrong else None,  # of the wrong ones, held or unsure
+        "falsely_told": sum(falsely) / (count - wrong) if falsely and count > wrong else None,
     }
 
 
@@ -369,3 +375,28 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     results.figure(figure)
+    _draw_reliability(results, numbers)
+
+
+def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of what a skill says of its own errors, set by set."""
+    plt = pyplot()
+    figure, (inside, told) = plt.subplots(1, 2, figsize=(7.5, 3.6))
+    inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
+    told.axvspan(0, MOST_FALSELY_TOLD, ymin=LEAST_TOLD / 105, color="#eeeeee", zorder=0)
+    for part, colour, label in (("recorded", TOOL, "recorded partners"), ("made", ADAPTED, "made tasks")):
+        for task in numbers[part].values():
+            name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
+            one = task["methods"][name]
+            if one["takes"] and one["coverage"]:
+                inside.plot(
+                    100 * np.array(numbers["levels"]), 100 * np.array(one["coverage"]), ".-", color=colour, lw=0.8
+                )
+            if one.get("falsely_told") is not None and one["told"] is not None:
+                told.plot(100 * one["falsely_told"], 100 * one["told"], "o", color=colour, ms=5)
+        inside.plot([], [], ".-", color=colour, label=label)
+    inside.set(xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]")
+    told.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
+    told.set_ylabel("wrong samples held or unsure [%]")
+    inside.legend(fontsize=8)
+    results.figure(figure, "reliability")

@@ -72,6 +72,7 @@ class Judged(NamedTuple):
     unsure: int | None
     wrong: int  # the tool is farther off than UNSURE_M
     told: int | None  # of these, those where it held or reported to be uncertain
+    falsely_told: int | None  # the same of all others
 
 
 @cache
@@ -158,6 +159,7 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
     lengths = np.linalg.norm(errors, axis=1)
     held, unsure, wrong = said.held, said.uncertain, lengths > UNSURE_M
+    told = None if held is None or unsure is None else held | unsure
     return Judged(
         count,
         float(np.sum(errors**2)),
@@ -168,7 +170,8 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         None if held is None else int(held.sum()),
         None if unsure is None else int(unsure.sum()),
         int(wrong.sum()),
-        None if held is None or unsure is None else int((wrong & (held | unsure)).sum()),
+        None if told is None else int((wrong & told).sum()),
+        None if told is None else int((~wrong & told).sum()),
     )
 
 
