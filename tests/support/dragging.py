@@ -12,6 +12,8 @@ from support.chromium import Tab
 
 STEP_S = 0.016  # interval of a mouse's or a finger's events
 DRAG_S = 0.5  # duration of a drag
+ARRIVE_S = 10.0
+PIXEL_M = 0.01  # [m] a drag may end this far beside a point, because it goes from pixel to pixel
 WHEEL_M = 0.0002  # [m] that the page lifts a hand by a unit of the wheel
 
 
@@ -52,6 +54,9 @@ class Person:
     def drag(self, side: str, to: tuple[float, float, float]) -> None:
         """Drag a hand to a point with the mouse, and turn the wheel until it is as high."""
         self.along(self.pixel(self.hand(side)), self.pixel(to), self.tab.mouse)
+        end = time.monotonic() + ARRIVE_S  # the page may still have events of the mouse to take in
+        while math.dist(self.hand(side, "aim")[:2], to[:2]) > PIXEL_M and time.monotonic() < end:
+            time.sleep(STEP_S)
         here = self.pixel(self.hand(side, "aim"))
         self.tab.mouse("Wheel", *here, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M)
 
@@ -65,7 +70,9 @@ class Person:
             time.sleep(max(0.0, begun_s + i * STEP_S - time.monotonic()))
         mouse("Released", *end)
 
-    def arrive(self, side: str, to: tuple[float, float, float], within_m: float = 0.01, within_s: float = 10.0) -> None:
+    def arrive(
+        self, side: str, to: tuple[float, float, float], within_m: float = 0.01, within_s: float = ARRIVE_S
+    ) -> None:
         """Wait until a hand has arrived at a point."""
         end = time.monotonic() + within_s
         while math.dist(self.hand(side), to) > within_m:

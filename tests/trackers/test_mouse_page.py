@@ -249,6 +249,21 @@ def test_fingers_on_a_phone_drag_both_hands_at_once_and_lift_them(daemon: Daemon
         until_arrived(received, "left", (starts[0][0] - away_m, starts[0][1], starts[0][2] + lift_m), 0.01)
 
 
+def test_the_wheel_lifts_the_hand_that_was_dragged_there_though_it_has_not_arrived(url: str, tmp_path: Path) -> None:
+    """Not the other one, which is nearer to the pointer meanwhile."""
+    with person_at(url, tmp_path) as person:
+        x, y, z = person.hand("left")
+        beside = (x, y + 0.03, z)
+        begin, end = person.pixel(person.hand("right")), person.pixel(beside)
+        person.tab.mouse("Pressed", *begin)
+        person.tab.mouse("Moved", *end)
+        person.tab.mouse("Released", *end)
+        person.tab.mouse("Wheel", *end, deltaX=0, deltaY=-500)
+        person.tab.until(f"hands.left.aim[2] !== {z} || hands.right.aim[2] > {person.hand('right')[2]} + 0.05")
+        assert person.hand("left", "aim")[2] == z
+        assert math.dist(person.hand("right", "aim")[:2], beside[:2]) < 0.01
+
+
 def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None:
     parts = urlsplit(url)
     for query in ("", "?token=guessed"):
