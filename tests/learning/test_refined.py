@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from service.core.frame import Vector
+from service.core.skill.staged import StagedKMP
+from service.core.skill.stages import LEFT
 from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration, NamedDemonstration
 from service.learning.learn import learn
@@ -117,3 +119,11 @@ def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
     assert shared_counts(200, 4, 0, 4) == [50] * 4
     assert shared_counts(200, 2, 100, 4) == [50] * 2 + [4] * 100
     assert chosen({1.0: 0.03, 4.0: 0.02, np.inf: 0.025}) == (4.0, ("4", {"1": 0.03, "4": 0.02, "yours alone": 0.025}))
+
+
+def test_which_hand_leads_is_chosen_over_all_takes_and_not_by_three_of_one_person() -> None:
+    of_others = learn([one.demonstration for one in takes("path", people=range(4), each=2)], name="others")
+    mine = learn([one.demonstration for one in takes("path", people=[32], each=3)], name="mine", refined=of_others)
+    assert isinstance(of_others.model, StagedKMP)
+    assert isinstance(mine.model, StagedKMP)
+    assert mine.model.task.leads == of_others.model.task.leads == LEFT

@@ -455,25 +455,36 @@ class Staged:
         demonstrations = [take.demonstration for take in taught.new]
         progress(f"choosing the delay over {len(new)} demonstrations")
         best, delay, error_m = with_delay(self.task, new, blocks)
+        everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # a task is not one person's
+
+        def tried(task: Task) -> Candidate:
+            return Candidate.of(task, everybody, delay.mean_s)
+
+        if earlier:
+            error_m = math.sqrt(tried(self.task).squares(all_blocks).mean())
         taken, tried_m = POSITIONS.name, {POSITIONS.name: error_m}
         for is_simpler in (True, False):
-            tasks = leading_tasks(best.task, best.encoded) if is_simpler else turning_tasks(best.task, demonstrations)
+            shown = tried(best.task).encoded if earlier else best.encoded
+            tasks = leading_tasks(best.task, shown) if is_simpler else turning_tasks(best.task, demonstrations)
             errors_m = {taken: tried_m[taken]}
             for name, task in tasks.items():
                 progress(f"trying {name}")
-                errors_m[name] = math.sqrt(Candidate.of(task, new, delay.mean_s).squares(blocks).mean())
+                errors_m[name] = math.sqrt(tried(task).squares(all_blocks).mean())
             least_m = min(errors_m.values())
             limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
             taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
             if taken in tasks:
-                best, delay, errors_m[taken] = with_delay(tasks[taken], new, blocks)
+                best, delay, least_m = with_delay(tasks[taken], new, blocks)
+                errors_m[taken] = errors_m[taken] if earlier else least_m
             tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
         errors_m = {taken + name: math.sqrt(one.squares(blocks).mean()) for name, one in clocked.items()}
-        if errors_m and min(errors_m.values()) < clock_limit_m(tried_m[taken]):
+        without_m = math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
+        if errors_m and min(errors_m.values()) < clock_limit_m(without_m):
             best = clocked[preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))]
             taken = next(name for name, one in zip(errors_m, clocked.values(), strict=True) if one is best)
-        tried_m |= errors_m
+        if not earlier or taken in errors_m:  # else these are errors of the new takes alone
+            tried_m |= errors_m
         if len(tried_m) == 1:
             tried_m = {}
         if not earlier:
