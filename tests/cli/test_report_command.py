@@ -41,7 +41,7 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     assert "Settings, versions" not in said  # one file twice: none differs
 
     verdict = said.splitlines()[0]
-    counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 3 holds and no faults"
+    counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 4 holds and no faults"
     assert re.fullmatch(rf"{counted}; the worst was hold: operator, for 0\.6 s from 9\.0 s on\.", verdict)
 
     text = page.read_text(encoding="utf-8")

@@ -66,6 +66,7 @@ KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the clock at which it is 
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
+OWN_DELAY_SHARE = 0.75  # a delay of one's own must reduce the error of that of all takes to this share
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
 WITHOUT_PLACES = "without places"  # in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
@@ -358,14 +359,21 @@ def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence
     return block if len(blocks) > 1 else ()
 
 
-def with_delay(task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]]) -> tuple[Candidate, Delay, float]:
+def with_delay(
+    task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]], usual_s: float | None = None
+) -> tuple[Candidate, Delay, float]:
     """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
     in all of them; that delay, with the standard deviation of the delays that predict each of them
-    best; and the error [m].
+    best; and the error [m]. A delay that is `usual_s` is kept unless another one predicts much
+    better, because a teacher's delay varies between takes, and there may be only a few.
     """
     candidates = [Candidate.of(task, shown, late_s) for late_s in DELAYS_S]
     squares = np.array([one.squares(blocks) for one in candidates])
     best, each_s = int(squares.sum(axis=1).argmin()), np.array(DELAYS_S)[squares.argmin(axis=0)]
+    if usual_s is not None:
+        usual = DELAYS_S.index(usual_s)
+        if squares[best].sum() > OWN_DELAY_SHARE**2 * squares[usual].sum():
+            best = usual
     return candidates[best], Delay(DELAYS_S[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
 
 
@@ -454,8 +462,9 @@ class Staged:
         )
         demonstrations = [take.demonstration for take in taught.new]
         progress(f"choosing the delay over {len(new)} demonstrations")
-        best, delay, error_m = with_delay(self.task, new, blocks)
         everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # a task is not one person's
+        usual_s = with_delay(self.task, everybody, all_blocks)[1].mean_s if earlier else None
+        best, delay, error_m = with_delay(self.task, new, blocks, usual_s)
 
         def tried(task: Task) -> Candidate:
             return Candidate.of(task, everybody, delay.mean_s)
@@ -474,7 +483,7 @@ class Staged:
             limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
             taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
             if taken in tasks:
-                best, delay, least_m = with_delay(tasks[taken], new, blocks)
+                best, delay, least_m = with_delay(tasks[taken], new, blocks, usual_s)
                 errors_m[taken] = errors_m[taken] if earlier else least_m
             tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
