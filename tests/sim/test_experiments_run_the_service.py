@@ -25,6 +25,7 @@ from service.core.skill.staged import StagedKMP
 from service.core.skill.stages import MOST_STAGES
 from service.files.shipped import recordings, shipped_skill
 from service.learning.learn import learn
+from service.learning.methods import staged
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from service.settings.config import Settings, robot_description
@@ -110,11 +111,15 @@ class TestPeople:
         assert shown.estimates[:, 0].tobytes() == wanted["hands"].tobytes()
         assert shown.estimates[:, 1].tobytes() == wanted["hand_velocities"].tobytes()
 
-    def test_a_rival_that_predicts_as_ours_gets_the_target_that_ours_has(self, shown: Seen) -> None:
-        """Of one stage, so that nothing before makes a difference."""
+    def test_a_rival_that_predicts_as_ours_gets_the_target_that_ours_has(
+        self, shown: Seen, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Of one stage and without a clock, so that nothing before makes a difference."""
+        monkeypatch.setattr(staged, "CLOCKS", {})
         of_two = [one._replace(places=(one.places[0], one.places[2])) for one in by_people(3)]
         learned = learn(of_two)
         assert isinstance(learned.model, StagedKMP)
+        assert learned.model.clock is None
         exact = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
         placed, belief = exact.model.placed, np.eye(1, MOST_STAGES)[0]
 
@@ -123,11 +128,15 @@ class TestPeople:
 
             depends_on = DependsOn.HANDS
 
+            @staticmethod
+            def tempos(seen: Observed) -> np.ndarray:
+                return np.column_stack([seen.stillness, np.zeros(len(seen.hands))])
+
             def mean(self, seen: Observed) -> np.ndarray:
-                return placed.mean(seen.hands, np.tile(belief, (len(seen.hands), 1)), seen.stillness)
+                return placed.mean(seen.hands, np.tile(belief, (len(seen.hands), 1)), self.tempos(seen))
 
             def predict(self, seen: Observed) -> Predicted:
-                rows = zip(seen.hands, [belief] * len(seen.hands), seen.stillness, strict=True)
+                rows = zip(seen.hands, [belief] * len(seen.hands), self.tempos(seen), strict=True)
                 far = placed.gates_m(seen.hands) > exact.threshold
                 return Predicted(self.mean(seen), np.array([placed.covariance(*one) for one in rows]), far)
 
