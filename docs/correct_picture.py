@@ -29,7 +29,7 @@ from sim.scene import Scene
 PICTURE = Path(__file__).with_name("correct.png")
 DPI = 90
 STAGE, SHARE = 0, 0.5  # the correction is made halfway to the handover
-LED_M = np.array([0.03, 0.0, 0.07])  # by which the tool is led
+LED_M = np.array([0.03, 0.0, 0.07])  # [m] displacement of the tool that is led
 REST_S, MOVE_S, SAMPLE_TICKS = 1.0, 2.5, 5
 
 

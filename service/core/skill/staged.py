@@ -47,9 +47,11 @@ RESTING_TEMPO = np.array([*STILL, 0.0])  # tempo of two hands that rest and have
 
 
 class Unknown(NamedTuple):
-    """What the tool's position may be where a skill was never shown it: its standard deviation on
-    each axis [m] away from all demonstrations, and the covariances (N, 3, 3) [m²] of the tool at
-    the N via-points in the demonstrations, for via-points that are not known in a scene.
+    """Scatter of the tool's position where nothing was demonstrated.
+
+    * `std_m`: standard deviation on each axis [m], away from all demonstrations.
+    * `scatters` (N, 3, 3) [m²]: covariances of the tool at the N via-points over the
+      demonstrations, for via-points that are not known in a scene.
     """
 
     std_m: float
