@@ -32,14 +32,29 @@ seed = 7
 """
 
 
+def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
+    """The report of a demo that succeeds. One that fails on a machine that its report calls busy is
+    repeated, twice at most.
+    """
+    command = [sys.executable, "-m", "service", "demo", "--json", *arguments]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    for _ in range(3):
+        done = subprocess.run(
+            command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=110, check=False
+        )
+        if done.returncode != 1 or '"busy": ""' in done.stdout:
+            break
+    assert done.returncode == 0, done.stdout + done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["success"]
+    return report
+
+
 @timed
+@pytest.mark.timeout(330)
 def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
-    arguments = ["demo", "--json", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")]
-    done = thirdhand(*arguments, timeout=110)
-    assert done.returncode == 0, done.stdout + done.stderr
-    report = json.loads(done.stdout)
-    assert report["success"]
+    report = demonstrated("--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
     assert report["missing"] == ""
     for name in ("handover", "grasp", "carry"):
         assert report["events"][name]["reached"]
@@ -56,20 +71,13 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
 
 
 @timed
+@pytest.mark.timeout(330)
 def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
     """Its URDF lies beside it, and both are named by a relative path."""
     (tmp_path / "my").mkdir()
     for name in ("ur5.toml", "ur5.urdf"):
         (tmp_path / "my" / name).write_bytes(WAM.with_name(name).read_bytes())
-    command = [sys.executable, "-m", "service", "demo", "--json", "--arm", "my/ur5.toml", "--rate", "1000"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command += ["--output", "out"]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=110, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    report = json.loads(done.stdout)
-    assert report["success"]
+    report = demonstrated("--arm", "my/ur5.toml", "--rate", "1000", "--output", "out", cwd=tmp_path)
     assert report["rate_hz"] == pytest.approx(1000, rel=0.05)
 
 
