@@ -24,7 +24,6 @@ from service.core.skill.via_points import rest_of
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import NOTED_M, adapted
 
-SAME_HANDS_M = SEGMENT_END_M  # hands this near to earlier ones are at the same place
 LEAST_CORRECTION_M = NOTED_M  # a tool that is off by less is where the skill has it
 OFFERED_AFTER = 3  # corrections at the same hands after which a demonstration is proposed
 REACH_STEP_M = 0.02  # distance between the hands at which a correction's effect is examined
@@ -59,7 +58,8 @@ def correction_at(
     """The correction that puts the tool (3,) [m], and its orientation if given, for hands (6,) [m]
     in a stage of the task (-1 for a skill without stages).
 
-    It replaces earlier ones of the same stage at hands that are nearer than SAME_HANDS_M.
+    It replaces earlier ones of the same stage at hands that are nearer than
+    SEGMENT_END_M, which are at the same place.
     """
     left, right, names = _point(hands[:3]), _point(hands[3:]), skill.model.names
     end = _end_of(skill, hands, stage) if names else ""
@@ -68,7 +68,7 @@ def correction_at(
         replaced = [point for point in skill.via_points if point.name == end]
     else:
         earlier = [p for p in skill.via_points if _NUMBERED.fullmatch(p.name) and p.stage == name_of_stage]
-        replaced = [point for point in earlier if _apart_m(skill, hands, _hands(point)) < SAME_HANDS_M]
+        replaced = [point for point in earlier if _apart_m(skill, hands, _hands(point)) < SEGMENT_END_M]
     numbers = [int(found[1]) for point in skill.via_points if (found := _NUMBERED.fullmatch(point.name))]
     before = replaced[-1] if end and replaced else ViaPoint(end, left, right, _point(tool))
     point = msgspec.structs.replace(
@@ -158,7 +158,7 @@ def _end_of(skill: Skill, hands: Vector, stage: int) -> str:
     """The via-point at the begin or end of a stage at which hands (6,) are; empty if at neither."""
     ends = {skill.model.names[k]: _apart_m(skill, hands, skill.model.hands[k]) for k in (stage, stage + 1)}
     name = min(ends, key=lambda name: ends[name])
-    return name if ends[name] < SAME_HANDS_M else ""
+    return name if ends[name] < SEGMENT_END_M else ""
 
 
 def _apart_m(skill: Skill, hands: Vector, others: Vector) -> float:

@@ -27,7 +27,7 @@ from service.core.skill.memory import along as filtered
 from service.core.skill.memory import turn_lag_s
 from service.core.skill.stages import LEFT, MOST_STAGES, NONE, RIGHT, add_followed, along_both, on_way, recognise
 from service.core.skill.task import Indices, NamedViaPoints, Task
-from service.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
+from service.core.skill.tuning import DIRECTION_SPEED_MPS, FIRST_STAGE_ODDS, WITH_HAND_POWER
 from service.learning.demonstration import Demonstration
 from service.learning.skill_file import SkillError
 
@@ -297,7 +297,7 @@ def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -
     for t in range(len(moving)):
         if t:
             out[t] = out[t - 1]
-        recognise(out[t], moving[t], periods_s, stages)
+        recognise(out[t], moving[t], periods_s, stages, FIRST_STAGE_ODDS)
 
 
 @compiled

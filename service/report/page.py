@@ -35,7 +35,8 @@ h1 { font-size: 1.5rem } h2 { font-size: 1.2rem; margin-top: 2.5rem; border-top:
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { text-align: left; padding: .15rem 1.1rem .15rem 0; border-bottom: 1px solid #e5e5e5;
          vertical-align: top; white-space: pre-line; overflow-wrap: anywhere }
-td:first-child { overflow-wrap: break-word } th { font-weight: 600; color: #555 } .number { text-align: right; white-space: nowrap }
+td:first-child { overflow-wrap: break-word }
+th { font-weight: 600; color: #555 } .number { text-align: right; white-space: nowrap }
 svg { max-width: 100%; height: auto } p { margin: .3rem 0 }
 """
 

@@ -30,7 +30,7 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numba
 import numpy as np
@@ -233,6 +233,13 @@ class _Reads(ast.NodeTransformer):
         return ast.copy_location(copy.deepcopy(self.named[node.id]), node)
 
 
+def reading(path: str, source: bytes, reads: Mapping[str, ast.expr]) -> ast.Module:
+    """A module that reads its numbers from memory. Raises ImportError if it reads one when it is
+    imported.
+    """
+    return cast(ast.Module, ast.fix_missing_locations(_Reads(path, reads).visit(ast.parse(source))))
+
+
 class _Loader(SourceFileLoader):
     """Loader of a module of the service that reads its numbers from memory."""
 
@@ -240,8 +247,7 @@ class _Loader(SourceFileLoader):
 
     def get_code(self, fullname: str) -> Any:
         path = self.get_filename(fullname)
-        tree = _Reads(path, self.reads).visit(ast.parse(self.get_data(path)))
-        return compile(ast.fix_missing_locations(tree), path, "exec")
+        return compile(reading(path, self.get_data(path), self.reads), path, "exec")
 
     def exec_module(self, module: ModuleType) -> None:
         vars(module)["_memory"] = sys.modules[__name__]

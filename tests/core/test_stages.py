@@ -13,6 +13,7 @@ from service.core.skill.memory import along, delayed
 from service.core.skill.skill import Skill
 from service.core.skill.stage import SkillStage
 from service.core.skill.stages import MOST_STAGES, STAGE, along_way, recognise
+from service.core.skill.tuning import FIRST_STAGE_ODDS
 from service.files.shipped import shipped_skill
 from service.learning.skill_file import decoded
 from service.settings.config import Settings
@@ -55,7 +56,7 @@ def legs(*ends: float) -> np.ndarray:
 def beliefs(stages: np.ndarray, x: np.ndarray) -> np.ndarray:
     belief, out = np.zeros(MOST_STAGES), []
     for one in motion(x):
-        recognise(belief, one, PERIOD_S, stages)
+        recognise(belief, one, PERIOD_S, stages, FIRST_STAGE_ODDS)
         out.append(belief.copy())
     return np.array(out)
 
@@ -79,7 +80,7 @@ def test_a_belief_that_is_wrong_comes_right_within_a_second(there_and_back: np.n
     belief[0] = 1.0
     for one in motion(np.full(100, 0.7)):
         one[0, 1] = 0.4
-        recognise(belief, one, PERIOD_S, stages)
+        recognise(belief, one, PERIOD_S, stages, FIRST_STAGE_ODDS)
     assert belief[3] > 0.8
 
 

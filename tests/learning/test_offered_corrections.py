@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from service.core.skill.skill import Skill
+from service.core.skill.tuning import SEGMENT_END_M
 from service.learning.corrections import (
     OFFERED_AFTER,
-    SAME_HANDS_M,
     corrected,
     correction_at,
     newest_correction,
@@ -89,14 +89,14 @@ def test_repeated_corrections_replace_each_other_are_counted_and_offered(staged:
     hands, skill = hands_in(staged, 0, 0.5), staged
     for count in range(1, OFFERED_AFTER + 1):
         assert offer_of(skill) == ""
-        aside = 0.5 * SAME_HANDS_M * (count % 2) * np.eye(6)[1]
+        aside = 0.5 * SEGMENT_END_M * (count % 2) * np.eye(6)[1]
         made = correction_at(skill, hands + aside, 0, tool_in(staged, hands, 0) + count * 0.5 * UP)
         assert len(made.replaced) == (count > 1)
         skill, _ = corrected(skill, made.among(skill.via_points), made.point, max_gain=4.0)
         assert (made.point.name, made.point.corrections) == (f"correction-{count}", count)
         assert newest_correction(skill.via_points) == made.point
     assert offer_of(skill).startswith("correction-3 was corrected up to 3 times at nearly the same hands: show")
-    elsewhere = correction_at(skill, hands + 2.0 * SAME_HANDS_M * np.eye(6)[1], 0, tool_in(skill, hands, 0) + UP)
+    elsewhere = correction_at(skill, hands + 2.0 * SEGMENT_END_M * np.eye(6)[1], 0, tool_in(skill, hands, 0) + UP)
     assert (elsewhere.point.name, elsewhere.replaced) == ("correction-4", ())
 
 

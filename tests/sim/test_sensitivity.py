@@ -76,6 +76,14 @@ def test_each_name_of_the_tuning_reads_its_own_value() -> None:
     assert set(reads) - set(numbers)  # formulas of other numbers
 
 
+def test_every_module_of_the_service_reads_its_numbers_while_it_runs() -> None:
+    """A default or constant of a module would keep the value that the number had at its import."""
+    _, reads = sensitivity.tuning()
+    for path in sorted((ROOT / "service").rglob("*.py")):
+        if path.name != "tuning.py":
+            sensitivity.reading(str(path), path.read_bytes(), reads)
+
+
 @pytest.mark.parametrize(("value", "half", "double"), [(8, 4, 16), (1, 0, 2), (0.3, 0.15, 0.6)])
 def test_a_number_is_halved_and_doubled_and_a_count_stays_one(value: Any, half: Any, double: Any) -> None:
     one = sensitivity.Number("intake", "NAME", value, 0)

@@ -38,7 +38,7 @@ from service.core.skill.stages import (
 )
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
 from service.core.skill.task_clock import TaskClock
-from service.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.core.skill.tuning import FIRST_STAGE_ODDS, PULL_SHARPNESS_PER_M2, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
 from service.core.skill.via_points import pulls_through, sharpness_between
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
@@ -139,7 +139,7 @@ class Placed(Immutable):
         out[: len(self.stages)] = 1.0 / len(self.stages)
         moving[0] = hands
         for _ in range(BELIEF_PERIODS):
-            recognise(out, moving, 0.1, self.stages)
+            recognise(out, moving, 0.1, self.stages, FIRST_STAGE_ODDS)
         return out
 
     def mean(self, hands: Vector, beliefs: Vector, tempos: Vector | None = None) -> Vector:
@@ -255,7 +255,7 @@ class StagedKMP:
         """Stages between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
         everywhere = [point for point in others if point.stage not in self.names[:-1]]
-        pulls = np.hstack(pulls_through(self._resting, self.hands, everywhere))
+        pulls = np.hstack(pulls_through(self._resting, self.hands, everywhere, PULL_SHARPNESS_PER_M2))
         placed = self._unpulled.pulled(pulls)
         for k, name in enumerate(self.names[:-1]):
             if of_stage := [point for point in others if point.stage == name]:

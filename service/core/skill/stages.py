@@ -184,9 +184,7 @@ def _likely(moving: Vector, stage: Record) -> float:
 
 
 @compiled
-def recognise(
-    belief: Vector, moving: Vector, period_s: float, stages: Records, first_odds: float = FIRST_STAGE_ODDS
-) -> None:
+def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records, first_odds: float) -> None:
     """Update the belief (K or more,) in K stages by the hands' motion (3, 6), one period Δ later,
     in place.
 
@@ -552,7 +550,7 @@ def predicted(
     tempo, tools, clock = np.empty(3), np.empty((3, len(stages), 3)), one["clock"]
     tempo[:2] = one["stillness"]
     if one["period_s"] > 0.0:
-        recognise(belief, one["now"], one["period_s"], stages)
+        recognise(belief, one["now"], one["period_s"], stages, FIRST_STAGE_ODDS)
     _around(one["moving"], hands)
     if one["is_turning"]:
         _turned_around(one["turning"], hands)

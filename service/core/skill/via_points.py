@@ -60,7 +60,7 @@ def pulls_through(
     mean: Callable[[Vector], Vector],
     unchanged: Vector,
     via_points: Sequence[ViaPoint],
-    sharpness: float = PULL_SHARPNESS_PER_M2,
+    sharpness: float,
 ) -> tuple[Vector, Vector]:
     """Kernels that make the mean f of a model, (T, 6) to (T, 3) [m], pass through via-points, and
     leave it as it is at the hands `unchanged` (K, 6).
