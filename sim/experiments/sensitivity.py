@@ -523,7 +523,9 @@ class Known(NamedTuple):
 
 
 def at_tuned_values(known: Mapping[str, Number], all_sessions: Mapping[str, Session]) -> Known:
-    """Measure all sessions with all seeds."""
+    """Measure all sessions with all seeds. The figures of the first seed are measured once more, as
+    those at other values are: in a fork.
+    """
     out = Known({}, {}, {}, {})
     for name, session in all_sessions.items():
         forget()  # or a number that is read once, for a cache, would be marked in the first session alone
@@ -532,9 +534,20 @@ def at_tuned_values(known: Mapping[str, Number], all_sessions: Mapping[str, Sess
         out.reads[name] = [key for key, one in known.items() if marks[one.at]]
         found += [session(seed) for seed in range(1, 1 if name == "golden" else EACH)]
         out.seconds[name] = (time.monotonic() - began) / max(1, len(found) - 1)
-        out.figures[name] = found[0]
         spread = {figure: [one[figure] for one in found] for figure in found[0]}
         out.noise[name] = {figure: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for figure, v in spread.items()}
+    figures = in_fork(functools.partial(measured, all_sessions))()
+    if isinstance(figures, str):
+        raise ExperimentError(f"at the tuned values: {figures}")
+    return out._replace(figures=figures)
+
+
+def measured(some: Mapping[str, Session]) -> Figures:
+    """Figures of these sessions with the first seed; no session finds caches of another one."""
+    out: Figures = {}
+    for name, session in some.items():
+        forget()
+        out[name] = session(0)
     return out
 
 
@@ -566,12 +579,7 @@ def in_fork(work: Callable[[], Any]) -> Callable[[], Any]:
 def at_other_value(one: Number, value: Any, known: Known, all_sessions: Mapping[str, Session]) -> Figures:
     """Figures of the sessions that read a number, at another value; runs in a fork."""
     values[one.at : one.at + one.size] = value
-    forget()
-    out: Figures = {}
-    for name, session in all_sessions.items():
-        if one.key in known.reads[name]:
-            out[name] = session(0)
-    return out
+    return measured({name: session for name, session in all_sessions.items() if one.key in known.reads[name]})
 
 
 def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:

@@ -86,8 +86,7 @@ TO_AND_FRO_MPS2 = 50.0  # [m/s²] below this acceleration, a single hand could h
 CONTESTED_ON_SHARE = 0.25  # a source is contested above this share of contradicting samples
 TO_AND_FRO_MAX_SHARE = 2.0 * CONTESTED_ON_SHARE  # alternating samples raise the contested share up to this limit
 CONTESTED_OFF_SHARE = END_SHARE * CONTESTED_ON_SHARE  # a contested source remains so until its share is below this
-# 5e-3 to 0.03. More: scatter is tolerated. Less: noisy trackers hold the arm.
-SCATTER_ON_M = 0.012  # a hand is contested above this standard deviation of its samples on each axis
+SCATTER_ON_M = SOURCES_APART_M  # a hand is contested above this standard deviation of its samples on each axis
 SCATTER_OFF_M = END_SHARE * SCATTER_ON_M  # a contested hand remains so until the standard deviation is below this
 SCATTER_LEAST_SAMPLES = NOISE_SAMPLES // 2  # with fewer, one outlier in four differences looks like scatter
 

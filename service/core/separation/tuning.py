@@ -48,5 +48,4 @@ CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a vi
 # The body.
 # 0 to 0.03. More: the arm folds less. Less: parts come nearer.
 OWN_CLEARANCE_M = 0.01  # largest clearance between own parts; more would keep the arm from folding
-# 0 to 0.03. More: overlaps are forgiven. Less: mesh capsules collide falsely.
-CAPSULE_EXCESS_M = 0.01  # capsules around meshes exceed them by about this
+CAPSULE_EXCESS_M = OWN_CLEARANCE_M  # capsules around meshes exceed them by about as much

@@ -7,7 +7,7 @@ line follows from others.
 
 from __future__ import annotations
 
-from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS
+from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS, STILLNESS_LOWPASS_S
 
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
 # 0.03 to 0.5. More: stages learn apart. Less: stages share more.
@@ -81,8 +81,7 @@ TURN_WEIGHT_M = 0.1  # entries of a rotation matrix become lengths: those of a t
 # Clock of the task.
 # 0.03 to 0.2. More: the clock starts later. Less: a restless hand starts it.
 CLOCK_START_MPS = 0.08  # a faster hand has begun the task; tremor and drift are slower
-# 0.03 to 0.3. More: the clock starts and stops softly. Less: the target accelerates more.
-CLOCK_LAG_S = 0.1  # time constant with which the clock's rate changes
+CLOCK_LAG_S = STILLNESS_LOWPASS_S  # time constant with which the clock's rate changes, as stillness does
 
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
