@@ -66,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     p.add_argument("--arm", default="wam", help=arm)
-    numbers = "of `sensitivity`: a stage of the core, or one of its numbers"
-    p.add_argument("--numbers", metavar="NAME", default="", help=numbers)
+    numbers = "of `sensitivity`: stages of the core or numbers, to be measured anew"
+    p.add_argument("--numbers", metavar="NAME,...", default="", help=numbers)
     again = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
     p.add_argument("--redraw", action="store_true", help=again)
     p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")

@@ -129,6 +129,9 @@ _SENSITIVITY = Seeds(  # four seeds of each session
         "scenes": Stream("random scene", 2026, range(300, 304)),
         "made": Stream("made task three", 2, range(30, 42)),
         "untold": Stream("made task one_hand", 2, range(30, 42)),
+        "turned": Stream("made task heading", 2, range(30, 42)),
+        "shown": Stream("demonstration", 2, range(1, 5)),
+        "resting": Stream("resting hands", 7, range(4)),
     },
     learned=_SHIPPED,
 )

@@ -52,7 +52,7 @@ class Options:
     workers: int = 1  # processes
     share: float = 1.0  # share of the full size; less for a quick look
     arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
-    numbers: str = ""  # for `sensitivity`: a stage of the core, or one of its numbers; empty: all
+    numbers: str = ""  # for `sensitivity`: stages of the core or numbers, with commas; empty: those without a result
 
 
 @dataclass

@@ -63,7 +63,11 @@ LARGEST_CHANGED = {
 STAGES = ("intake", "skill", "setpoint", "arm", "separation", "limiter", "decision")  # in the order of measurement
 FACTORS = (0.5, 2.0)
 EVENTS = ("handover", "grasp", "carry")
-MADE, UNTOLD_KIND = "three", "one_hand"  # kinds of made tasks: for `partners`, and for `untold`
+MADE, UNTOLD_KIND, TURNED_KIND = (
+    "three",
+    "one_hand",
+    "heading",
+)  # kinds of made tasks: for `partners`, `untold`, `turned`
 SOFT_JERK = 5.0  # [m/s³] of a tool that is moved softly
 AT_REST_S = 0.3  # at the end of a stop
 BOX = ((0.52, -0.2, 0.36), (0.08, 0.04, 0.3))  # centre and half size [m] of a box on the way to the handover
@@ -72,6 +76,11 @@ SLOW_MPS, APART_M = 0.005, 0.04  # speed of a slow hand; distance between the po
 UNSEEN_S, TWO_S = (2.0, 0.3), (3.0, 1.0)  # middle and length of the time without one hand, and with two sources
 BURSTS, BURST, BURST_M = 4, (1, 5), (0.05, 0.4)  # bursts of outliers: how many, of how many samples, how far away
 EXCHANGED_S = (3.0, 0.3)  # middle and length of the time in which the tracker takes each hand for the other one
+RATE_HZ, RESTING_S = 250, 8.0  # of the sessions with resting hands
+CLOSED_M = 0.06  # half size of a box around a target, which the tool then does not reach
+DETOUR_RAD = 0.15  # a way out goes so far aside at each joint
+INSIDE_M = 0.005  # distance of a box and the arm, inside of the clearance
+PULLED_M, PULLED_AT_M = 0.05, (0.0, 0.05, 0.1, 0.2)  # size of a via-point's effect; how far from it that is measured
 LIMIT_S = 300  # a value that takes longer has no figures
 ROOM = 1024  # float64 values for which there is memory
 
@@ -302,16 +311,20 @@ def sessions() -> dict[str, Session]:
     from scipy.signal import butter, sosfiltfilt
     from scipy.spatial.transform import Rotation
 
-    from service.contract.records import Flag, Mode
-    from service.contract.requests import TOLERANCE_M
+    from service.contract.records import SIDES, Flag, Mode
+    from service.contract.requests import TOLERANCE_M, ViaPoint
     from service.core.controller import Controller
+    from service.core.frame import Event, Tick, order
+    from service.core.separation.stage import Separation
+    from service.core.skill.skill import Skill
     from service.files.recording import Recording
     from service.files.replay import ticks
     from service.files.shipped import recordings, shipped_skill
     from service.learning.learn import learn
     from service.learning.skill_file import decoded
     from service.learning.via_points import adapted
-    from service.settings.config import Box, Obstacles, Settings
+    from service.settings.config import Box, Obstacles, Settings, robot_description
+    from sim.closed_loop import START_NS, hand_event
     from sim.experiments import motion, phase, reached, separation
     from sim.experiments.catalogue import EXPERIMENTS
     from sim.experiments.open_loop import targets
@@ -323,6 +336,7 @@ def sessions() -> dict[str, Session]:
     from sim.made_tasks import takes
     from sim.scene import Scene
     from sim.script import HandScript
+    from sim.teach import demonstrate
 
     streams = EXPERIMENTS["sensitivity"].seeds.tuning
     period_s, names = moving_hands.PERIOD_S, ("error_rms_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
@@ -480,6 +494,111 @@ def sessions() -> dict[str, Session]:
         found = summary([judged(one, predicted(skill, one)) for one in seen])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
 
+    def turned(seed: int) -> dict[str, float]:
+        """A skill of both hands and their orientation, for a tool that turns with a hand."""
+        skill, seen = taught_by_two(TURNED_KIND, streams["turned"], seed, named=False)
+        found = summary([judged(one, predicted(skill, one)) for one in seen])
+        return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
+
+    def gripper(seed: int) -> dict[str, float]:
+        """The nominal scene with a skill that opens and closes the gripper."""
+        stream = streams["shown"]
+        shown = [demonstrate(Scene(), seed=1000 * stream.seed + n, gripper=True) for n in stream.numbers]
+        skill = reached.taught(learn(shown), Scene().via_points())
+        script = HandScript(Scene(), seed=streams["hands"].numbers[seed], tremor_rms=TREMOR_M, noise_std=NOISE_M)
+        one = rehearse(script, lambda bench: skill, rate_hz=RATE_HZ, keep=True)
+        switched = np.flatnonzero(np.diff(one.frames["gripper"].astype(np.int64)))
+        return {
+            "switches": float(len(switched)),
+            "switched_s": float(one.time_s[switched].sum()),
+            "grasp_error_mm": one.errors_mm[1],
+        }
+
+    def pulled(seed: int) -> dict[str, float]:
+        """How far one more via-point moves the target, by the hands' distance from its own."""
+        random, scene = np.random.default_rng([streams["resting"].seed, seed]), Scene()
+        skill = reached.taught(shipped_skill(), scene.via_points())
+        hands = skill.hands[seed % len(skill.hands)] + random.uniform(-0.1, 0.1, 6)
+        aside = random.standard_normal(6)
+        at = hands + np.outer(PULLED_AT_M, aside / np.linalg.norm(aside))
+        left, right, tool = (tuple(x.tolist()) for x in (hands[:3], hands[3:], skill.mean(at)[0] + (0, 0, PULLED_M)))
+        more = reached.taught(shipped_skill(), [*scene.via_points(), ViaPoint("more", left, right, tool)])
+        moved_mm = 1000 * np.linalg.norm(more.mean(at) - skill.mean(at), axis=1)
+        return {f"moved_at_{100 * m:g}_cm_mm": float(moved) for m, moved in zip(PULLED_AT_M, moved_mm, strict=True)}
+
+    def resting(seed: int) -> tuple[Settings, Skill, Array, np.random.Generator]:
+        """A cell whose arm moves as commanded, a taught skill, both hands (6,) at a via-point."""
+        settings = msgspec.structs.replace(
+            Settings(), rate_hz=RATE_HZ, arm=msgspec.structs.replace(Settings().arm, source="assumed")
+        )
+        skill = reached.taught(shipped_skill(), Scene().via_points())
+        random = np.random.default_rng([streams["resting"].seed, seed])
+        hands = np.array(skill.via_points[2 - seed % 3].left + skill.via_points[2 - seed % 3].right)
+        return settings, skill, hands + random.uniform(-0.01, 0.01, 6), random
+
+    def at_hands(controller: Controller, hands: Array, k: int, *events: Event) -> Any:
+        """The frame of tick k, in which samples of resting hands (6,) arrive."""
+        stamp_ns = START_NS + round(k * 1e9 / RATE_HZ)
+        seen = [
+            hand_event(side, tuple(x.tolist()), stamp_ns) for side, x in zip(SIDES, hands.reshape(2, 3), strict=True)
+        ]
+        return controller.step(Tick(k, (*(seen if k % 3 == 1 else ()), *events)))
+
+    def blocked(seed: int) -> dict[str, float]:
+        """Resting hands, with the target inside of a box: the tool comes no nearer, and is then led
+        along a way out.
+        """
+        settings, skill, hands, random = resting(seed)
+        box = Box(tuple(skill.mean(hands[None])[0].tolist()), (CLOSED_M, CLOSED_M, CLOSED_M))
+        settings = msgspec.structs.replace(settings, obstacles=Obstacles(boxes=(box,)))
+        controller = Controller(settings, skill, urdf=robot_description(settings))
+        aside, frames = random.uniform(-DETOUR_RAD, DETOUR_RAD, len(settings.joints.names)), []
+        events: tuple[Event, ...] = ()
+        began = ended = 0
+        for k in range(1, round(RESTING_S * RATE_HZ)):
+            frames.append(at_hands(controller, hands, k, *events))
+            state, events = controller.state, ()
+            if not began and state["stuck"]:
+                began, joints = k, state["joints"][0]
+                events = (order("way", json.dumps([(joints + aside).tolist(), joints.tolist()])),)
+            elif began and not ended and k > began + 1 and state["way_next"] >= state["way_count"]:
+                ended = k
+        found = np.array(frames)
+        tool = found["tool"]
+        ended = ended or len(frames)
+        return {
+            "stuck_s": began / RATE_HZ,
+            "way_s": (ended - began) / RATE_HZ,
+            "way_mm": 1000 * float(np.linalg.norm(tool[began:] - tool[began - 1], axis=1).max()),
+            "following": float(np.mean(found["mode"] == Mode.FOLLOW)),
+        }
+
+    def crowded(seed: int) -> dict[str, float]:
+        """An arm that begins nearer to a box than the clearance: it retreats, and then follows."""
+        settings, skill, hands, random = resting(seed)
+        urdf, joints = robot_description(settings), np.array(settings.arm.posture)
+        tool = at_hands(Controller(settings, skill, urdf=urdf), hands, 1)["tool"]
+        way = random.standard_normal(3)
+        way /= np.linalg.norm(way)
+
+        def with_box(off_m: float) -> Settings:
+            box = Box(tuple((tool + off_m * way).tolist()), (CLOSED_M, CLOSED_M, CLOSED_M))
+            return msgspec.structs.replace(settings, obstacles=Obstacles(boxes=(box,)))
+
+        near_m, far_m = 0.0, 1.0
+        for _ in range(12):
+            middle_m = (near_m + far_m) / 2
+            clear_m = Separation(with_box(middle_m), urdf).clearance(joints.copy(), hands.reshape(2, 3))[0]
+            near_m, far_m = (middle_m, far_m) if clear_m < INSIDE_M else (near_m, middle_m)
+        controller = Controller(with_box(far_m), skill, urdf=urdf)
+        found = np.array([at_hands(controller, hands, k) for k in range(1, round(RATE_HZ * RESTING_S / 2))])
+        moved = np.linalg.norm(found["tool"] - tool, axis=1)
+        return {
+            "moved_mm": 1000 * float(moved[-1]),
+            "moved_first_mm": 1000 * float(moved[RATE_HZ // 2]),
+            "following": float(np.mean(found["mode"] == Mode.FOLLOW)),
+        }
+
     first: dict[str, Any] = {}
 
     def golden(_: int) -> dict[str, float]:
@@ -509,6 +628,11 @@ def sessions() -> dict[str, Session]:
         "box": beside_a_box,
         "partners": partners,
         "untold": untold,
+        "turned": turned,
+        "gripper": gripper,
+        "pulled": pulled,
+        "blocked": blocked,
+        "crowded": crowded,
         "golden": golden,
     }
 
@@ -605,7 +729,9 @@ def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """Measure the numbers that the result does not have yet; the result is written after each."""
+    """Measure the numbers that the result does not have yet, or those that are named; the result is
+    written after each.
+    """
     from sim.experiments.evidence import result_of
 
     known = numbers()
@@ -614,7 +740,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     rows: dict[str, Any] = {
         key: row for key, row in before.get("numbers", {}).items() if same and key in known and known[key].is_of(row)
     }
-    wanted = [key for key in known if key not in rows and options.numbers in ("", key, *key.split("."))]
+    named = set(options.numbers.split(",")) if options.numbers else set()
+    wanted = [key for key in known if (named & {key, *key.split(".")} if named else key not in rows)]
     out: dict[str, Any] = {"tuned": before.get("tuned", {}) if same else {}, "numbers": rows, "unmeasured": []}
     if not wanted:
         return out
