@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from service.contract import cdr
-from service.contract.channels import STREAMS
+from service.contract.channels import CHANNELS, STREAMS
 from service.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from service.contract.records import GONE_S, Flag, Reason
 from service.core.arm.stage import Arm
@@ -60,7 +60,7 @@ from service.settings.config import Settings
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
 ENGAGING = int(Flag.ENGAGING)
-SAMPLES = ("hands/left", "hands/right", "joints/state", "joints/guided", "clutch", "gripper/wish")
+SAMPLES = {channel.key for channel in CHANNELS if channel.direction == "in" and channel.event}
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
