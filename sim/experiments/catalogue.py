@@ -132,6 +132,7 @@ _SENSITIVITY = Seeds(  # four seeds of each session
         "turned": Stream("made task heading", 2, range(30, 42)),
         "shown": Stream("demonstration", 2, range(1, 5)),
         "resting": Stream("resting hands", 7, range(4)),
+        "implausible": Stream("implausible samples", 8, range(4)),
     },
     learned=_SHIPPED,
 )

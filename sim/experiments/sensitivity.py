@@ -80,6 +80,11 @@ RATE_HZ, RESTING_S = 250, 8.0  # of the sessions with resting hands
 CLOSED_M = 0.06  # half size of a box around a target, which the tool then does not reach
 DETOUR_RAD = 0.15  # a way out goes so far aside at each joint
 INSIDE_M = 0.005  # distance of a box and the arm, inside of the clearance
+IMPLAUSIBLE_S, EVERY = 8.0, 7  # length of the session, and one of how many samples is implausible
+TREMBLE_RAD, TREMBLE_S = 0.05, 2.0  # an arm trembles by this at first; until when, ever less
+JOINTS_OFF_RAD, JOINTS_RADPS = (0.05, 0.6), (20.0, 300.0)  # of implausible joint states
+FAR_M, SECOND_M, SCATTER_M = (1.5, 12.0), (0.008, 0.03), (0.0, 0.01)  # hands far away; a second source, and its scatter
+FAST_CLOCK = 0.04  # largest drift of the tracker's clock
 PULLED_M, PULLED_AT_M = 0.05, (0.0, 0.05, 0.1, 0.2)  # size of a via-point's effect; how far from it that is measured
 LIMIT_S = 300  # a value that takes longer has no figures
 ROOM = 1024  # float64 values for which there is memory
@@ -311,10 +316,11 @@ def sessions() -> dict[str, Session]:
     from scipy.signal import butter, sosfiltfilt
     from scipy.spatial.transform import Rotation
 
-    from service.contract.records import SIDES, Flag, Mode
+    from service.contract.records import SIDES, Cause, Flag, Mode
     from service.contract.requests import TOLERANCE_M, ViaPoint
     from service.core.controller import Controller
     from service.core.frame import Event, Tick, order
+    from service.core.intake.hand_estimator import TRUSTED
     from service.core.separation.stage import Separation
     from service.core.skill.skill import Skill
     from service.files.recording import Recording
@@ -324,7 +330,7 @@ def sessions() -> dict[str, Session]:
     from service.learning.skill_file import decoded
     from service.learning.via_points import adapted
     from service.settings.config import Box, Obstacles, Settings, robot_description
-    from sim.closed_loop import START_NS, hand_event
+    from sim.closed_loop import START_NS, hand_event, joints_event
     from sim.experiments import motion, phase, reached, separation
     from sim.experiments.catalogue import EXPERIMENTS
     from sim.experiments.open_loop import targets
@@ -526,11 +532,12 @@ def sessions() -> dict[str, Session]:
         moved_mm = 1000 * np.linalg.norm(more.mean(at) - skill.mean(at), axis=1)
         return {f"moved_at_{100 * m:g}_cm_mm": float(moved) for m, moved in zip(PULLED_AT_M, moved_mm, strict=True)}
 
-    def resting(seed: int) -> tuple[Settings, Skill, Array, np.random.Generator]:
-        """A cell whose arm moves as commanded, a taught skill, both hands (6,) at a via-point."""
-        settings = msgspec.structs.replace(
-            Settings(), rate_hz=RATE_HZ, arm=msgspec.structs.replace(Settings().arm, source="assumed")
-        )
+    def resting(seed: int, *, source: str = "assumed") -> tuple[Settings, Skill, Array, np.random.Generator]:
+        """A cell, a taught skill, both hands (6,) at a via-point. The arm moves as commanded unless
+        it has another `source`.
+        """
+        arm = msgspec.structs.replace(Settings().arm, source=source)
+        settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ, arm=arm)
         skill = reached.taught(shipped_skill(), Scene().via_points())
         random = np.random.default_rng([streams["resting"].seed, seed])
         hands = np.array(skill.via_points[2 - seed % 3].left + skill.via_points[2 - seed % 3].right)
@@ -543,6 +550,54 @@ def sessions() -> dict[str, Session]:
             hand_event(side, tuple(x.tolist()), stamp_ns) for side, x in zip(SIDES, hands.reshape(2, 3), strict=True)
         ]
         return controller.step(Tick(k, (*(seen if k % 3 == 1 else ()), *events)))
+
+    def implausible(seed: int) -> dict[str, float]:
+        """An arm that trembles less and less, joint states and hands that cannot be, a second
+        source, and a tracker whose clock is too fast.
+        """
+        settings, skill, middle_of, random = resting(seed, source="state")
+        random = np.random.default_rng([streams["implausible"].seed, seed])
+        controller = Controller(settings, skill, urdf=robot_description(settings))
+        joints, names, frames, trusted = np.array(settings.arm.posture), settings.joints.names, [], 0
+        drift, ready = random.uniform(0.0, FAST_CLOCK), 0
+        for k in range(1, round(IMPLAUSIBLE_S * RATE_HZ)):
+            now_s = k / RATE_HZ
+            stamp_ns, is_odd = START_NS + round(1e9 * now_s), random.integers(EVERY) == 0
+            at = joints + max(0.0, 1.0 - now_s / TREMBLE_S) * TREMBLE_RAD * random.uniform(-1.0, 1.0, len(joints))
+            rates = np.zeros(len(joints))
+            if is_odd and TREMBLE_S < now_s < IMPLAUSIBLE_S / 2:
+                which = random.integers(len(joints))
+                at[which] += random.choice((-1.0, 1.0)) * random.uniform(*JOINTS_OFF_RAD)
+                rates[which] = random.uniform(*JOINTS_RADPS) * (random.random() < 0.5)
+            inbox = [joints_event(names, tuple(at.tolist()), tuple(rates.tolist()), stamp_ns)]
+            if k % 3 == 1:
+                hands = middle_of + 0.05 * np.sin(2.0 * now_s)
+                if is_odd:
+                    hands[:3] *= random.uniform(*FAR_M) / np.linalg.norm(hands[:3])
+                elif k % 2 and now_s > IMPLAUSIBLE_S / 2:
+                    hands[5] += SECOND_M[0] + (SECOND_M[1] - SECOND_M[0]) * (now_s / IMPLAUSIBLE_S * 8.0 % 1.0)
+                    hands[3:] += random.uniform(*SCATTER_M) * random.standard_normal(3)
+                late_ns = round(1e9 * (drift * now_s + random.exponential(0.003)))
+                inbox += [
+                    hand_event(side, tuple(x.tolist()), stamp_ns - late_ns)
+                    for side, x in zip(SIDES, hands.reshape(2, 3), strict=True)
+                ]
+            if frames and frames[-1]["mode"] == Mode.FAULT:
+                inbox.append(order("reset", ""))
+            frame = controller.step(Tick(k, tuple(inbox)))
+            frames.append(frame)
+            if frame["mode"] == Mode.FOLLOW:
+                ready, joints = ready or k, frame["joints"]
+            trusted += int((controller.state["clock"] == TRUSTED).sum())
+        found = np.array(frames)
+        return {
+            "out_of_range": float(found["rejected"][-1][Cause.OUT_OF_RANGE]),
+            "jumped": float(found["rejected"][-1][Cause.JUMPED]),
+            "ready_s": ready / RATE_HZ,
+            "following": float(np.mean(found["mode"] == Mode.FOLLOW)),
+            "trusted": trusted / 2 / len(found),
+            "tool_mm": 1000 * float(np.linalg.norm(np.diff(found["tool"], axis=0), axis=1).sum()),
+        }
 
     def blocked(seed: int) -> dict[str, float]:
         """Resting hands, with the target inside of a box: the tool comes no nearer, and is then led
@@ -631,6 +686,7 @@ def sessions() -> dict[str, Session]:
         "turned": turned,
         "gripper": gripper,
         "pulled": pulled,
+        "implausible": implausible,
         "blocked": blocked,
         "crowded": crowded,
         "golden": golden,
