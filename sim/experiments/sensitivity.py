@@ -318,9 +318,9 @@ def sessions() -> dict[str, Session]:
 
     from service.contract.records import SIDES, Cause, Flag, Mode
     from service.contract.requests import TOLERANCE_M, ViaPoint
+    from service.core.codes import TRUSTED
     from service.core.controller import Controller
     from service.core.frame import Event, Tick, order
-    from service.core.intake.hand_estimator import TRUSTED
     from service.core.separation.stage import Separation
     from service.core.skill.skill import Skill
     from service.files.recording import Recording
@@ -558,7 +558,8 @@ def sessions() -> dict[str, Session]:
         settings, skill, middle_of, random = resting(seed, source="state")
         random = np.random.default_rng([streams["implausible"].seed, seed])
         controller = Controller(settings, skill, urdf=robot_description(settings))
-        joints, names, frames, trusted = np.array(settings.arm.posture), settings.joints.names, [], 0
+        joints, names, trusted = np.array(settings.arm.posture), settings.joints.names, 0
+        frames: list[Any] = []
         drift, ready = random.uniform(0.0, FAST_CLOCK), 0
         for k in range(1, round(IMPLAUSIBLE_S * RATE_HZ)):
             now_s = k / RATE_HZ
