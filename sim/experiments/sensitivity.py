@@ -25,7 +25,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
@@ -763,12 +763,14 @@ def at_other_value(one: Number, value: Any, known: Known, all_sessions: Mapping[
     return measured({name: session for name, session in all_sessions.items() if one.key in known.reads[name]})
 
 
-def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
+def serve(keys: list[str], workers: int, done: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Measure numbers one after the other: first all figures at the tuned values, then a row a
-    number. With two workers, both values of a number are measured at the same time.
+    number; in the sessions that are not `done`, or in all if none is left. With two workers, both
+    values of a number are measured at the same time.
     """
     known = begin()
     all_sessions = sessions()
+    all_sessions = {name: one for name, one in all_sessions.items() if name not in done} or all_sessions
     here = at_tuned_values(known, all_sessions)
     yield {"tuned": here._asdict()}
     for key in keys:
@@ -781,13 +783,17 @@ def serve(keys: list[str], workers: int) -> Iterator[dict[str, Any]]:
             started = {factor: in_fork(measure) for factor, measure in work.items()}
             figures = {factor: result() for factor, result in started.items()}
         changed = {f: {"to": np.asarray(value).tolist(), "figures": figures[f]} for f, value in others.items()}
-        measured = {"value": np.asarray(one.value).tolist(), "changed": changed}
-        yield {"number": key, "row": measured | {"seconds": round(time.monotonic() - began, 1)}}
+        seconds = round(time.monotonic() - began, 1)
+        yield {
+            "number": key,
+            "row": {"value": np.asarray(one.value).tolist(), "changed": changed, "seconds": seconds},
+        }
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """Measure the numbers that the result does not have yet, or those that are named; the result is
-    written after each.
+    """Measure the numbers that the result does not have yet, in all sessions; or those that are
+    named, in the sessions that the result does not have yet, or in all if it has these. The result
+    is written after each number.
     """
     from sim.experiments.evidence import result_of
 
@@ -802,7 +808,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     out: dict[str, Any] = {"tuned": before.get("tuned", {}) if same else {}, "numbers": rows, "unmeasured": []}
     if not wanted:
         return out
-    command = [sys.executable, "-m", "sim.experiments.sensitivity", f"--workers={options.workers}", *wanted]
+    done = list(out["tuned"].get("figures", ())) if named and all(key in rows for key in wanted) else []
+    command = [sys.executable, "-m", "sim.experiments.sensitivity", f"--workers={options.workers}"]
+    command += [f"--done={','.join(done)}", *wanted]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as server:
         assert server.stdout is not None
         for line in server.stdout:
@@ -810,15 +818,24 @@ def run(results: Results, options: Options) -> dict[str, Any]:
                 continue  # the simulation's greeting
             found = json.loads(line)
             if "tuned" in found:
-                out["tuned"] = found["tuned"]
+                out["tuned"] = {part: out["tuned"].get(part, {}) | new for part, new in found["tuned"].items()}
             else:
-                rows[found["number"]] = found["row"]
+                rows[found["number"]] = joined(rows.get(found["number"]) if done else None, found["row"])
                 results.say(f"{found['number']}: {worst(found['row'], out['tuned'])}")
             out["unmeasured"] = [key for key in known if key not in rows]
             results.numbers(out)
     if server.returncode:
         raise ExperimentError(f"the measuring process ended with {server.returncode}")
     return out
+
+
+def joined(before: Mapping[str, Any] | None, row: dict[str, Any]) -> dict[str, Any]:
+    """A row with the figures of other sessions that it had before, unless a session failed."""
+    for factor, found in row["changed"].items():
+        earlier = before["changed"][factor]["figures"] if before else {}
+        if isinstance(found["figures"], dict) and isinstance(earlier, dict):
+            found["figures"] = earlier | found["figures"]
+    return row
 
 
 def effects(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[tuple[float, str, str, float]]:
@@ -858,6 +875,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Measure numbers of the core, by stage.NAME; a line of JSON each.")
     parser.add_argument("numbers", nargs="*", metavar="STAGE.NAME")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--done", metavar="SESSION,...", default="", help="sessions that are left out, if others remain"
+    )
     arguments = parser.parse_args()
-    for made in serve(arguments.numbers, arguments.workers):
+    for made in serve(arguments.numbers, arguments.workers, arguments.done.split(",")):
         print(json.dumps(made), flush=True)

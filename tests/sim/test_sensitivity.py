@@ -126,3 +126,13 @@ def test_no_other_experiment_uses_its_seeds() -> None:
     theirs = [stream for seeds in others for part in seeds[:3] for stream in part.values()]
     assert [f"{one} and {other}" for one in own for other in theirs if one.overlaps(other)] == []
     assert all(len(stream.numbers) >= sensitivity.EACH for stream in own)
+
+
+def test_figures_of_new_sessions_join_those_of_earlier_ones() -> None:
+    def row(half: Any, double: Any) -> dict[str, Any]:
+        return {"value": 1.0, "changed": {"0.5": {"figures": half}, "2": {"figures": double}}}
+
+    joined = sensitivity.joined(row({"calm": {"a": 1.0}}, "no result"), row({"box": {"b": 2.0}}, {"box": {"b": 3.0}}))
+    assert joined["changed"]["0.5"]["figures"] == {"calm": {"a": 1.0}, "box": {"b": 2.0}}
+    assert joined["changed"]["2"]["figures"] == {"box": {"b": 3.0}}
+    assert sensitivity.joined(None, row({}, {})) == row({}, {})
