@@ -84,8 +84,8 @@ class Capture:
         self._subscribers = [session.declare_subscriber(key, listener) for key, listener in heard]
 
     def _listener(self, key: str, frame: str = "") -> Callable[[zenoh.Sample], None]:
-        """A function that queues the messages of a channel; with a `frame`, the transforms to that
-        frame.
+        """A function that queues the messages of a channel; with a `frame`, the poses of that
+        child frame.
         """
         waiting, name = self._waiting[key], cdr.bytes_of_frame(frame)
 
