@@ -44,8 +44,8 @@ A program on another machine needs only the client: `pip install ./service/clien
 installs the distribution `thirdhand-client`, for Python 3.10 or later on Linux, macOS and Windows,
 with `eclipse-zenoh` and `msgspec`. `pip wheel --no-deps ./service/client` builds its wheel. It may
 be installed beside `thirdhand`: the two share no file, and the service's own client is then
-imported. The package `service` is found only after `import thirdhand` there, and a package of your
-own with that name must be renamed.
+imported. There, Python finds the package `service` only after `import thirdhand`. Rename a package
+of your own if it has this name.
 
 Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
 radians, or in metres if they slide.

@@ -34,7 +34,7 @@ class Client:
         self._timeout_s = timeout_s
 
     def hold(self, by: str = "") -> Reply:
-        """Stop the arm, which then holds; returns once that is in force. `by` names who holds."""
+        """Stop the arm, which then holds; returns once that is in force. `by` names the holder."""
         return self._typed("hold", {"by": by} if by else None, Reply)
 
     def resume(self, by: str = "") -> Reply:
@@ -80,8 +80,8 @@ class Client:
         """Correct the tool in a hold: it belongs where the arm was led by hand or, if given, at
         `tool` [m]; returns once that is in force.
 
-        It holds for the hands at which the hold began, or for those of `now`. If `turned`, the
-        orientation of the led tool is corrected too.
+        It holds for the `hands` at which the hold began (`held`), or for those of this moment
+        (`now`). If `turned`, the orientation of the led tool is corrected too.
         """
         return self._typed("correct", requests.Correct(tool, hands, turned), Reply)
 
@@ -101,9 +101,9 @@ class Client:
     def wait_until_ready(self, *, timeout_s: float | None = 15.0, silent: bool | None = None) -> Status:
         """The status, once a daemon of this cell is ready.
 
-        It waits for `timeout_s` [s], and longer while the daemon's start makes progress. None:
-        until Ctrl-C. One message on standard error reports the waiting unless `silent`, which by
-        default holds if there is a timeout.
+        It waits for `timeout_s` [s], and longer while the daemon's start makes progress; None:
+        until Ctrl-C. Unless `silent`, one message on standard error reports the waiting. By
+        default, `silent` is True if there is a timeout.
         """
         return tried(self.status, timeout_s, silent=silent)
 

@@ -37,9 +37,9 @@ def connect(
     zenoh_config: str | Path | None = None,
     timeout_s: float | None = 10.0,
 ) -> Connection:
-    """A connection to a cell, which is to be closed; a context.
+    """A connection to a cell; a context manager. The caller closes it.
 
-    What is not given is taken from the environment, the client's file or the defaults, as by
+    Arguments that are None are taken from the environment, the client's file or the defaults, see
     `client_settings`. Connecting is tried for `timeout_s` [s]; None: until Ctrl-C. Raises
     UnreachableError, and SettingsError for settings that cannot be used.
     """
@@ -49,11 +49,12 @@ def connect(
 
 
 class Connection(Client, AbstractContextManager["Connection"]):
-    """A cell's streams, and all requests of a `Client`, over one Zenoh session, which it closes.
+    """A cell's streams, and all requests of a `Client`, over one Zenoh session; a context manager.
 
     A pose is three numbers, the position x y z [m], or seven, followed by the quaternion x y z w.
     `stamp_ns` is the time of measurement [ns since 1970]; None: now. Stamps of one channel must
-    increase. The first message on a channel waits up to 5 s until somebody listens to it.
+    increase. The first message on a channel waits up to 5 s until somebody listens to it. `close`
+    closes the session.
 
     Each publishing call raises ValueError, before anything is sent, for values that the service
     would reject, and UnreachableError if nobody listens.
@@ -96,16 +97,16 @@ class Connection(Client, AbstractContextManager["Connection"]):
         self._publish_closure("gripper/state", closure, stamp_ns)
 
     def clutch(self, pressed: bool) -> None:
-        """Publish that the clutch is pressed, or released; while it is pressed, again at 10 Hz or
-        more.
+        """Publish that the clutch is pressed, or released. While it is pressed, call this at 10 Hz
+        or more.
         """
         if not isinstance(pressed, bool):
             raise ValueError(f"clutch: {pressed!r} given; True or False needed")
         self._publish({"clutch": lambda _: cdr.encode_bool(pressed)}, None)
 
     def guided(self, led: bool) -> None:
-        """Publish that somebody leads the arm by hand, or ends it; while it is led, again with each
-        joint state.
+        """Publish that somebody leads the arm by hand, or no longer does. While it is led, call
+        this with each joint state.
         """
         if not isinstance(led, bool):
             raise ValueError(f"guided: {led!r} given; True or False needed")
@@ -133,7 +134,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
     def watch(self, suffix: str, *, timeout_s: float | None = None) -> Watch:
         """An iterator over the messages of a channel: `tool/target`, `joints/command`, `status`.
 
-        After `timeout_s` [s] without a message it yields None; None: it waits for the next one. To
+        It yields None after `timeout_s` [s] without a message; if `timeout_s` is None, it waits. To
         the daemon, a program that watches `joints/command` is the arm's driver.
         """
         return Watch(self._session, self._cell, suffix, timeout_s=timeout_s)

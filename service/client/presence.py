@@ -67,8 +67,8 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
 
 
 class Overheard(AbstractContextManager["Overheard"]):
-    """Collect the keys that match some expressions and on which something is published; a
-    context.
+    """Collect the keys that match some expressions and on which something is published; a context
+    manager.
     """
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:

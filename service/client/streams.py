@@ -98,7 +98,7 @@ def checked_frame(frame_id: Any) -> None:
 
 
 class Tracker(AbstractContextManager["Tracker"]):
-    """A publisher of a cell's hand poses; a context.
+    """A publisher of a cell's hand poses; a context manager.
 
     The constructor waits up to `timeout_s` [s] until a daemon or `thirdhand record` subscribes to
     both hands; None: until Ctrl-C. Raises UnreachableError if there is no subscriber.
@@ -193,17 +193,16 @@ class _Received(AbstractContextManager[Any]):
 
 
 class Watch(_Received, Iterator[Any]):
-    """An iterator over the messages of one channel, in the order of arrival; a context.
+    """An iterator over the messages of one channel, in the order of arrival; a context manager.
 
     Poses have `stamp_ns`, `frame_id`, `position` [m] and `orientation`, and `tool/target` also its
     `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
     of SceneObject, `clutch` a bool, `gripper/wish` a closure from 0 to 1, and `status` a Status.
 
-    It waits for the next message. After `timeout_s` [s] without one it yields None; None: never. It
-    ends once it, or its connection, is closed.
-    A slow loop gets the newest 256 messages. Messages that cannot be decoded are skipped:
-    `rejected` counts them, and `reason` is the cause of the last one. Raises ValueError for a
-    channel that carries no messages.
+    It waits for the next message. It yields None after `timeout_s` [s] without one; if `timeout_s`
+    is None, it waits on. It ends once it, or its connection, is closed. A slow loop gets the newest
+    256 messages. Messages that cannot be decoded are skipped: `rejected` counts them, and `reason`
+    is the cause of the last one. Raises ValueError for a channel that carries no messages.
     """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None) -> None:
@@ -246,7 +245,7 @@ class Command(NamedTuple):
 
 
 class Follower(_Received):
-    """A receiver of a cell's joint commands and publisher of its joint states; a context.
+    """A receiver of a cell's joint commands and publisher of its joint states; a context manager.
 
     `names` are the arm's joints, in the order of all values here. Commands for other joints are
     ignored: `rejected` counts them, and `reason` is the cause of the last one.
@@ -274,8 +273,8 @@ class Follower(_Received):
         return commands
 
     def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
-        """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now. Raises
-        ValueError for what is not one number a joint, or none as velocities.
+        """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now. Velocities
+        may be empty. Raises ValueError unless there is one number for each joint.
         """
         check_open(self._session)
         now_ns = time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns)

@@ -139,7 +139,7 @@ class HoldRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
-    """A via-point in force, and how far the skill misses it [m], and its orientation [rad]."""
+    """A via-point in force, and how far the skill misses its position [m] and orientation [rad]."""
 
     missed_by_m: float
     missed_by_rad: float | None = None
@@ -174,7 +174,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     """The answer to a request: the tick from which it holds, and the via-points in force.
 
     `warnings` say which of them are missed by more than 5 mm, and which others were moved by more.
-    Of hold, resume and reset: the mode that resulted, its reason, and a note where there was
+    The answer to hold, resume and reset has the resulting mode, its reason, and a note if there was
     nothing to do.
     """
 

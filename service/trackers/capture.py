@@ -1,5 +1,5 @@
-"""Capture of a demonstration: hands, tool and gripper of a cell are received over Zenoh until a
-person ends it or everything is at rest, and are written as received.
+"""Capture of a demonstration: messages of a cell's hands, tool and gripper are received over Zenoh
+until a person ends the capture or everything is at rest. They are written as received.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from service.settings.config import Settings, robot_description
 HAND_KEYS = ("hands/left", "hands/right")
 TOOL_KEY = ENDINGS["tool"]
 CAPTURED_KEYS = (*HAND_KEYS, TOOL_KEY, JOINT_STATES, GRIPPER_STATE)
-OTHER_CELLS = ("**/hands/*", "**/tool/pose")  # these find streams of other cells, and misspelt keys
+OTHER_CELLS = ("**/hands/*", "**/tool/pose")  # these expressions find streams of other cells, and misspelt keys
 MAX_OTHER_KEYS = 8  # an error message lists at most this many of them
 REST_RAD = 0.02  # a joint at rest moves less than this
 MIN_COVERED_SHARE = 0.7  # samples must cover this share of a rest
@@ -52,7 +52,7 @@ class CaptureError(ExplainedError, RuntimeError):
 
 class Sample(NamedTuple):
     """A received message: its arrival [ns], its bytes, and the position of hand or tool [m] or of
-    joints [rad], by which rest is detected.
+    joints [rad], from which rest is detected.
     """
 
     arrived_ns: int
@@ -61,8 +61,8 @@ class Sample(NamedTuple):
 
 
 class Capture:
-    """The samples of one demonstration, of the hands that lead the tool; subscribed until
-    closed.
+    """The samples of one demonstration: the hands that lead the tool, the tool, the joints and the
+    gripper. The subscriptions last until `close`.
     """
 
     def __init__(
@@ -84,7 +84,9 @@ class Capture:
         self._subscribers = [session.declare_subscriber(key, listener) for key, listener in heard]
 
     def _listener(self, key: str, frame: str = "") -> Callable[[zenoh.Sample], None]:
-        """A function that takes the messages of a channel, or those of transforms with a frame."""
+        """A function that queues the messages of a channel; with a `frame`, the poses of that
+        child frame.
+        """
         waiting, name = self._waiting[key], cdr.bytes_of_frame(frame)
 
         def take(sample: zenoh.Sample) -> None:
@@ -150,7 +152,7 @@ class Capture:
         return [key for key in self.hands if not self.samples[key]] + tool
 
     def check(self) -> None:
-        """Raise CaptureError if a hand or the tool is too far away, or in an unknown frame."""
+        """Raise CaptureError if a hand or the tool is too far away, or its frame is unknown."""
         for key in (*self.hands, TOOL_KEY):
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
@@ -223,8 +225,8 @@ class Capture:
         return min(begins) - int(1e9 * RETAINED_REST_S), max(ends) + int(1e9 * RETAINED_REST_S)
 
     def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
-        """Write the demonstration, all or nothing: the received messages and the task's via-points,
-        with settings and URDF attached.
+        """Write the whole demonstration or nothing: the received messages and the task's
+        via-points, with settings and URDF attached.
 
         Without a tracked tool its poses are computed from the joints. Raises CaptureError, OSError.
         """
@@ -286,7 +288,7 @@ def capture(
     """Capture a demonstration, from the first messages of hands and tool until `is_ended`, until
     everything rests for `rest_s` [s] after a motion, or until CAPTURE_SILENCE_S without a message.
 
-    Raises CaptureError if they are not received within `wait_s` [s].
+    Raises CaptureError if hands and tool are not received within `wait_s` [s].
     """
     captured, others = Capture(session, cell, settings, conducts, person), Overheard(session, *OTHER_CELLS)
     at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"

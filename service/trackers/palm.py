@@ -1,9 +1,9 @@
 """The pose of a palm from its landmarks in one picture.
 
-The palm is rigid, so five points of it, whose distances are known, have one pose that explains
-where the picture shows them. Their distances are those of an average palm, scaled by the person's
-hand length. A single camera sees depth by size alone: a length that is wrong by 5 % moves a hand
-that is 0.5 m away by 2.5 cm.
+The palm is rigid, so the picture of five of its points determines its pose, if their distances are
+known. The distances are those of an average palm, scaled by the person's hand length. A single
+camera measures depth by size alone: with a length that is wrong by 5 %, the position of a hand that
+is 0.5 m away is wrong by 2.5 cm.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ PALM = (WRIST, INDEX, MIDDLE, RING, LITTLE)
 AVERAGE_PALM = np.array(
     [[0.0, 0.0, 0.0], [0.505, 0.125, 0.0], [0.515, 0.0, 0.0], [0.475, -0.115, 0.0], [0.41, -0.215, 0.0]]
 )
-PALM_CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # their mean is the palm's position
+PALM_CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # the palm's position is their mean
 _AHEAD = AVERAGE_PALM[PALM_CORNERS].sum(axis=0) / np.linalg.norm(AVERAGE_PALM[PALM_CORNERS].sum(axis=0))
-MAX_ERROR = 0.02  # root mean square of x / z and y / z; a larger one is that of no palm
-NEWTON_STEPS = 10  # of Gauss and Newton; the pose changes by less than 0.1 mm in the last
-MAX_TURN_RAD = 0.3  # of one step
-RANK_SHARE = 1e-3  # directions that the picture hardly tells remain as they began
+MAX_ERROR = 0.02  # root mean square error of x / z and y / z; with a larger one, the points are not those of a palm
+NEWTON_STEPS = 10  # Gauss-Newton steps; the last one changes the pose by less than 0.1 mm
+MAX_TURN_RAD = 0.3  # largest turn in one step
+RANK_SHARE = 1e-3  # directions that the picture hardly determines keep their initial value
 
 
 class Lens(NamedTuple):
-    """A pinhole camera: focal length and size of its picture [pixels]; the axis is its middle."""
+    """A pinhole camera: focal length and size of its picture [pixels]; the optical axis is in the
+    middle.
+    """
 
     focal: float
     width: int
@@ -68,8 +70,8 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
 
         Σ_k |π(R s_k + t) - u_k|²,   π(x, y, z) = (x, y) / z
 
-    by steps of Gauss and Newton. `shape` (21, 3), a rough shape of the hand in the camera's axes,
-    gives R to begin with.
+    by Gauss-Newton steps. `shape` (21, 3), a rough shape of the hand in the camera's axes, gives
+    the initial R.
     """
     u = lens.rays(picture[list(PALM)])
     palm = hand_length * (AVERAGE_PALM - AVERAGE_PALM.mean(axis=0))
@@ -80,7 +82,7 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
         turned = turn.apply(palm)
         x, y, z = (turned + at).T
         if z.min() < hand_length / 2:
-            return None  # a hand so near does not fit into a picture
+            return None  # a hand as near as this does not fit into a picture
         errors = np.stack([x, y], 1) / z[:, None] - u
         none = np.zeros(len(z))
         rows = np.stack([1 / z, none, -x / z**2], 1), np.stack([none, 1 / z, -y / z**2], 1)

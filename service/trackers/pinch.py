@@ -15,8 +15,9 @@ OPEN_M = 0.08  # fingers this far apart wish an open gripper
 
 
 class Pinches:
-    """Publishes the clutch, pressed while one hand pinches, and the gripper's wish, closed as far
-    as the fingers of one hand are. `clutch` and `gripper` name the hand, left or right; None: none.
+    """Publisher of the clutch, which is pressed while one hand pinches, and of the gripper's wish,
+    which follows the distance between the fingers of one hand. `clutch` and `gripper` name these
+    hands, left or right; None: no hand.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class Pinches:
             self._publishers["clutch"].put(cdr.encode_bool(False))
 
     def publish(self, distances_m: Mapping[str, float], stamp_ns: int) -> None:
-        """Publish by the distances [m] of thumb and index tip of the hands that are seen, by side.
-        A hand that is not seen does not press the clutch, and leaves the gripper as it is.
+        """Publish clutch and wish for the distances [m] of thumb and index tip of the visible
+        hands, by side. A hand that is not seen does not press the clutch, and leaves the gripper as
+        it is.
         """
         if self._clutch is not None:
             apart_m = distances_m.get(self._clutch, PARTED_M)

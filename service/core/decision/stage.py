@@ -69,15 +69,15 @@ class Decision:
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def is_brief(self, state: Record) -> bool:
-        """True during a hold that the hands have caused, in its first BRIEF_HOLD_S. The arm then
-        resumes its motion without engaging anew.
+        """True in the first BRIEF_HOLD_S of a hold that the hands have caused. The arm then resumes
+        its motion without engaging anew.
         """
         held = int(state["tick"] - state["followed_tick"])
         return int(state["reason"]) in BY_THE_HANDS and held <= self._brief_ticks
 
     def take(self, state: Record, event: Event) -> None:
-        """Apply an event of kind hold, resume, reset, fault or way (a way out). Raises ValueError
-        for others.
+        """Apply an event of the kind hold, resume, reset, fault or way (a way out). Raises
+        ValueError for other kinds.
         """
         match event.kind:
             case "hold" | "resume":
@@ -98,8 +98,8 @@ class Decision:
                 raise ValueError(f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}")
 
     def fail(self, state: Record, frame: Record, reason: Reason, *, speed: float | None = None) -> None:
-        """Set the mode to fault from this tick on. `speed` [m/s] is the tool's, if it is the
-        reason.
+        """Set the mode to fault from this tick on. `speed` [m/s] is that of the tool, for a fault
+        that it caused.
         """
         state["mode"], state["reason"] = frame["mode"], frame["reason"] = FAULT, reason
         if speed is not None:

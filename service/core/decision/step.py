@@ -75,7 +75,8 @@ def step(
 
     * TWO_SOURCES: a hand or the arm is contested.
     * GUIDED: the arm is led by hand. This is an operator's hold, which lasts afterwards.
-    * NOT_READY: the arm is not ready; if it moves back by itself, not while the clutch is released.
+    * NOT_READY: the arm is not ready. While the clutch is released, an arm that would move back by
+      itself holds for a later reason.
     * OPERATOR: the operator holds it.
     * CLUTCH: the clutch is released.
     * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
@@ -127,17 +128,18 @@ def step(
 
 @compiled
 def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
-    """State of the arm: starts, stops being ready, or fails. Returns STARTS_ASSUMED,
-    STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or -1 twice.
+    """Update the state of the arm: it starts, is no longer ready, or causes a fault. Returns
+    STARTS_ASSUMED, STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or
+    -1 twice.
 
     * An assumed arm starts at its configured posture and is ready.
-    * An arm that is led by hand is not ready. Its commanded joints come to rest, and then are the
-      measured ones in each tick.
-    * Any other arm starts where it reports one posture, once the commanded joints are at rest. If
-      it is outside its limits it is RETURNING, else READY. One that is inside of a thing starts
-      only after the operator's confirmation (`leaves`), and is RETURNING.
-    * A RETURNING arm is READY within its limits and inside of nothing, or within its limits without
-      motion for STUCK_S.
+    * An arm that is led by hand is not ready. Its commanded joints come to rest. From then on they
+      are set to the measured ones in each tick.
+    * Any other arm starts at its measured posture, once this is constant and the commanded joints
+      are at rest. If it is outside its limits it is RETURNING, else READY. An arm inside of an
+      obstacle starts only after the operator's confirmation (`leaves`), and is RETURNING.
+    * A RETURNING arm becomes READY once it is within its limits, and either inside of no obstacle
+      or without motion for STUCK_S.
     * A silent arm is a fault (ARM_SILENT) if it follows or moves; at rest, it is no longer ready.
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
@@ -185,7 +187,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
 
 @compiled
 def _note_hold(states: Records, known: int) -> None:
-    """Note hands and stage at the begin of an operator's hold, and forget them at its end.
+    """Store hands and stage at the start of an operator's hold; its end clears them.
 
     The stage is the most probable one, if its probability is above 1/2.
     """
@@ -212,12 +214,13 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
         g_0 - g > min(PROGRESS_SHARE g_0, PROGRESS_SPEED_SHARE max_speed STUCK_S)
 
-    and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are taken
-    anew. They also are if the arm does not follow, if g < STUCK_GAP_M, or if the target has moved
-    by more than that. While the setpoint engages, engaging_speed takes the place of max_speed.
+    and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are set
+    to the present ones. This also happens if the arm does not follow, if g < STUCK_GAP_M, or if the
+    target has moved by more than STUCK_GAP_M. While the setpoint engages, engaging_speed takes the
+    place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
-    WAY_TIMEOUT_S has passed. After a way that was empty, it lasts until the target has moved by
+    WAY_TIMEOUT_S has passed. If no way out was found, it lasts until the target has moved by
     ANOTHER_TARGET_M.
     """
     state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]

@@ -1,7 +1,7 @@
 """Errors of held-out demonstrations, and how far a prediction is supported by them.
 
-A prediction is as uncertain as predictions at like inputs were wrong. Where no demonstration was,
-the tool may be wherever demonstrations had it.
+The covariance of a prediction is the scatter of held-out errors at similar inputs. Far from all
+demonstrations, it is the scatter of the tool over all of them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SURVIVAL = -np.log1p(-np.array(LEVELS))  # -log of the share of errors beyond ea
 class LocalErrors(Immutable):
     """Errors e_m of held-out demonstrations at inputs x_m of a primitive.
 
-    * `inputs` (I, M): one row an input.
+    * `inputs` (I, M): one row for each input.
     * `errors` (M, 3) [m].
     * `stretch` (I,): factors c_i of the kernel exp(-Σ_i (c_i (x_i - x_mi))²).
     * `unknown_std_m`: standard deviation of the tool on each axis where no demonstration was.
@@ -43,8 +43,8 @@ class LocalErrors(Immutable):
 
     @classmethod
     def of(cls, primitive: KMP, inputs: Vector, errors: Vector, unknown_std_m: float) -> LocalErrors:
-        """Errors (M, 3) [m] at inputs (M, I) of a primitive, whose kernel is made
-        SUPPORT_SHARPNESS times as sharp.
+        """Errors (M, 3) [m] at inputs (M, I) of a primitive. Its kernel is made SUPPORT_SHARPNESS
+        times as sharp.
         """
         scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
         factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
@@ -67,9 +67,9 @@ def local_scatter(
         C = (ν σ² I + Σ_m g_m e_m e_mᵀ) / (ν + Σ_m g_m) + LEAST_STD_M² I
         g_m = exp(-Σ_i (c_i (x_i - x_mi))²),   ν = SUPPORT_MASS,   σ = `unknown_std_m`
 
-    So it is the scatter of the errors e_m (M, 3) at like inputs x_m (I, M) where there are some,
-    and grows to σ² away from all of them: the posterior mean of a variance whose prior weighs as
-    much as ν errors.
+    So C is the scatter of the errors e_m (M, 3) at similar inputs x_m (I, M), and grows to σ² away
+    from all of them. It is the posterior mean of a variance whose prior σ² weighs as much as ν
+    errors.
     """
     count = errors.shape[0]
     squares = np.zeros(count)
@@ -94,8 +94,8 @@ def local_scatter(
 
 @compiled
 def error_probability(covariance: Vector, added: float, ratios: Vector) -> float:
-    """Probability, rounded, that the tool is farther than UNSURE_M from its prediction, whose
-    calibrated covariance C is (3, 3) [m²]. A variance that is `added` [m²] counts beside tr C.
+    """Probability, rounded, that the tool belongs farther than UNSURE_M from its prediction with
+    the calibrated covariance C (3, 3) [m²]. The variance `added` [m²] is added to tr C.
 
     `ratios` (L,) are the quantiles of |e|² / tr C at LEVELS. With u = UNSURE_M² / tr C, -log of the
     probability is interpolated linearly in log u between them, and beyond the last ones with their

@@ -1,18 +1,18 @@
 """Clock of a task, or of each of its stages: how long ago the hands began it.
 
-The clock starts when a hand first moves faster than CLOCK_START_MPS after rest, and advances at a
-rate r that follows its goal g with the time constant CLOCK_LAG_S:
+The clock t [s] starts when a hand first moves faster than CLOCK_START_MPS after rest. Over the time
+t' [s] it advances at a rate r, which follows its goal g with the time constant CLOCK_LAG_S:
 
     dt/dt' = r,   dr/dt' = (g - r) / CLOCK_LAG_S
 
-* g = 1 for a clock that runs; g = 1 - s for one that waits, with the stillness s of the hand that
-  is less still.
+* g = 1 for a clock that runs. g = 1 - s for a clock that waits, with the stillness s of the hand
+  that is less still.
 * g = 0 once t has reached `longest_s`, the end of the longest demonstration.
 * g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. The next motion
   starts the clock anew if the hands are where demonstrations begin, or if the task may be over (t
-  at least `over_s`). Elsewhere the user has paused, and the clock goes on.
-* If the task has stages, the clock starts anew in each: it is 0 from a change of the most probable
-  stage to the next motion.
+  at least `over_s`). Elsewhere the user has paused, and the clock continues.
+* If the task has stages, the clock starts anew in each. When the most probable stage changes, the
+  clock is set to 0, and starts with the next motion.
 
 So the clock is continuous while hands move, and constant where nothing was demonstrated.
 """
@@ -42,9 +42,9 @@ class TaskClock(NamedTuple):
     """Parameters of the clock that is an input of a skill."""
 
     waits: bool  # true if the clock waits while both hands rest
-    weight: float  # as an input, a second counts as this length [m], or this share of a stage
-    longest_s: float  # the clock stops there
-    over_s: float  # from here on the task may be over
+    weight: float  # as an input, a second counts as this length [m], with stages as this share of a segment
+    longest_s: float  # the clock stops at this time
+    over_s: float  # from this time on the task may be over
     rest_s: float  # a longer rest ends the task, or is a pause
     near_m: float  # hands within this distance of `begin` are where demonstrations begin
     begin: tuple[float, ...]  # (6,) [m] mean hands at the begin of the demonstrations
@@ -69,11 +69,13 @@ class TaskClock(NamedTuple):
 
 @compiled
 def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> None:
-    """Advance a clock (5,) by one period Δ, for hands (6,) [m] whose faster one has this speed
-    [m/s], and whose less still one this stillness; see the equations of this module.
+    """Advance a clock (5,) by one period `period_s` [s]; see the equations of this module. The
+    faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
+    `still`.
 
-    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may go on resting, and
-    the stage. `rows` (K, 12) are `TaskClock.numbers` in each stage; a task without stages has one.
+    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, and
+    the stage. `rows` (K, 12) are `TaskClock.numbers` of each stage; a task without stages has one
+    row.
     """
     numbers = rows[stage]
     if clock[CLOCK_STAGE] != stage:
@@ -100,8 +102,8 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
 
 @compiled
 def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
-    """Advance the clock in the state by `count`, with the speeds of the hands `sides` (2,) without
-    their tremor, in the most probable stage.
+    """Advance the clock in the state by `count`, in the most probable stage. The speeds are those
+    of the hands `sides` (2,) without their tremor.
     """
     state, hands, speed, still, stage = states[0], np.empty(6), 0.0, 1.0, 0
     for i in range(2):
@@ -132,8 +134,9 @@ def counted(
     rows: Vector,
     stages: NDArray[np.int64] | None = None,
 ) -> Vector:
-    """The clock (T,) [s] along hands (T, 6) [m] with the speeds (T,) [m/s] of the faster one and
-    the stillness (T,) of the less still one, in these stages (T,); `rows` are those of `count`.
+    """The clock (T,) [s] along hands (T, 6) [m], in the `stages` (T,). `speeds` (T,) [m/s] are
+    those of the faster hand, `stillness` (T,) is that of the less still one. `rows` are those of
+    `count`.
     """
     out, steps = np.empty(len(hands)), max(1, math.ceil(period_s / MEMORY_STEP_S))
     if stages is None:

@@ -58,7 +58,7 @@ SUPPORT_SHARPNESS = 4.0  # sharpness of the kernel of errors / of the primitive'
 # 1e-3 to 0.01. More: the region is larger. Less: the region is smaller.
 LEAST_STD_M = 0.003  # lower limit of the standard deviation on each axis
 # 0.05 to 0.3. More: fewer targets are unsure. Less: more targets are unsure.
-UNSURE_M = 0.10  # the skill is unsure if the 95 % region reaches farther: the tool may belong to another thing
+UNSURE_M = 0.10  # a tool farther than this from where it belongs is wrong: it may be at another thing
 AMBIGUOUS_M = 0.5 * UNSURE_M  # tools of two stages farther apart than this belong to different things
 TRAIL_S = SAMPLE_CORRELATION_S  # mean velocity over this time, by the error of timing, adds to the covariance
 

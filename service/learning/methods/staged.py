@@ -2,9 +2,9 @@
 covered to the share that the tool covers, with the teacher's delay and the errors of held-out
 demonstrations.
 
-A stage lies between two via-points. Which one it is, the skill estimates by the belief b (K,) over
-the K stages, the forward filter of a hidden Markov model with transition rates A and likelihoods l,
-see `service.core.skill.stages.recognise`:
+A stage lies between two via-points. The skill estimates the present stage by the belief b (K,) over
+the K stages. This is the forward filter of a hidden Markov model with transition rates A and
+likelihoods l, see `service.core.skill.stages.recognise`:
 
     b(t) ~ l(t) ∘ (I + dt A)ᵀ b(t - dt)
 
@@ -56,20 +56,20 @@ from service.learning.regions import blocks_of, unknown_std
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
-SAMPLES_TRIED = 200  # samples of a demonstration by which delays and inputs are tried, about
-LEAST_OFF_M = 0.03  # hands deviate from their segments by at least this distance, also where few takes show it
+SAMPLES_TRIED = 200  # delays and inputs are compared with about this number of samples of a demonstration
+LEAST_OFF_M = 0.03  # lower limit of the hands' distance from a segment, root mean square; few takes may show less
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
 CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
-SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the way to a corner that was demonstrated
+SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the path to a corner that was demonstrated
 UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
-KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the clock at which it is known
+KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the longest clock at which the tool's share is known
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 HOLD_SHARE = 0.005  # share of the time that the gate may hold: hands that start elsewhere approach, and are followed
-OWN_DELAY_SHARE = 0.75  # a delay of one's own must reduce the error of that of all takes to this share
+OWN_DELAY_SHARE = 0.75  # the new takes get a delay of their own if it reduces their error to this share
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
-WITHOUT_PLACES = "without places"  # in a skill's figures
-PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the way, no offset
+WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
+PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the segment, no offset
 
 
 class Hyperparameters(NamedTuple):
@@ -84,9 +84,9 @@ ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
 
 
 class Samples(NamedTuple):
-    """The samples that are learned from: their rows in each demonstration, inputs (N, 2 + K), with
-    a clock (N, 2 + K + 1), outputs (N, OUTPUTS), and the numbers (N,) of their demonstrations, of
-    which the first `new` are held out and judged.
+    """The N samples that are learned from: their rows in each demonstration, inputs (N, 2 + K) or
+    with a clock (N, 2 + K + 1), outputs (N, OUTPUTS), and `owner` (N,), the numbers of their
+    demonstrations. The first `new` demonstrations are held out and judged.
     """
 
     encoded: Sequence[Encoded]
@@ -129,8 +129,9 @@ class Samples(NamedTuple):
         return min(errors_m, key=errors_m.__getitem__)
 
     def held_out(self, ell: float, noises: Sequence[float], weight: float, block_of: Indices | None = None) -> Vector:
-        """The tool's errors (J, N, 3) [m] at the samples of new demonstrations, with these noises
-        (J,) and this weight. Each demonstration is held out, or its block (H,).
+        """The tool's errors (J, N, 3) [m] at the N samples of new demonstrations, with these noises
+        (J,) and this weight. Each of the H demonstrations is held out, or its whole block in
+        `block_of` (H,).
         """
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
         is_new, held_out = self.owner < self.new, self.owner if block_of is None else block_of[self.owner]
@@ -146,7 +147,9 @@ class Samples(NamedTuple):
         return errors
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
-        """The KMP of all demonstrations but these, adapted to where the tool is known to be."""
+        """The KMP of all demonstrations except those in `without`, adapted to where the tool is
+        known to be.
+        """
         kept = ~np.isin(self.owner, without)
         weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
         covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
@@ -170,9 +173,9 @@ class Samples(NamedTuple):
     def _timed(self, at: Vector, shares: Vector, clock: TaskClock) -> tuple[Vector, Vector]:
         """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
 
-        Where a clock runs on, the tool may still be on its way when the hands are at the end of a
-        stage, so it is known there when the clock ends; and at the begin of a stage when the clock
-        begins. All else is known at any time.
+        If the clock runs while the hands rest, the tool may still be moving when the hands are at
+        the end of a stage. So it is known there only when the clock ends, and at the start of a
+        stage only when the clock starts. All other shares are known at any time.
         """
         stages = self.encoded[0].stages[at[:, 2:].argmax(axis=1)]
         moves = (stages["square"] > STAYS) | (stages["leads"] != NONE)[:, None]
@@ -225,9 +228,9 @@ def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
 
 
 def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
-    """Tasks in which the share of one hand alone counts, by name, unless one conducts anyway: of
-    each hand that was ahead of the other one in the demonstrations, so that they show whether the
-    tool waits, and of a hand that is the only one that the tool follows.
+    """Tasks in which the share of one hand alone counts, by name; none if one hand conducts anyway.
+    A hand qualifies if it was ahead of the other one in the demonstrations, so that they show
+    whether the tool waits, or if it is the only hand that the tool follows.
     """
     if any(one.demonstration.conducts != "both" for one in shown):
         return {}
@@ -240,8 +243,8 @@ def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
 
 
 def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[str, Task]:
-    """Tasks in which the tool turns with the hands that it follows, or follows one hand everywhere
-    and turns with it, by name, for the hands that turn in the demonstrations.
+    """Tasks in which the tool turns with hands that turn in the demonstrations, by name: with the
+    hands that it follows, or with one hand that it then follows everywhere.
     """
     turns = np.concatenate([one.turns for one in demonstrations]).reshape(-1, 2, 9)
     sides = np.flatnonzero(np.ptp(turns, axis=0).max(axis=1) > math.sin(LEAST_TURN_RAD)).tolist()
@@ -257,9 +260,9 @@ def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[s
 
 
 class _Prediction(NamedTuple):
-    """A take's mean prediction without its block: the delayed hands (T, 6) [m], or (T, 24) with
-    their turns, the belief (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of primitives
-    beside the position's.
+    """A take's mean prediction, learned without its block: the delayed hands (T, 6) [m], or (T, 24)
+    with their turns, the belief (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of the
+    primitives of orientation and gripper.
     """
 
     hands: Vector
@@ -291,7 +294,7 @@ class _Prediction(NamedTuple):
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
-        """Errors (M, 6) at about `count` samples: shares (2,), stage, and error (3,) [m]."""
+        """Errors (M, 6) at up to `count` samples: shares (2,), stage, and error (3,) [m]."""
         rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
         stages = self.belief[rows].argmax(axis=1)
         return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
@@ -301,7 +304,7 @@ class Candidate(NamedTuple):
     """A task and a teacher's delay that are tried, with the encoded demonstrations, the samples,
     the hands' distances (K, 2) [m] from their segments, and hyper-parameters.
 
-    The delay is the one of the new demonstrations, see `Samples`.
+    The delay is that of the new demonstrations, see `Samples`.
     """
 
     task: Task
@@ -322,8 +325,8 @@ class Candidate(NamedTuple):
         before_s: float = 0.0,
         weight: float = 1.0,
     ) -> Self:
-        """The candidate of a task with this delay, and this weight against earlier demonstrations,
-        which have a delay of their own.
+        """The candidate of a task with this delay. Earlier demonstrations have a delay of their
+        own, `before_s`, and the new ones this weight against them.
         """
         task, encoded = encode(task, [*new, *earlier], [delay_s] * len(new) + [before_s] * len(earlier))
         samples = Samples.of(encoded, len(new))
@@ -335,8 +338,8 @@ class Candidate(NamedTuple):
         return self._replace(samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos)
 
     def without(self, block: Sequence[int], primitive: KMP, step: int = 1) -> dict[int, _Prediction]:
-        """The predictions, by a primitive without them, of a block's demonstrations at one of every
-        `step` samples.
+        """The predictions of a block's demonstrations at one of every `step` samples, by a
+        primitive that was learned without them.
         """
         clock, found = self.samples.clock, dict[int, _Prediction]()
         for h in block:
@@ -355,7 +358,9 @@ class Candidate(NamedTuple):
 
 
 def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence[int]:
-    """The demonstrations that are left out to predict a block: itself, unless there is no other."""
+    """The demonstrations that are left out to predict a block: the block, or none if it is the only
+    one.
+    """
     return block if len(blocks) > 1 else ()
 
 
@@ -363,9 +368,9 @@ def with_delay(
     task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]], usual_s: float | None = None
 ) -> tuple[Candidate, Delay, float]:
     """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
-    in all of them; that delay, with the standard deviation of the delays that predict each of them
-    best; and the error [m]. A delay that is `usual_s` is kept unless another one predicts much
-    better, because a teacher's delay varies between takes, and there may be only a few.
+    in all of them; that delay, with the standard deviation of the best delays of the single
+    demonstrations; and the error [m]. If `usual_s` is given, it is the delay unless another one
+    predicts much better: a teacher's delay varies between takes, and there may be only a few.
     """
     candidates = [Candidate.of(task, shown, late_s) for late_s in DELAYS_S]
     squares = np.array([one.squares(blocks) for one in candidates])
@@ -455,14 +460,14 @@ class Staged:
         self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
     ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
         """The candidate that predicts held-out new takes best, its delay, the errors [m] of all
-        candidates, the name of the one taken, and the weights.
+        candidates, its name, and the weights.
         """
         new, earlier = (
             [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
         )
         demonstrations = [take.demonstration for take in taught.new]
         progress(f"choosing the delay over {len(new)} demonstrations")
-        everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # a task is not one person's
+        everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # to judge what all persons share
         usual_s = with_delay(self.task, everybody, all_blocks)[1].mean_s if earlier else None
         best, delay, error_m = with_delay(self.task, new, blocks, usual_s)
 
@@ -528,9 +533,8 @@ class Staged:
 def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
     """The candidate with those clocks that may predict clearly better, by the clock's name.
 
-    What is compared here leaves out where the tool is known to be, and holds out the blocks of
-    `paired`; if a skill is refined, the new takes show the pace that counts, and are held out one
-    by one.
+    This comparison ignores where the tool is known to be, and holds out the blocks of `paired`. If
+    a skill is refined, the pace of the new takes counts, and they are held out person by person.
     """
     persons = persons_of(taught.new)
     block_of = persons if taught.earlier else paired(persons)
@@ -554,8 +558,9 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
 
 
 def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
-    """The covariances (N, 3, 3) [m²] of the tool at each via-point over the demonstrations; of its
-    offset from the hand, where it follows one; zeros, where it also turns with that hand.
+    """The covariances (N, 3, 3) [m²] of the tool at each via-point over the demonstrations. Where
+    it follows a hand, they are those of its offset from that hand; where it also turns with the
+    hand, zeros.
     """
     at = np.array([one.at.at[[one.at.names.index(name) for name in task.names]] for one in encoded])
     for n, side in enumerate(task.follow.tolist()):
@@ -566,8 +571,8 @@ def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
 
 
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
-    """The distances (K, 2) [m] of the hands from their segments, root mean square, in each stage;
-    in all stages where no demonstration has this one.
+    """The distances (K, 2) [m] of the hands from their segments in each stage, root mean square. A
+    stage that no demonstration has gets those of all stages.
     """
     labels, off = np.concatenate([one.labels for one in encoded]), np.concatenate([one.off for one in encoded])
     by_stage = [off[labels == k] if (labels == k).any() else off for k in range(len(encoded[0].stages))]
