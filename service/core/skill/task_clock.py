@@ -14,7 +14,7 @@ t' [s] it advances at a rate r, which follows its goal g with the time constant 
 * If the task has stages, the clock starts anew in each. When the most probable stage changes, the
   clock is set to 0, and starts with the next motion.
 
-So the clock is continuous while hands move, and constant where nothing was demonstrated.
+So the clock is continuous within a stage, and constant where nothing was demonstrated.
 """
 
 from __future__ import annotations
