@@ -17,7 +17,7 @@ from service.files.shipped import cell_of
 from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
 from service.process.progress import progress, say, steps
 from service.report.tables import NONE, Table
-from service.report.variants import CHANGES, Judgement, VariantFigures, best, toml, tried
+from service.report.variants import CHANGES, JudgedHands, VariantFigures, best, toml, tried
 from service.settings.file_content import UnusableError, content
 
 
@@ -34,24 +34,24 @@ def tune(args: argparse.Namespace) -> int:
         say(line)
     with steps("tuning") as doing:
         doing("estimating the true hands")
-        judgement = Judgement.of(hands)
+        judged_hands = JudgedHands.of(hands)
     with progress("tuning", unit="variants", total=len(CHANGES)) as done:
-        variants = tried(judgement, progress=done)
+        variants = tried(judged_hands, progress=done)
     chosen, reason = best(variants, hands.settings)
     if args.plot:
         from service.report.variants_picture import draw  # its import is slow
 
-        draw(judgement, variants, chosen, args.plot)
+        draw(judged_hands, variants, chosen, args.plot)
     if args.json:
-        print(msgspec.json.format(msgspec.json.encode(_as_json(judgement, variants, chosen, reason))).decode())
+        print(msgspec.json.format(msgspec.json.encode(_as_json(judged_hands, variants, chosen, reason))).decode())
         return 0
     console = plain_console()
     lasts_s = (hands.ticks[-1].index - hands.ticks[0].index) * hands.period_s
     print(
-        f"{printable(str(hands.path))}: {judgement.judged_s:.1f} of {lasts_s:.1f} s are judged, in which the arm "
+        f"{printable(str(hands.path))}: {judged_hands.judged_s:.1f} of {lasts_s:.1f} s are judged, in which the arm "
         "follows with the settings as recorded\nand the true hands are known. The arm is taken to move as commanded."
     )
-    print_table(console, _hands_table(judgement))
+    print_table(console, _hands_table(judged_hands))
     print_table(console, _variants_table(variants))
     if any(one.rejected for one in variants):
         print_table(console, _rejected_table(variants))
@@ -72,9 +72,9 @@ def _skill(path: Any) -> StoredSkill | None:
         raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
 
 
-def _hands_table(judgement: Judgement) -> Table:
+def _hands_table(judged_hands: JudgedHands) -> Table:
     rows = []
-    for side, hand in judgement.truth.items():
+    for side, hand in judged_hands.truth.items():
         tremor = hand.tremor()
         found = (f"{tremor.rate_hz:.1f}", f"{tremor.amplitude_mm:.2f}") if tremor else ("none", NONE)
         counts = str(len(hand.times) + hand.untrusted), str(hand.untrusted)
@@ -112,10 +112,10 @@ def _rejected_table(variants: list[VariantFigures]) -> Table:
     return Table("rejected", "Rejected samples by cause; other settings reject the same", ("settings", *causes), rows)
 
 
-def _as_json(judgement: Judgement, variants: list[VariantFigures], chosen: VariantFigures, reason: str) -> object:
+def _as_json(judged_hands: JudgedHands, variants: list[VariantFigures], chosen: VariantFigures, reason: str) -> object:
     return {
-        "recording": str(judgement.hands.path),
-        "judged_s": judgement.judged_s,
+        "recording": str(judged_hands.hands.path),
+        "judged_s": judged_hands.judged_s,
         "hands": {
             side: {
                 "rate_hz": hand.rate_hz,
@@ -124,7 +124,7 @@ def _as_json(judgement: Judgement, variants: list[VariantFigures], chosen: Varia
                 "noise_mm": hand.noise_mm,
                 "tremor": tremor._asdict() if (tremor := hand.tremor()) else None,
             }
-            for side, hand in judgement.truth.items()
+            for side, hand in judged_hands.truth.items()
         },
         "variants": [one._asdict() | {"tracking": one.tracking._asdict()} for one in variants],
         "best": {"name": chosen.name, "change": chosen.change, "reason": reason, "toml": toml(chosen.change)},

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from service.core.frame import Vector
 
-LAG_RANGE_S = (-0.06, 0.2)  # lags that are tried
+TRIED_LAGS_S = (-0.06, 0.2)  # lags that are tried
 STOP_FROM_MPS, STOP_TO_MPS = 0.1, 0.02  # a target stops if its speed falls from above the first to below the second
 BRAKING_S = 0.25  # it does so within this time
 RESTING_S = 0.25  # and then rests for this time, in which the tool may pass it
-MOVED_M = 0.02  # a target moves in a second in which its path is longer
+LEAST_PATH_M = 0.02  # a target moves in a second in which its path is longer
 
 
 class TrackingFigures(NamedTuple):
@@ -60,7 +60,7 @@ def _usual_error_mm(target: Vector, tool: Vector, period_s: float, judged: NDArr
     errors = []
     for begin in range(0, len(squared), ticks):
         rows = np.flatnonzero(judged[begin : begin + ticks]) + begin
-        if len(rows) > ticks / 2 and np.linalg.norm(np.diff(target[rows], axis=0), axis=1).sum() > MOVED_M:
+        if len(rows) > ticks / 2 and np.linalg.norm(np.diff(target[rows], axis=0), axis=1).sum() > LEAST_PATH_M:
             errors.append(squared[rows].mean())
     return 1000 * math.sqrt(float(np.median(errors)) if errors else float(squared[judged].mean()))
 
@@ -78,10 +78,10 @@ def rms(rows: Vector) -> float:
 
 
 def lag_ms(target: Vector, tool: Vector, period_s: float, judged: NDArray[np.bool_] | None = None) -> float:
-    """The lag [ms] within LAG_RANGE_S with the largest cross-correlation of the speeds; NaN for a
+    """The lag [ms] within TRIED_LAGS_S with the largest cross-correlation of the speeds; NaN for a
     path that is too short, or a target that does not move.
     """
-    first, last = (round(limit_s / period_s) for limit_s in LAG_RANGE_S)
+    first, last = (round(limit_s / period_s) for limit_s in TRIED_LAGS_S)
     begin, end = -2 * first, len(target) - last + 2 * first
     if end <= begin:
         return math.nan

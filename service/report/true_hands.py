@@ -29,18 +29,20 @@ from service.files.track import Track
 from service.files.track_check import checked, sound
 from service.settings.config import Settings
 
-CUT_HZ, CUT_RATE_SHARE = 6.0, 1 / 8  # faster motion is tremor or noise; of slow trackers above this share of the rate
+HALF_RESPONSE_HZ = 6.0  # the response of the true motion is one half here: faster motion is tremor or noise
+HALF_RESPONSE_RATE_SHARE = 1 / 8  # for trackers with a low rate: at this share of the rate
 REWEIGHTINGS = 3
-FAR_RESIDUALS, FAR_LEAST_M = 3.0, 1e-3  # weights are reduced beyond this multiple of the median residual, and this
+FAR_RESIDUALS = 3.0  # weights are reduced for residuals above this multiple of the median one
+FAR_LEAST_M = 1e-3  # smaller residuals keep their weight
 LONGEST_GAP_S = 0.25  # within longer gaps between trusted samples the true motion is not known
 LEAST_HAND_SAMPLES = 20
-TREMOR_HZ = (4.0, 12.0)
+TREMOR_RANGE_HZ = (4.0, 12.0)
 SPECTRUM_S = 2.0  # length of a spectrum's segments
 SHOULDERS_HZ = (1.25, 2.5)  # the spectrum without the tremor is interpolated from both sides at this distance
-TREMOR_RATIO = 3.0  # a peak this many times above it is a tremor
+TREMOR_RATIO = 3.0  # a tremor has a peak this many times above the rest of the spectrum
 TREMOR_HALF_WIDTH_HZ = 1.0
-LONGEST_DELAY_S = 0.3  # stamps with a larger spread of delays are ignored: times of arrival are used
-FIRST_STAMP_NS = 10**12
+DELAY_SPREAD_S = 0.3  # stamps with a larger spread of delays are ignored: times of arrival are used
+EARLIEST_STAMP_NS = 10**12
 
 
 class Tremor(NamedTuple):
@@ -96,13 +98,13 @@ class TrueHand(NamedTuple):
         return hz, density.sum(axis=1)
 
     def tremor(self) -> Tremor | None:
-        """The strongest tremor in TREMOR_HZ; None without one, or with too few samples."""
+        """The strongest tremor in TREMOR_RANGE_HZ; None without one, or with too few samples."""
         hz, density = self.spectrum()
         if not len(hz):
             return None
         log_hz, log_density = np.log(np.maximum(hz, hz[1])), np.log(np.maximum(density, 1e-30))
         rest = np.full(len(hz), np.nan)
-        band = np.flatnonzero((hz >= TREMOR_HZ[0]) & (hz <= min(TREMOR_HZ[1], hz[-1] - SHOULDERS_HZ[0])))
+        band = np.flatnonzero((hz >= TREMOR_RANGE_HZ[0]) & (hz <= min(TREMOR_RANGE_HZ[1], hz[-1] - SHOULDERS_HZ[0])))
         for i in band.tolist():
             away = np.abs(hz - hz[i])
             beside = (away >= SHOULDERS_HZ[0]) & (away <= SHOULDERS_HZ[1])
@@ -143,7 +145,7 @@ def true_hands(ticks: Sequence[Tick], settings: Settings, *, origin: str) -> dic
 def smoothing_spline(times: Vector, samples: Vector) -> BSpline:
     """The spline through samples (M, 3) at growing times (M,) [s]; see the module."""
     interval_s = float(np.median(np.diff(times)))
-    omega = 2.0 * math.pi * min(CUT_HZ, CUT_RATE_SHARE / interval_s)
+    omega = 2.0 * math.pi * min(HALF_RESPONSE_HZ, HALF_RESPONSE_RATE_SHARE / interval_s)
     weights = np.ones(len(times))
     for _ in range(REWEIGHTINGS):
         path = make_smoothing_spline(times, samples, weights, lam=1.0 / (interval_s * omega**4))
@@ -162,7 +164,7 @@ def with_true_hands(ticks: Iterable[Tick], hands: Mapping[str, TrueHand], period
         newest = np.clip(np.searchsorted(hand.times, times) - 1, 0, len(hand.times) - 1)
         sides.append((f"hands/{side}", hand.at(times).tolist(), hand.orientations[newest].tolist()))
     for i, tick in enumerate(ticks):
-        stamp_ns = FIRST_STAMP_NS + round(1e9 * times[i])
+        stamp_ns = EARLIEST_STAMP_NS + round(1e9 * times[i])
         inbox = [event for event in tick.inbox if not event.kind.startswith("hands/")]
         for kind, positions, orientations in sides:
             if math.isfinite(positions[i][0]):
@@ -193,7 +195,7 @@ def _track(side: str, ticks: Iterable[Tick], period_s: float) -> Track:
         since_first = (stamped - stamped[0]) / 1e9
         delays = came - since_first
         least, most = np.percentile(delays, (1, 95))
-        times = since_first + least if most - least < LONGEST_DELAY_S else came
+        times = since_first + least if most - least < DELAY_SPREAD_S else came
     stamps, first = np.unique(np.round(1e9 * times).astype(np.int64), return_index=True)
     rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept]).reshape(-1, 7)
     return Track(f"hands/{side}", side, stamps, stamps, rows[first], frame)

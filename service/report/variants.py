@@ -88,7 +88,7 @@ class VariantFigures(NamedTuple):
             yield Figure(f"rejected: {word(cause)}", self.rejected.get(word(cause), 0), "", 0)
 
 
-class Judgement(NamedTuple):
+class JudgedHands(NamedTuple):
     """The judged ticks (T,) of a recording's hands, the target (T, 3) [m] of its skill for the true
     hands, their truth by side, and the frames (T,) with the recording's own settings.
     """
@@ -100,7 +100,7 @@ class Judgement(NamedTuple):
     frames: Records
 
     @classmethod
-    def of(cls, hands: RecordedHands) -> Judgement:
+    def of(cls, hands: RecordedHands) -> JudgedHands:
         """Raises RecordingError if the arm does not follow long enough to judge anything."""
         truth = true_hands(hands.ticks, hands.settings, origin=str(hands.path))
         frames = hands.frames(hands.settings)
@@ -181,16 +181,19 @@ def toml(change: Change) -> str:
 
 
 def tried(
-    judgement: Judgement, changes: tuple[Change, ...] = CHANGES, *, progress: Callable[[int], None] = lambda count: None
+    judged_hands: JudgedHands,
+    changes: tuple[Change, ...] = CHANGES,
+    *,
+    progress: Callable[[int], None] = lambda count: None,
 ) -> list[VariantFigures]:
     """The figures with the recording's own settings, and of every change that is one for its
     cell.
     """
-    found = [judgement.figures("as recorded", {}, judgement.frames)]
+    found = [judged_hands.figures("as recorded", {}, judged_hands.frames)]
     for i, change in enumerate(changes):
-        settings = changed(judgement.hands.settings, change)
+        settings = changed(judged_hands.hands.settings, change)
         if settings is not None:
-            found.append(judgement.figures(written_change(change), change, judgement.hands.frames(settings)))
+            found.append(judged_hands.figures(written_change(change), change, judged_hands.hands.frames(settings)))
         progress(i + 1)
     return found
 
@@ -253,17 +256,17 @@ def compared(hands: RecordedHands, other: Settings, name: str) -> tuple[list[Tab
     Raises RecordingError for settings of another arm or rate.
     """
     hands.check_comparable(other, name)
-    judgement = Judgement.of(hands)
+    judged_hands = JudgedHands.of(hands)
     frames = hands.frames(other)
-    both = [judgement.figures("as recorded", {}, judgement.frames), judgement.figures(name, {}, frames)]
+    both = [judged_hands.figures("as recorded", {}, judged_hands.frames), judged_hands.figures(name, {}, frames)]
     names = [one.name for one in both]
     tables = [side_by_side(names, [list(one.figures()) for one in both])]
     differ = differing(*(flat(msgspec.to_builtins(settings)) for settings in (hands.settings, other)))
     if differ:
         rows = tuple((setting, str(one), str(another)) for setting, one, another in differ)
         tables.append(Table("settings", "Settings that differ", ("setting", *names), rows, numbers=9))
-    apart_mm = 1000 * np.linalg.norm(frames["tool"] - judgement.frames["tool"], axis=1)
-    joints = np.abs(frames["joints"] - judgement.frames["joints"])
+    apart_mm = 1000 * np.linalg.norm(frames["tool"] - judged_hands.frames["tool"], axis=1)
+    joints = np.abs(frames["joints"] - judged_hands.frames["joints"])
     if not joints.any():
         return tables, "All commands are the same."
     at = int(np.argmax(apart_mm))

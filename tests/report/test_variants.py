@@ -17,13 +17,14 @@ from service.report.tracking import TrackingFigures
 from service.report.variants import (
     CHANGES,
     Change,
-    Judgement,
+    JudgedHands,
     VariantFigures,
     best,
     changed,
     compared,
     toml,
     tried,
+    written_change,
 )
 from service.settings.config import Settings, parse
 from support.paths import RECORDINGS
@@ -38,8 +39,8 @@ def hands() -> RecordedHands:
 
 
 @pytest.fixture(scope="module")
-def judgement(hands: RecordedHands) -> Judgement:
-    return Judgement.of(hands)
+def judged_hands(hands: RecordedHands) -> JudgedHands:
+    return JudgedHands.of(hands)
 
 
 def test_a_recording_without_its_arm_is_followed_as_it_was(golden: Path) -> None:
@@ -54,8 +55,8 @@ def test_a_recording_without_its_arm_is_followed_as_it_was(golden: Path) -> None
     assert (frames["rejected"] == recorded["rejected"]).all()
 
 
-def test_settings_are_judged_by_the_true_hands(judgement: Judgement) -> None:
-    own, calm = tried(judgement, (CALM, {"tool": {"max_jerk": 400.0}}))  # the second is no change
+def test_settings_are_judged_by_the_true_hands(judged_hands: JudgedHands) -> None:
+    own, calm = tried(judged_hands, (CALM, {"tool": {"max_jerk": 400.0}}))  # the second is no change
     assert (own.name, calm.name) == ("as recorded", "max_jerk = 100")
     assert 2.0 < own.tracking.error_mm < 30.0
     assert own.tracking.lag_ms > 0.0
@@ -63,8 +64,8 @@ def test_settings_are_judged_by_the_true_hands(judgement: Judgement) -> None:
     assert calm.tracking.error_mm > own.tracking.error_mm
     assert own.rejected == calm.rejected
     assert own.rejected["not_finite"] == 13
-    ideal = judgement._replace(target=judgement.frames["tool"])
-    assert ideal.figures("perfect", {}, judgement.frames).tracking.error_mm == 0.0
+    ideal = judged_hands._replace(target=judged_hands.frames["tool"])
+    assert ideal.figures("perfect", {}, judged_hands.frames).tracking.error_mm == 0.0
 
 
 def test_every_change_is_valid_in_the_shipped_cell_and_can_be_written_to_a_file() -> None:
@@ -72,6 +73,9 @@ def test_every_change_is_valid_in_the_shipped_cell_and_can_be_written_to_a_file(
         settings = changed(Settings(), change)
         assert settings is not None
         assert parse(toml(change), origin="tune") == settings
+    words: Change = {"tool": {"orientation": "full"}}
+    assert parse(toml(words), origin="tune").tool.orientation == "full"
+    assert written_change(words) == "orientation = full"
     assert changed(Settings(), {"tool": {"max_speed": 9.0}}) is None
     assert changed(Settings(), {"tool": {"stop_room": Settings().tool.stop_room}}) is None
 
@@ -140,4 +144,4 @@ def test_a_part_keeps_what_lasts_and_must_hold_ticks() -> None:
 
 def test_hands_that_the_arm_does_not_follow_are_refused_with_the_reasons() -> None:
     with pytest.raises(RecordingError, match=r"follows for 0\.\d s .*hold: operator 0\.\d s"):
-        Judgement.of(recorded_hands(GOLDEN, part=(8.9, 9.7)))
+        JudgedHands.of(recorded_hands(GOLDEN, part=(8.9, 9.7)))
