@@ -36,7 +36,7 @@ def tune(args: argparse.Namespace) -> int:
         doing("estimating the true hands")
         judged_hands = JudgedHands.of(hands)
     with progress("tuning", unit="variants", total=len(CHANGES)) as done:
-        variants = tried(judged_hands, progress=done)
+        variants = tried(judged_hands, CHANGES, progress=done)
     chosen, reason = best(variants, hands.settings)
     if args.plot:
         from service.report.variants_picture import draw  # its import is slow

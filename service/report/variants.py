@@ -8,7 +8,7 @@ hands move on.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
@@ -182,7 +182,7 @@ def toml(change: Change) -> str:
 
 def tried(
     judged_hands: JudgedHands,
-    changes: tuple[Change, ...] = CHANGES,
+    changes: Sequence[Change],
     *,
     progress: Callable[[int], None] = lambda count: None,
 ) -> list[VariantFigures]:
