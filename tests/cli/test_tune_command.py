@@ -95,7 +95,7 @@ def test_a_mistake_is_explained(
 def test_a_retired_setting_is_accepted_with_a_warning_of_one_line(tmp_path: Path) -> None:
     cell = tmp_path / "cell.toml"
     cell.write_text("[tool]\njerk_weight = 1e-8\nmax_jerk = 0\n", encoding="utf-8")
-    done = thirdhand("replay", GOLDEN, "--config", str(cell))
+    done = thirdhand("replay", GOLDEN, "--config", str(cell), timeout=110)
     warned, *errors = done.stderr.splitlines()
     assert warned == (
         f"thirdhand: {cell}: [tool] jerk_weight is retired and has no effect; "
