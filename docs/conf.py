@@ -42,6 +42,7 @@ GROUPS = {
         "ros2-control",
         "near-people",
         "rate",
+        "tune",
         "look",
         "viewing",
         "reports",

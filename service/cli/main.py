@@ -10,6 +10,8 @@ import argparse
 import contextlib
 import importlib
 import os
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from service.contract.roles import DAEMON, ROLES
 from service.learning.residual_risk import OPTION
 from service.process import interrupt
 from service.process.progress import say
+from service.settings.config import RetiredSettingWarning
 from service.settings.file_content import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
@@ -40,7 +43,7 @@ GROUPS = {
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "replay", "bench"),
+    "check": ("doctor", "cells", "replay", "tune", "bench"),
     "set up": ("arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
@@ -184,13 +187,29 @@ def parser() -> argparse.ArgumentParser:
         "replay",
         "Runs the core on a recording, or on several that follow each other, and compares every frame. Missing and "
         "damaged parts are listed; only with --exact they are failures.",
-        "thirdhand replay recordings/golden.mcap --exact",
+        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay yesterday.mcap --config calmer.toml",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
     exact = "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
     c.add_argument("--exact", action="store_true", help=exact)
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
+    compared = "instead, compare the recording's settings with these, for the same hands"
+    option(c, "--config", "CELL", f"{compared}: {ARM_HELP}")
+
+    c = command(
+        "tune",
+        "Tries about a dozen settings on the hands of a recording or a take: error, lag, jerk, overshoot and "
+        "rejections of each, and the noise and tremor of the hands. Prints the lines to write for the best trade-off.",
+        "thirdhand tune recordings/golden.mcap --plot tune.png",
+    )
+    option(c, "file", "FILE", "a recording of the daemon, or a take (.mcap)")
+    option(c, "--config", "CELL", f"the cell (default: the settings in the file): {ARM_HELP}")
+    option(c, "--skill", "FILE", "the skill (default: that in the file; for a take the shipped soldering skill)")
+    part = "use this part only, in seconds from the start; the default is all of it"
+    c.add_argument("--part", nargs=2, type=within(float, 0, 1e6, " s"), metavar=("FROM", "TO"), help=part)
+    option(c, "--plot", "PNG", "draw the variants and the hands to this file")
+    c.add_argument("--json", action="store_true", help="print the figures as one JSON object")
 
     c = command("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
@@ -424,9 +443,20 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
     return sub
 
 
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
+) -> None:
+    """Show a warning about a file in one line; others with their place in the program."""
+    if issubclass(category, RetiredSettingWarning):
+        say(f"thirdhand: {message}")
+    else:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line and return its exit code."""
     args = parser().parse_args(arguments)
+    warnings.showwarning = _show_warning
     module, function = args.run.rsplit(".", 1)
     try:
         if "reaches" in args and not vars(args).get("config"):

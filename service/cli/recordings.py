@@ -22,6 +22,7 @@ from service.contract.requests import Status
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.mcap_file import ends_early
 from service.files.pose_streams import TRACK_NAMES, PoseTopic
+from service.files.recorded_hands import recorded_hands
 from service.files.recording import Recording
 from service.files.replay import replay as replayed
 from service.files.shipped import cell_of
@@ -87,8 +88,10 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
 
 def replay(args: argparse.Namespace) -> int:
     """Replay recordings; exit code 0 if all frames are within tolerance, or with `--exact` complete
-    and identical.
+    and identical. With `--config` compare two settings; exit code 0 once they are compared.
     """
+    if args.config is not None:
+        return _replay_with(args)
     if args.output:
         check_writable(args.output, ".mcap")
     counts = [Recording.open(path).ticks() for path in args.files]
@@ -97,6 +100,28 @@ def replay(args: argparse.Namespace) -> int:
         result = replayed(*args.files, after=args.after, progress=done, output=args.output)
     print(result.text())
     return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
+
+
+def _replay_with(args: argparse.Namespace) -> int:
+    """Compare the settings of a recording with others, for the recorded hands."""
+    from service.cli.report_command import plain_console, print_table
+    from service.report.variants import compared  # its import is slow
+
+    if len(args.files) > 1 or args.exact or args.after is not None or args.output:
+        raise UsageError("--config compares the settings of one recording: without --exact, --after and --output")
+    other = cell_of(args.config)
+    hands = recorded_hands(args.files[0])
+    with steps("replaying") as doing:
+        doing("replaying the hands with both settings")
+        tables, sentence = compared(hands, other, args.config)
+    for line in hands.remarks:
+        say(line)
+    console = plain_console()
+    print("The same hands with both settings; the arm is taken to move as commanded.")
+    for one in tables:
+        print_table(console, one)
+    print(f"\n{printable(sentence)}")
+    return 0
 
 
 def _refined(path: Path) -> StoredSkill:

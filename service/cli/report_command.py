@@ -42,14 +42,12 @@ def report(args: argparse.Namespace) -> int:
     for path in args.files:
         with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
             reports.append(reported(path, progress=done))
-    console = Console(highlight=False, soft_wrap=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=PLAIN_WIDTH)
+    console = plain_console()
     for one in reports:
         _print(console, one)
     if len(reports) > 1:
         for table in comparison(reports):
-            _print_table(console, table)
+            print_table(console, table)
     if args.csv:
         write_csv(reports, args.csv)
         console.print(Text(printable(f"tables in {args.csv}")))
@@ -69,6 +67,12 @@ def report(args: argparse.Namespace) -> int:
     return 0
 
 
+def plain_console() -> Console:
+    """The console for tables, with a fixed width if it is not a terminal."""
+    console = Console(highlight=False, soft_wrap=False)
+    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
+
+
 def _print(console: Console, one: Report) -> None:
     verdict, *lines = summary(one)
     console.print(Text(verdict, style="bold"), soft_wrap=True)
@@ -76,7 +80,7 @@ def _print(console: Console, one: Report) -> None:
         console.print(Text(line))
     console.print(_bar(one))
     for table in tables(one):
-        _print_table(console, table)
+        print_table(console, table)
 
 
 def _bar(one: Report) -> Text:
@@ -93,7 +97,8 @@ def _bar(one: Report) -> Text:
     return bar
 
 
-def _print_table(console: Console, table: Table) -> None:
+def print_table(console: Console, table: Table) -> None:
+    """Print a table with its title after an empty line."""
     drawn = RichTable(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for i, head in enumerate(table.heads):
         drawn.add_column(escape(head), justify="right" if table.is_number(i) else "left", overflow="fold")

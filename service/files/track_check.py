@@ -119,6 +119,13 @@ def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) ->
     return out
 
 
+def in_base_frame(settings: Settings) -> Settings:
+    """The settings for hands that are in frame `base` already."""
+    hands = HandSettings()
+    mapped = {name: getattr(hands, name) for name in ("frame", "unit", "axes", "base_from_tracker")}
+    return msgspec.structs.replace(settings, hands=msgspec.structs.replace(settings.hands, **mapped))
+
+
 def sound(track: Track) -> Track:
     """The track with NaN for poses that are not finite or whose quaternion is not a rotation. A
     track without any rotation is assumed to have the identity.
@@ -144,10 +151,7 @@ class _Verdict(NamedTuple):
 
 def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdict]:
     """The decisions on each track, as `left` or `right` hand of one intake, in order of stamps."""
-    hands = HandSettings()
-    mapped = {name: getattr(hands, name) for name in ("frame", "unit", "axes", "base_from_tracker")}
-    hands = msgspec.structs.replace(settings.hands, **mapped)
-    settings = msgspec.structs.replace(settings, hands=hands)
+    settings = in_base_frame(settings)
     intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
     intake.begin(state)
     state["tick"] = 0

@@ -4,7 +4,7 @@ at via-points, and limits that were active.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -274,18 +274,24 @@ def _rejections(columns: Columns) -> Iterator[Rejection]:
 def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]:
     """Names and values of the settings, versions and machine that differ between two recordings."""
     a, b = (
-        _flat(msgspec.to_builtins(r.columns.recording.settings), "")
+        flat(msgspec.to_builtins(r.columns.recording.settings))
         | {f"made with {name}": value for name, value in r.columns.recording.metadata.items()}
         | {"skill": r.skill}
         for r in (one, other)
     )
+    return differing(a, b)
+
+
+def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Names and both values of what differs."""
     values = ((name, a.get(name, "unknown"), b.get(name, "unknown")) for name in sorted({*a, *b}))
     return [found for found in values if found[1] != found[2]]
 
 
-def _flat(value: Any, path: str) -> dict[str, Any]:
+def flat(value: Any, path: str = "") -> dict[str, Any]:
+    """Values in nested tables, by their path with dots."""
     if isinstance(value, dict):
-        inner = (_flat(inside, f"{path}.{name}" if path else name) for name, inside in value.items())
+        inner = (flat(inside, f"{path}.{name}" if path else name) for name, inside in value.items())
         return {name: found for one in inner for name, found in one.items()}
     return {path: value}
 

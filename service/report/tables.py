@@ -194,27 +194,32 @@ def summary(report: Report) -> list[str]:
 
 
 def comparison(reports: Sequence[Report]) -> Iterator[Table]:
-    """Figures of several reports side by side; for two reports also differences, and settings that
-    differ.
+    """Figures of several reports side by side; for two reports also settings that differ."""
+    names = names_of(reports)
+    yield side_by_side(names, [list(report.figures()) for report in reports])
+    if len(reports) == 2:
+        settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(*reports))
+        if settings:
+            yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+
+
+def side_by_side(names: Sequence[str], columns: Sequence[Sequence[Figure]]) -> Table:
+    """Figures in a column for each name; for two also their differences. Figures that are 0 in all
+    columns are left out.
     """
-    told = [{figure.name: figure for figure in report.figures()} for report in reports]
-    two = len(reports) == 2
+    by_name = [{figure.name: figure for figure in column} for column in columns]
+    two = len(columns) == 2
     rows = []
-    for name in dict.fromkeys(name for one in told for name in one):
-        figures = [one.get(name) for one in told]  # None: a via-point that was not taught there
+    for name in dict.fromkeys(name for one in by_name for name in one):
+        figures = [one.get(name) for one in by_name]  # None: a via-point that was not taught there
         values = [figure and figure.value for figure in figures]
         known = next(figure for figure in figures if figure is not None)
         if any(values):
             row = [f"{name} [{known.unit}]" if known.unit else name]
             row += [NONE if value is None else f"{value:.{known.digits}f}" for value in values]
             rows.append((*row, *([_difference(known, values[0], values[1])] if two else [])))
-    names = names_of(reports)
     heads = ("figure", *names, *(("difference",) if two else ()))
-    yield Table("comparison", "Side by side", heads, tuple(rows))
-    if two:
-        settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(*reports))
-        if settings:
-            yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+    return Table("comparison", "Side by side", heads, tuple(rows))
 
 
 def names_of(reports: Sequence[Report]) -> list[str]:

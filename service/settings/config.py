@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,6 +42,15 @@ MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
+
+
+# Retired settings by table and name, and what takes their place. In a cell's file they are accepted
+# with a warning and have no effect. Recordings replay with the values that they hold.
+RETIRED = {("tool", "jerk_weight"): "a lower max_jerk makes the tool follow more calmly"}
+
+
+class RetiredSettingWarning(FutureWarning):
+    """A file has a setting that is retired."""
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -90,7 +100,7 @@ class ToolSettings(Section, frozen=True):
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
-    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] least weight of jerk² against error²
+    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] retired: see RETIRED
     stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
@@ -519,6 +529,10 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
         raise SettingsError(f"{origin}: {error}") from None
     except RecursionError:
         raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None
+    for (table, name), advice in RETIRED.items():
+        if isinstance(given.get(table), dict) and given[table].pop(name, None) is not None:
+            text = f"{origin}: [{table}] {name} is retired and has no effect; {advice}"
+            warnings.warn(text, RetiredSettingWarning, stacklevel=2)
     return converted(given, origin=origin, folder=folder)
 
 

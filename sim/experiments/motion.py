@@ -21,6 +21,7 @@ from service.files.shipped import cell_of, recordings
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
+from service.report.tracking import derivative, lag_ms, rms
 from service.settings.config import Settings
 from sim.experiments import spectra
 from sim.experiments.catalogue import EXPERIMENTS
@@ -162,14 +163,14 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
     overshoot = settled = math.nan
     if not math.isnan(hands.stop_s):
         begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
-        way = _derived(target, 1)[begin]
+        way = derivative(target, PERIOD_S, order=1)[begin]
         past = (tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
         overshoot = max(0.0, 1000 * float(past.max()))
         late = np.flatnonzero(1000 * np.linalg.norm(tool[end:] - target[-1], axis=1) > SETTLED_MM)
         settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
     tool, target = tool[begun:], target[begun:]
     off_mm = 1000 * np.linalg.norm(tool - target, axis=1)
-    wanted_acceleration, acceleration = (_derived(x, 2) for x in (target, tool))
+    wanted_acceleration, acceleration = (derivative(x, PERIOD_S, order=2) for x in (target, tool))
     return Figures(
         name,
         hands.group,
@@ -177,34 +178,15 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         hands.person,
         error_rms_mm=float(np.sqrt(np.mean(off_mm**2))),
         error_p95_mm=float(np.percentile(off_mm, 95)),
-        lag_ms=_lag_ms(target, tool),
-        acceleration_ratio=_rms(acceleration) / _rms(wanted_acceleration),
-        jerk_ratio=_rms(_derived(acceleration, 1)) / _rms(_derived(wanted_acceleration, 1)),
+        lag_ms=lag_ms(target, tool, PERIOD_S),
+        acceleration_ratio=rms(acceleration) / rms(wanted_acceleration),
+        jerk_ratio=rms(derivative(tool, PERIOD_S, order=3)) / rms(derivative(target, PERIOD_S, order=3)),
         limited=seen.limited,
         top_speed=seen.top_speed,
         overshoot_mm=overshoot,
         settled_ms=settled,
         joint_speeds=spectra.speeds(seen.tool, seen.joints),
     )
-
-
-def _derived(x: Array, times: int) -> Array:
-    for _ in range(times):
-        x = np.gradient(x, PERIOD_S, axis=0)
-    return x
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
-
-
-def _lag_ms(target: Array, tool: Array) -> float:
-    """The maximum of the cross-correlation of speeds."""
-    a, b = (np.linalg.norm(_derived(x, 1), axis=1) for x in (target, tool))
-    a, b = a - a.mean(), b - b.mean()
-    inner = a[60 : len(a) - 160]
-    score = [float(inner @ b[60 + k : len(b) - 160 + k]) for k in range(-30, 101)]
-    return 1000 * PERIOD_S * (int(np.argmax(score)) - 30)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick
+from service.core.controller import Controller
+from service.core.frame import Tick
 from service.core.skill.skill import Skill, clamp
+from service.files.recorded_hands import frames_of, with_ideal_arm
 from service.settings.config import Settings, robot_description
 from sim.experiments.results import Array
 
@@ -19,15 +19,12 @@ USUAL = Settings()
 
 def controller(skill: Skill, settings: Settings) -> Controller:
     """The service's core with an arm that is where it is commanded."""
-    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
-    return Controller(settings, skill, urdf=robot_description(settings))
+    return Controller(with_ideal_arm(settings), skill, urdf=robot_description(settings))
 
 
 def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> NDArray[np.void]:
     """The service's frames (T,) of ticks."""
-    found: list[Frame] = []
-    run(controller(skill, settings), ticks, [lambda tick, frame: found.append(frame)])
-    return np.array(found)
+    return frames_of(controller(skill, settings), ticks)
 
 
 def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:

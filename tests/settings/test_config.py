@@ -8,9 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from service.contract.explain import validated
 from service.daemon.launch import described
 from service.files.shipped import cell_of
-from service.settings.config import WAM, Files, Settings, load, parse, robot_description
+from service.settings.config import WAM, Files, RetiredSettingWarning, Settings, load, parse, robot_description
 from service.settings.file_content import SettingsError
 from service.settings.network import Network, is_local
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
@@ -334,3 +335,10 @@ def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, l
     with pytest.raises(SettingsError) as caught:
         load(tmp_path / "cell.toml")
     assert message in str(caught.value)
+
+
+def test_a_retired_setting_has_no_effect_in_a_file_and_is_kept_by_recordings() -> None:
+    with pytest.warns(RetiredSettingWarning, match=r"cell.toml: \[tool\] jerk_weight is retired and has no effect; "):
+        assert parse("[tool]\njerk_weight = 'x'", origin="cell.toml") == Settings()
+    recorded = msgspec.json.encode({"tool": {"jerk_weight": 1e-8}})  # a recording replays with what was in effect
+    assert validated(msgspec.json.decode(recorded), Settings).tool.jerk_weight == 1e-8
