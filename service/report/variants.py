@@ -48,7 +48,7 @@ CHANGES: tuple[Change, ...] = (
 )
 LIMITS_OF_MOTION = ("max_speed", "max_acceleration", "max_jerk")  # a proposal never raises these
 LEAST_JUDGED_S = 2.0
-SAME_SHARE = 0.03  # a smaller change of error or jerk is not worth a setting
+SAME_SHARE = 0.05  # a smaller change of error or jerk is not worth a setting
 MORE_JERK, LESS_JERK = 1.1, 0.8  # a proposal has at most the first share of the jerk, or the second for the same error
 MORE_OVERSHOOT_MM = 1.0
 MORE_HELD_S = 0.1
