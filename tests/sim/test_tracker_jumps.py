@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.experiments.people.moving_hands import tracker_kind
+from sim.experiments.gains import gain
+from sim.experiments.people.moving_hands import SMALL_KINDS, recorded, small_motion, tracker_kind
 from sim.experiments.people.tracker_jumps import exchanged_samples, noise_std_m, repair
 from sim.experiments.results import Array
 
 WAY = np.array([0.6, 0.64, 0.48])
 TRACKERS = {"24 Hz": (24.0, 0.0002), "30 Hz": (30.0, 0.002), "120 Hz": (120.0, 0.0003)}  # rate, noise [m]
-Path = Callable[[Array], Array]
+Position = Callable[[Array], Array]
 
 
 def eased(u: Array) -> Array:
@@ -23,16 +25,16 @@ def eased(u: Array) -> Array:
     return np.asarray(u**3 * (10 - 15 * u + 6 * u * u))
 
 
-def reach(length_m: float, speed_mps: float) -> Path:
+def reach(length_m: float, speed_mps: float) -> Position:
     return lambda t: length_m * eased(t * speed_mps / (1.875 * length_m))
 
 
-def out_and_back(length_m: float, speed_mps: float) -> Path:
+def out_and_back(length_m: float, speed_mps: float) -> Position:
     lasts_s = 1.875 * length_m / speed_mps
     return lambda t: length_m * (eased(t / lasts_s) - eased(t / lasts_s - 1))
 
 
-PATHS: dict[str, Path] = {
+PATHS: dict[str, Position] = {
     "rest": np.zeros_like,
     "reach at 1 m/s": reach(0.5, 1.0),
     "reach at 2 m/s": reach(0.5, 2.0),
@@ -44,7 +46,7 @@ PATHS: dict[str, Path] = {
 }
 
 
-def hands(path: Path, tracker: str, seed: int) -> tuple[Array, Array, Array]:
+def hands(path: Position, tracker: str, seed: int) -> tuple[Array, Array, Array]:
     """Times, the true hands, and the samples of a tracker that makes no mistake. The right hand
     rests 0.3 m beside the left one.
     """
@@ -117,3 +119,33 @@ def test_the_noise_of_a_tracker_is_found_in_quick_motion_and_names_its_kind() ->
     assert kinds == {"24 Hz": "motion capture", "30 Hz": "camera", "120 Hz": "motion capture"}
     noisy = hands(PATHS["rest"], "30 Hz", seed=2)[2]
     assert tracker_kind(200, noisy) == "other"
+
+
+def test_both_truths_of_a_recording_are_kept_and_cleanly_tracked_hands_have_no_jumps(tmp_path: Path) -> None:
+    t, true, seen = hands(PATHS["reach at 1 m/s"], "30 Hz", seed=3)
+    begin = int(np.searchsorted(t, 0.1))
+    seen[begin : begin + 3, 2] += 0.08
+    np.savez(tmp_path / "someone_1.npz", time_s=t, left=seen[:, :3], right=seen[:, 3:])
+    found = {one.group: one for one in recorded(tmp_path, np.zeros(6))}
+    as_recorded = found["recorded"]
+    assert as_recorded.jumping is not None
+    assert as_recorded.tracker == "camera"
+    np.testing.assert_array_equal(as_recorded.truth, found["clean"].truth)
+    off = np.linalg.norm(as_recorded.jumping - as_recorded.truth, axis=1)
+    assert 0.03 < off.max() < 0.08  # low-passed
+    assert off[:50].max() < 0.01
+    clean = found["clean"]
+    at = np.round(clean.stamps / 0.002).astype(int)
+    assert np.abs(clean.samples - clean.truth[np.minimum(at, len(clean.truth) - 1)]).max() < 0.005
+
+
+@pytest.mark.parametrize("kind", SMALL_KINDS)
+def test_the_gain_of_small_motion_is_found_beside_its_drift(kind: str) -> None:
+    for number, rate_hz in enumerate((1.0, 5.0, 12.0)):
+        small = small_motion(np.zeros(6), kind, rate_hz, number)
+        still = small_motion(np.zeros(6), kind, 0.0, number)
+        hand = slice(3 * (number % 2), 3 * (number % 2) + 3)
+        shaken, drift = small.truth[:, hand], still.truth[:, hand]
+        late = np.roll(shaken - drift, round(0.1 / rate_hz / 0.002), axis=0)
+        assert np.abs(shaken - drift).max() <= SMALL_KINDS[kind][0]
+        assert gain(shaken, 1.7 * late + drift, rate_hz) == pytest.approx(1.7, rel=0.02)

@@ -31,6 +31,11 @@ MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is s
 STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
 MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
 UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
+SMALL_KINDS = {  # amplitude [m], speed of the hand besides [m/s]
+    "3 mm in a drift of 0.1 m/s": (0.003, 0.1),
+    "2 mm at rest": (0.002, 0.0),
+}
+SMALL_S, SMALL_JUDGED_S, SMALL_RISE_S = 3.5, 2.0, 0.5  # duration, its judged end, the rise at the begin
 
 
 @dataclass(frozen=True)
@@ -230,3 +235,24 @@ def reaches(*, seeds: Sequence[int]) -> list[Moving]:
         samples = np.array([np.concatenate([pose[:3] for pose in script.sample(t)]) for t in stamps])
         out.append(Moving(f"scene {seed}", "minimum jerk", truth, stamps, samples))
     return out
+
+
+def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Moving:
+    """A hand that moves to and fro by millimetres at a frequency, at rest or in a steady drift."""
+    amplitude_m, drift_mps = SMALL_KINDS[kind]
+    random = np.random.default_rng([number, 8])
+    directions = random.standard_normal((2, 3)) * (1.0, 1.0, 0.5)
+    shake, drift = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    t = np.arange(round(SMALL_S / PERIOD_S)) * PERIOD_S
+    rise = np.clip(t / SMALL_RISE_S, 0.0, 1.0)
+    rise = rise**2 * (3 - 2 * rise)
+    gone = np.cumsum(drift_mps * rise) * PERIOD_S
+    way = (gone - gone[-1] / 2)[:, None] * drift + (amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t))[
+        :, None
+    ] * shake
+    truth = np.tile(middle, (len(t), 1))
+    truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += way
+    stamps = np.arange(0.0, t[-1], 0.01)
+    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
+    samples += 0.0005 * random.standard_normal(samples.shape)
+    return Moving(f"{kind}, {rate_hz:g} Hz", "small motion", truth, stamps, samples)

@@ -30,7 +30,7 @@ LONGER = 1.25  # ratio of the lengths of runs, above the first few
 THRESHOLD, THRESHOLD_EACH = 30.0, 6.0  # squared distance of a wrong run, and more for each of its samples
 LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
 ALIKE = 0.5  # the candidates are runs with at least this share of the largest excess over the threshold
-CANDIDATES = 40  # the number of candidates is limited
+CANDIDATES = 40  # the shortest of these are compared
 BEYOND = 0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
 STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
 EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
@@ -155,7 +155,7 @@ def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]
     while len(found):
         excess, first, last = found[np.argmax(found[:, 0])]
         alike = found[(found[:, 0] >= ALIKE * excess) & (found[:, 1] < last) & (found[:, 2] > first)]
-        alike = alike[np.argsort(-alike[:, 0])[:CANDIDATES]]
+        alike = alike[np.argsort(alike[:, 2] - alike[:, 1], kind="stable")[:CANDIDATES]]
         begin, end = _most_probable(t, x, alike[:, 1:].astype(int), quick)
         runs.append((begin, end))
         found = found[(found[:, 1] >= max(last, end) + reach) | (found[:, 2] <= min(first, begin) - reach)]
