@@ -14,7 +14,7 @@ from sim.experiments.people.moving_hands import PERIOD_S, SMALL_JUDGED_S, SMALL_
 from sim.experiments.results import ADAPTED, TOOL, Array, Results, pyplot
 
 PATHS = ("setpoint", "tool")
-LABELS = {"ours": ("ours", TOOL), "chase": ("One-Euro filter, then Ruckig after the target", ADAPTED)}
+FOLLOWER_LABELS = {"ours": ("ours", TOOL), "chase": ("One-Euro filter, then Ruckig after the target", ADAPTED)}
 
 
 def gain(target: Array, path: Array, rate_hz: float) -> float:
@@ -37,7 +37,7 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
     figure, axes = plt.subplots(1, len(SMALL_KINDS), figsize=(9, 3.4), sharey=True, layout="constrained")
     for panel, kind in zip(axes, SMALL_KINDS, strict=True):
         panel.axhline(1.0, color="0.8", lw=1)
-        for who, (label, colour) in LABELS.items():
+        for who, (label, colour) in FOLLOWER_LABELS.items():
             for path, style in zip(PATHS, ("-", "--"), strict=True):
                 values = numbers[kind][who][path]
                 panel.plot(numbers["hz"], values, style, marker="o", ms=3, color=colour, label=f"{label}: {path}")

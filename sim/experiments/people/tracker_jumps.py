@@ -23,15 +23,15 @@ SPREAD_M, SCALE_S = 0.1, 0.08
 USUAL_MPS, SPEED_SPAN_S = 2.0, 0.1  # the spread is in proportion to a recording's speed above this
 SCALES_S = (SCALE_S, 0.12, 0.18, 0.27, 0.4)  # from quick to calm hands
 PLACE_M, DRIFT_MPS = 1.0, 1.0  # standard deviations of the place and of the speed over a window
-LEAST_NOISE_M = 0.002  # includes a hand's tremor
-NEIGHBOURS = 8  # samples on each side that predict
+TRACKED_NOISE_FLOOR_M = 0.002  # includes a hand's tremor
+SAMPLES_BESIDE = 8  # samples on each side that predict
 LONGEST_S = 0.5  # longest run
-LONGER = 1.25  # ratio of the lengths of runs, above the first few
+RUN_GROWTH = 1.25  # ratio of the lengths of runs, above the first few
 THRESHOLD, THRESHOLD_EACH = 30.0, 6.0  # squared distance of a wrong run, and more for each of its samples
 LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
 ALIKE = 0.5  # the candidates are runs with at least this share of the largest excess over the threshold
 CANDIDATES = 40  # the shortest of these are compared
-BEYOND = 0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
+BRIDGE_MARGIN = 0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
 STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
 EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
 NOISE_ORDER = 5  # differences of this order contain a tracker's noise and hardly a hand's motion
@@ -106,7 +106,7 @@ def quick_process(t: Array, x: Array) -> Process:
     span = max(1, round(SPEED_SPAN_S / float(np.median(np.diff(t)))))
     speed = np.linalg.norm(x[span:] - x[:-span], axis=1) / (t[span:] - t[:-span])
     usual = float(np.percentile(speed, 95)) if len(speed) else 0.0
-    return Process(max(noise_std_m(x), LEAST_NOISE_M), SPREAD_M * max(1.0, usual / USUAL_MPS))
+    return Process(max(noise_std_m(x), TRACKED_NOISE_FLOOR_M), SPREAD_M * max(1.0, usual / USUAL_MPS))
 
 
 def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
@@ -141,17 +141,17 @@ def jumped_samples(t: Array, x: Array, quick: Process) -> NDArray[np.bool_]:
 
 def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]]:
     """Improbable runs [begin, end), each more so than all runs near it."""
-    if len(t) <= 2 * NEIGHBOURS:
+    if len(t) <= 2 * SAMPLES_BESIDE:
         return []
     longest = max(1, round(LONGEST_S / float(np.median(np.diff(t)))))
     rows, length = [], 1
-    while length <= min(longest, len(t) - 2 * NEIGHBOURS):
+    while length <= min(longest, len(t) - 2 * SAMPLES_BESIDE):
         squared, off_m = _off_prediction(t, x, length, quick)
         excess = squared - THRESHOLD - THRESHOLD_EACH * length
         begins = np.flatnonzero((excess > 0) & (off_m > LEAST_JUMP_M))
         rows.append(np.stack([excess[begins], begins, begins + length], axis=1))
-        length = max(length + 1, round(LONGER * length))
-    found, runs, reach = np.concatenate(rows), [], longest + NEIGHBOURS
+        length = max(length + 1, round(RUN_GROWTH * length))
+    found, runs, reach = np.concatenate(rows), [], longest + SAMPLES_BESIDE
     while len(found):
         excess, first, last = found[np.argmax(found[:, 0])]
         alike = found[(found[:, 0] >= ALIKE * excess) & (found[:, 1] < last) & (found[:, 2] > first)]
@@ -166,7 +166,7 @@ def _most_probable(t: Array, x: Array, runs: NDArray[np.int_], quick: Process) -
     """The run [begin, end) of several (K, 2) without which the samples around them are most
     probable. A wrong sample is anywhere within 1 m^3: the logarithm of its density is 0.
     """
-    around = np.arange(max(0, runs[:, 0].min() - NEIGHBOURS), min(len(t), runs[:, 1].max() + NEIGHBOURS))
+    around = np.arange(max(0, runs[:, 0].min() - SAMPLES_BESIDE), min(len(t), runs[:, 1].max() + SAMPLES_BESIDE))
     right = [around[(around < begin) | (around >= end)] for begin, end in runs]
     begin, end = runs[np.argmax([quick.best(t[one], x[one])[0] for one in right])]
     return int(begin), int(end)
@@ -176,9 +176,9 @@ def _off_prediction(t: Array, x: Array, length: int, quick: Process) -> tuple[Ar
     """Squared Mahalanobis distance, and rms distance [m], of each run of a length from its
     prediction by its neighbours, by the run's first sample.
     """
-    size = 2 * NEIGHBOURS + length
+    size = 2 * SAMPLES_BESIDE + length
     begins = np.arange(len(t) - length + 1)
-    firsts = np.clip(begins - NEIGHBOURS, 0, len(t) - size)
+    firsts = np.clip(begins - SAMPLES_BESIDE, 0, len(t) - size)
     squared, off_m = np.empty((2, len(begins)))
     for offset in np.unique(begins - firsts):
         of = np.flatnonzero(begins - firsts == offset)
@@ -201,12 +201,12 @@ def _bridged(t: Array, x: Array, wrong: NDArray[np.bool_], quick: Process) -> Ar
     out, kept = x.copy(), np.flatnonzero(~wrong)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):
-        around = np.concatenate([kept[kept < begin][-NEIGHBOURS:], kept[kept >= end][:NEIGHBOURS]])
+        around = np.concatenate([kept[kept < begin][-SAMPLES_BESIDE:], kept[kept >= end][:SAMPLES_BESIDE]])
         process = quick.best(t[around], x[around])[1]
         covariance = process.covariance(t[None, np.concatenate([around, np.arange(begin, end)])])[0]
         middle, size = x[around].mean(axis=0), len(around)
         weighted = np.linalg.solve(covariance[:size, :size], x[around] - middle)
         low, high = x[around].min(axis=0), x[around].max(axis=0)
-        beyond = BEYOND * (high - low)
+        beyond = BRIDGE_MARGIN * (high - low)
         out[begin:end] = np.clip(middle + covariance[size:, :size] @ weighted, low - beyond, high + beyond)
     return out
