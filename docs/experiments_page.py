@@ -21,7 +21,7 @@ import jinja2
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.evidence import RESULTS, result_of, staleness, tree
 from sim.experiments.partners import verdict
-from sim.experiments.people.moving_hands import MOST_LATE_S, UNSEEN_S
+from sim.experiments.people.moving_hands import MOST_LATE_S, PRECISE_M, UNSEEN_S
 
 HERE = Path(__file__).parent
 WIDTH = 100
@@ -121,6 +121,7 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         "version": version,
         "stale": stale_line,
         "late_ms": round(1000 * MOST_LATE_S),
+        "precise_mm": 1000 * PRECISE_M,
     }
     found.globals["unseen_ms"] = [round(1000 * each) for each in UNSEEN_S]
     found.filters |= {

@@ -20,6 +20,7 @@ import kmp
 from service import client
 from service.cli.main import GROUPS
 from sim.experiments.catalogue import EXPERIMENTS
+from sim.experiments.people.moving_hands import SMALL_KINDS
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -127,6 +128,26 @@ def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() ->
     assert written("{{ phase.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}") == "1234+, 0.06, 0.360"
     with pytest.raises(jinja2.UndefinedError, match="tremor"):
         written("{{ phase.tremor }}")
+
+
+def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them() -> None:
+    page = program("experiments_page")
+    results: dict[str, dict[str, Any]] = {name: page.result_of(page.RESULTS, name) for name in EXPERIMENTS}
+    errors = {"ours": 3.0, "chase": 4.0, "ours_median": 1.5, "chase_median": 2.5, "ratio": 0.75, "lag_ms": 30.0}
+    groups = ("clean", "recorded", "recorded, jumps in the truth")
+    results["motion-of-others"] |= {
+        "takes": {"somebody": 2},
+        "trackers": {"somebody": "camera"},
+        "by_person": {group: {"somebody": errors} for group in groups},
+        "by_tracker": {group: {"camera": errors} for group in groups},
+        "all": dict.fromkeys(groups, errors),
+    }
+    gains = {who: {"setpoint": [1.0, 1.25], "tool": [1.0, 1.125]} for who in ("ours", "chase")}
+    results["motion"]["gain_by_frequency"] = {"hz": [1, 2], **dict.fromkeys(SMALL_KINDS, gains)}
+    text = page.wrapped(page.templates(results, page.tree()).get_template("experiments.md.jinja").render())
+    row = "| 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 |"
+    assert f"\n| `somebody` | camera {row}\n| all by camera | {row}\n| all | {row}\n" in text
+    assert "the gain is at most 1.25, and 1.12 at the tool" in " ".join(text.split())
 
 
 def test_names_and_programs_for_users_of_other_libraries_exist_and_run() -> None:

@@ -113,7 +113,11 @@ _PARTNERS = Seeds(
     tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in TASK_KINDS},
     learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in TASK_KINDS},
 )
-_FOLLOWED = {"people": Stream("moving hands", 0, range(200, 203)), "stops": Stream("sudden stop", 0, range(200, 224))}
+_FOLLOWED = {
+    "people": Stream("moving hands", 0, range(200, 203)),
+    "stops": Stream("sudden stop", 0, range(200, 224)),
+    "small": Stream("small motion", 0, range(200, 202)),
+}
 _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
 _FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
 _ORDERS = {"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))}

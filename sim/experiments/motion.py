@@ -23,10 +23,21 @@ from service.learning.learn import learn
 from service.learning.skill_file import decoded
 from service.report.tracking import derivative, lag_ms, rms
 from service.settings.config import Settings
-from sim.experiments import spectra
+from sim.experiments import gains, spectra
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.open_loop import targets
-from sim.experiments.people.moving_hands import PERIOD_S, STOP_S, Moving, modelled, person, reaches, recorded, stops
+from sim.experiments.people.moving_hands import (
+    PERIOD_S,
+    SMALL_KINDS,
+    STOP_S,
+    Moving,
+    modelled,
+    person,
+    reaches,
+    recorded,
+    small_motion,
+    stops,
+)
 from sim.experiments.results import (
     ADAPTED,
     LEFT,
@@ -46,7 +57,8 @@ from sim.experiments.rivals.linear_filters import best_linear
 from sim.experiments.workers import shared_out
 
 SEEDS = EXPERIMENTS["motion"].seeds
-PEOPLE, STOPS, SCENE = (SEEDS.evaluation[name] for name in ("people", "stops", "hands"))
+PEOPLE, STOPS, SCENE, SMALL = (SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small"))
+SMALL_HZ = range(1, 13)
 SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
@@ -60,6 +72,7 @@ LABELS = {
 }
 TRUTH, SMOOTH = "truth", "minimum jerk"  # the follower and the group whose frequencies are shown
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+WITH_JUMPS = "recorded, jumps in the truth"  # a group: recorded hands, where a follower should follow jumps
 HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
@@ -90,6 +103,8 @@ class Figures:
     overshoot_mm: float
     settled_ms: float
     joint_speeds: list[float]  # [rad/s] by frequency, as of `spectra`
+    tracker: str = ""  # its kind, of recorded hands
+    error_with_jumps_mm: float = math.nan  # rms error against the truth with the tracker's jumps
 
 
 def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
@@ -153,8 +168,23 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, which, hands = task
     skill, settings, by_name = _known[which]
-    target = targets(skill, hands.truth, settings)
-    return figures(name, replace(hands, group=hands.group + which), target, by_name[name](hands))
+    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
+    found = figures(name, replace(hands, group=hands.group + which), target, seen)
+    if hands.jumping is None:
+        return found
+    begun = round(BEGUN_S / PERIOD_S)
+    off = seen.tool[begun:] - targets(skill, hands.jumping[begun:], settings)
+    return replace(found, error_with_jumps_mm=1000 * _rms(off))
+
+
+def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
+    """Gains of small motion of a kind and a frequency [Hz], from target to setpoint and tool."""
+    name, kind, rate_hz, number = task
+    skill, settings, by_name = _known[SHIPPED]
+    hands = small_motion(skill.hands.mean(axis=0), kind, rate_hz, number)
+    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
+    assert seen.setpoint is not None
+    return [gains.gain(target, path, rate_hz) for path in (seen.setpoint, seen.tool)]
 
 
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
@@ -186,6 +216,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         overshoot_mm=overshoot,
         settled_ms=settled,
         joint_speeds=spectra.speeds(seen.tool, seen.joints),
+        tracker=hands.tracker,
     )
 
 
@@ -213,6 +244,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "by_follower": table,
         "by_person": _by_person(results, [one for one in found if math.isnan(one.overshoot_mm)]),
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
+        "gain_by_frequency": _gains(results, options, dict(zip(("ours", "chase"), by_both, strict=True))),
         "joint_speeds_in_the_scene": _joint_speeds(found, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
     }
@@ -246,6 +278,30 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
     return list(shared_out(measure, tasks, options.workers, prepare=begin, chunk=8))
 
 
+def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
+    """The gains of small motion by kind, follower and path, rms over the numbers of the stream."""
+    rates = list(SMALL_HZ if options.share == 1 else SMALL_HZ[1::4])
+    numbers = SMALL.share(options.share)
+    tasks = [
+        (name, kind, float(hz), number)
+        for kind in SMALL_KINDS
+        for name in names.values()
+        for hz in rates
+        for number in numbers
+    ]
+    begin = functools.partial(prepare, options.share, options.arm)
+    found = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin, chunk=4)))
+    found = found.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
+    means = np.sqrt(np.mean(found**2, axis=3))
+    out: dict[str, Any] = {"hz": rates}
+    for kind, of_kind in zip(SMALL_KINDS, means, strict=True):
+        out[kind] = {
+            who: dict(zip(gains.PATHS, of.T.tolist(), strict=True)) for who, of in zip(names, of_kind, strict=True)
+        }
+        results.say(f"gain of {kind}, by Hz: {brief(out[kind])}")
+    return out
+
+
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
     """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
     harder = [("ours", SHIPPED, one) for one in hands if one.group in HARDER_GROUPS]
@@ -253,41 +309,74 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
     names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
     found = _measured([(name, SHIPPED, one) for name in names for one in hands], options)
     takes = Counter(one.person for one in hands if one.group == "clean")
+    found += [
+        replace(one, group=WITH_JUMPS, error_rms_mm=one.error_with_jumps_mm) for one in found if one.group == "recorded"
+    ]
     people = _by_person(results, found)
+    kinds = {person: _usual_tracker(found, person) for person in takes}
     together: dict[str, dict[str, float]] = {}
-    for group, rows in people.items():
-        means = {
-            who: math.sqrt(sum(count * rows[one][who] ** 2 for one, count in takes.items()) / takes.total())
-            for who in ("ours", "chase")
-        }
-        lags = [one.lag_ms for one in found if one.follower == "ours" and one.group == group]
-        together[group] = means | {"ratio": means["ours"] / means["chase"], "lag_ms": float(np.median(lags))}
+    trackers: dict[str, dict[str, dict[str, float]]] = {}
+    for group in people:
+        of = [one for one in found if one.group == group]
+        together[group] = _compared(of)
         results.say(f"{group}, all: {brief(together[group])}")
+        trackers[group] = {
+            kind: _compared([one for one in of if kinds[one.person] == kind]) for kind in sorted(set(kinds.values()))
+        }
+        results.say(f"{group}, by tracker: {brief(trackers[group])}")
     worse, of_harder = {}, _measured(harder, options)
     for group in HARDER_GROUPS:
         error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
         worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
         results.say(f"{group}, all: {brief(worse[group])}")
-    numbers = {"hands": "recorded", "takes": dict(takes), "by_person": people, "all": together, "harder": worse}
+    numbers = {
+        "hands": "recorded",
+        "takes": dict(takes),
+        "trackers": kinds,
+        "by_person": people,
+        "by_tracker": trackers,
+        "all": together,
+        "harder": worse,
+    }
     draw_numbers(results, numbers)
     return numbers
 
 
 def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
-    """Root mean square error [mm] over all sequences of each group and person: ours, and that of
-    the best chase for this person.
-    """
+    """The errors of each group and person, as of `_compared`."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for group in dict.fromkeys(one.group for one in rows):
         of = [one for one in rows if one.group == group]
-        chases = sorted({one.follower for one in of if one.follower.startswith("chase")})
-        out[group] = {
-            person: {"ours": _pooled(mine, "ours"), "chase": min(_pooled(mine, name) for name in chases)}
-            for person in dict.fromkeys(one.person for one in of)
-            for mine in [[one for one in of if one.person == person]]
-        }
+        people = dict.fromkeys(one.person for one in of)
+        out[group] = {person: _compared([one for one in of if one.person == person]) for person in people}
         results.say(f"{group}, rms [mm]: {brief(out[group])}")
     return out
+
+
+def _compared(rows: list[Figures]) -> dict[str, float]:
+    """Errors [mm] over sequences, root mean square and median: ours, and those of the best chase
+    for each person. Our lag is a median too.
+    """
+    errors: dict[str, list[float]] = {"ours": [], "chase": []}
+    for name in dict.fromkeys(one.person for one in rows):
+        mine = [one for one in rows if one.person == name]
+        chases = sorted({one.follower for one in mine if one.follower.startswith("chase")})
+        best = min(chases, key=lambda follower: _pooled(mine, follower))
+        for who, follower in (("ours", "ours"), ("chase", best)):
+            errors[who] += [one.error_rms_mm for one in mine if one.follower == follower]
+    out = {who: float(np.sqrt(np.mean(np.square(each)))) for who, each in errors.items()}
+    medians = {f"{who}_median": float(np.median(each)) for who, each in errors.items()}
+    ratios = {
+        "ratio": out["ours"] / out["chase"],
+        "ratio_of_medians": medians["ours_median"] / medians["chase_median"],
+    }
+    lag_ms = float(np.median([one.lag_ms for one in rows if one.follower == "ours"]))
+    return {**out, **ratios, **medians, "lag_ms": lag_ms, "takes": len(errors["ours"])}
+
+
+def _usual_tracker(rows: list[Figures], name: str) -> str:
+    """The kind of tracker that recorded most sequences of a person."""
+    return Counter(one.tracker for one in rows if one.person == name).most_common(1)[0][0]
 
 
 def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
@@ -319,6 +408,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     results.figure(figure)
     if "by_follower" in numbers:
         spectra.draw(results, {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()})
+    if "gain_by_frequency" in numbers:  # results of an older layout have none
+        gains.draw(results, numbers["gain_by_frequency"])
 
 
 def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]) -> None:

@@ -3,7 +3,7 @@
 Recordings are `.npz` files with `time_s` or `t` (T,) [s], `left` and `right` (T, 3) [m], NaN where
 a hand was not seen; a hand that was never seen rests. Files whose names differ only after the last
 underscore are of one person. Recorded hands are moved into the skill's region; their truth is the
-recording without what is too fast for a wrist.
+recording without the tracker's jumps, and without what is too fast for a wrist.
 """
 
 from __future__ import annotations
@@ -18,17 +18,24 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from service.contract.explain import in_words
+from sim.experiments.people.tracker_jumps import noise_std_m, repair
 from sim.experiments.results import Array, ExperimentError
 from sim.scene import Scene
 from sim.script import HandScript
 
 PERIOD_S = 0.002
 NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # a tracker below 60 Hz is a camera, and is noisier
+PRECISE_M = 0.0004  # [m] noise (standard deviation) of motion capture is below this
 CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # base from a camera's x right, y down
 MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is scaled down
 STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
 MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
 UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
+SMALL_KINDS = {  # amplitude [m], speed of the hand besides [m/s]
+    "3 mm in a drift of 0.1 m/s": (0.003, 0.1),
+    "2 mm at rest": (0.002, 0.0),
+}
+SMALL_S, SMALL_JUDGED_S, SMALL_RISE_S = 3.5, 2.0, 0.5  # duration, its judged end, the rise at the begin
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,8 @@ class Moving:
     samples: Array
     stop_s: float = math.nan  # when a sudden stop begins
     late: Array | None = None  # (M, 2) [s] delay of each hand's samples; inf: they never arrive
+    jumping: Array | None = None  # (N, 6) [m] the truth with the tracker's jumps, if it had some
+    tracker: str = ""  # its kind, of a recording
 
     @property
     def person(self) -> str:
@@ -80,27 +89,42 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
     t, hands, cut_hz = hands_in(path)
     t = t - t[0]
     rate = 1 / float(np.mean(np.diff(t)))
-    hands = hands - np.median(hands, axis=0)
-    truth = _smooth(hands, rate, cut_hz)
+    repaired = repair(t, hands).hands
+    middle_of_hands = np.median(repaired, axis=0)
+    hands, repaired = hands - middle_of_hands, repaired - middle_of_hands
+    truth = _smooth(repaired, rate, cut_hz)
     speed = np.linalg.norm(np.gradient(truth.reshape(-1, 2, 3), 1 / rate, axis=0), axis=2).max(axis=1)
     scale = min(1.0, MOST_SPEED / float(np.percentile(speed, 99)), 0.3 / float(np.abs(truth).max()))
+    ticks = np.arange(0.0, t[-1], PERIOD_S)
     spline = CubicSpline(t, middle + scale * truth)
-    fine = spline(np.arange(0.0, t[-1], PERIOD_S))
-    name = path.stem
+    fine = spline(ticks)
+    jumping = CubicSpline(t, middle + scale * _smooth(hands, rate, cut_hz))(ticks)
+    name, tracker = path.stem, tracker_kind(rate, hands)
     random = np.random.default_rng(number)
 
     def seen(group: str, rate_hz: float, noise: float) -> Moving:
         stamps = np.arange(0.0, t[-1] - PERIOD_S, 1 / rate_hz)
-        return Moving(name, group, fine, stamps, spline(stamps) + noise * random.standard_normal((len(stamps), 6)))
+        samples = spline(stamps) + noise * random.standard_normal((len(stamps), 6))
+        return Moving(name, group, fine, stamps, samples, tracker=tracker)
 
     clean = seen("clean", 100, 0.0005)
     return [
         clean,
-        Moving(name, "recorded", fine, t, middle + scale * hands),
+        Moving(name, "recorded", fine, t, middle + scale * hands, jumping=jumping, tracker=tracker),
         seen("30 Hz, 2 mm", 30, 0.002),
         replace(clean, group="late", late=random.uniform(0.0, MOST_LATE_S, (len(clean.stamps), 2))),
         replace(clean, group="unseen", late=_unseen(clean.stamps, random)),
     ]
+
+
+def tracker_kind(rate_hz: float, hands: Array) -> str:
+    """The kind of the tracker that recorded hands (T, 6) [m]: precise ones are motion capture, slow
+    and noisy ones cameras.
+    """
+    noise_m = max(noise_std_m(hands[:, :3]), noise_std_m(hands[:, 3:]))
+    if noise_m < PRECISE_M:
+        return "motion capture"
+    return "camera" if rate_hz <= NOISY_HZ else "other"
 
 
 def _unseen(stamps: Array, random: np.random.Generator) -> Array:
@@ -211,3 +235,24 @@ def reaches(*, seeds: Sequence[int]) -> list[Moving]:
         samples = np.array([np.concatenate([pose[:3] for pose in script.sample(t)]) for t in stamps])
         out.append(Moving(f"scene {seed}", "minimum jerk", truth, stamps, samples))
     return out
+
+
+def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Moving:
+    """A hand that moves to and fro by millimetres at a frequency, at rest or in a steady drift."""
+    amplitude_m, drift_mps = SMALL_KINDS[kind]
+    random = np.random.default_rng([number, 8])
+    directions = random.standard_normal((2, 3)) * (1.0, 1.0, 0.5)
+    shake, drift = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    t = np.arange(round(SMALL_S / PERIOD_S)) * PERIOD_S
+    rise = np.clip(t / SMALL_RISE_S, 0.0, 1.0)
+    rise = rise**2 * (3 - 2 * rise)
+    gone = np.cumsum(drift_mps * rise) * PERIOD_S
+    way = (gone - gone[-1] / 2)[:, None] * drift + (amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t))[
+        :, None
+    ] * shake
+    truth = np.tile(middle, (len(t), 1))
+    truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += way
+    stamps = np.arange(0.0, t[-1], 0.01)
+    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
+    samples += 0.0005 * random.standard_normal(samples.shape)
+    return Moving(f"{kind}, {rate_hz:g} Hz", "small motion", truth, stamps, samples)

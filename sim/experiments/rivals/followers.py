@@ -124,7 +124,7 @@ class _Chain:
             q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
             tool[k], joints[k] = self.arm.at(q).position, dq
             limited += wanted.speed_limited
-        return _followed(tool, joints, limited)
+        return _followed(tool, joints, limited)._replace(setpoint=setpoints[:, 0])
 
 
 def _followed(tool: Array, joints: Array, limited: int) -> Followed:

@@ -1,0 +1,151 @@
+"""Jumps of a tracker are found in made hands whose truth is known, and quick motion is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim.experiments.gains import gain
+from sim.experiments.people.moving_hands import SMALL_KINDS, recorded, small_motion, tracker_kind
+from sim.experiments.people.tracker_jumps import exchanged_samples, noise_std_m, repair
+from sim.experiments.results import Array
+
+WAY = np.array([0.6, 0.64, 0.48])
+TRACKERS = {"24 Hz": (24.0, 0.0002), "30 Hz": (30.0, 0.002), "120 Hz": (120.0, 0.0003)}  # rate, noise [m]
+Position = Callable[[Array], Array]
+
+
+def eased(u: Array) -> Array:
+    """A minimum-jerk reach of length 1 within u from 0 to 1."""
+    u = np.clip(u, 0.0, 1.0)
+    return np.asarray(u**3 * (10 - 15 * u + 6 * u * u))
+
+
+def reach(length_m: float, speed_mps: float) -> Position:
+    return lambda t: length_m * eased(t * speed_mps / (1.875 * length_m))
+
+
+def out_and_back(length_m: float, speed_mps: float) -> Position:
+    lasts_s = 1.875 * length_m / speed_mps
+    return lambda t: length_m * (eased(t / lasts_s) - eased(t / lasts_s - 1))
+
+
+PATHS: dict[str, Position] = {
+    "rest": np.zeros_like,
+    "reach at 1 m/s": reach(0.5, 1.0),
+    "reach at 2 m/s": reach(0.5, 2.0),
+    "short reach at 2 m/s": reach(0.2, 2.0),
+    "out and back at 2 m/s": out_and_back(0.3, 2.0),
+    "flick": out_and_back(0.05, 1.0),
+    "tremor": lambda t: 0.002 * np.sin(2 * np.pi * 8 * t),
+    "shaking": lambda t: 0.02 * (1 - np.cos(2 * np.pi * 4 * np.clip(t, 0, 1))),
+}
+
+
+def hands(path: Position, tracker: str, seed: int) -> tuple[Array, Array, Array]:
+    """Times, the true hands, and the samples of a tracker that makes no mistake. The right hand
+    rests 0.3 m beside the left one.
+    """
+    rate_hz, noise_m = TRACKERS[tracker]
+    random = np.random.default_rng(seed)
+    t = np.arange(-0.45, 0.9, 1 / rate_hz) + random.uniform(0, 1 / rate_hz)
+    true = np.hstack([path(t)[:, None] * WAY, np.tile([0.0, -0.3, 0.0], (len(t), 1))])
+    return t, true, true + noise_m * random.standard_normal(true.shape)
+
+
+def off_mm(found: Array, true: Array) -> float:
+    """The largest distance of a hand from its truth."""
+    return 1000 * float(np.linalg.norm((found - true).reshape(-1, 2, 3), axis=2).max())
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+@pytest.mark.parametrize("name", PATHS)
+def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
+    for seed in range(2):
+        t, _, seen = hands(PATHS[name], tracker, seed)
+        found = repair(t, seen)
+        assert not found.wrong.any()
+        assert not found.exchanged.any()
+        np.testing.assert_array_equal(found.hands, seen)
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+@pytest.mark.parametrize("name", ["rest", "reach at 1 m/s", "reach at 2 m/s"])
+@pytest.mark.parametrize("offsets_mm", [(60,), (68, 80), (70, 70, 70), (70, 70, 70, 70, 70), (150, -60, 90)])
+def test_jumps_are_taken_out_of_the_truth(name: str, tracker: str, offsets_mm: tuple[int, ...]) -> None:
+    for seed, begin_s in enumerate((-0.1, 0.2)):
+        t, true, seen = hands(PATHS[name], tracker, seed)
+        begin, clean_mm = int(np.searchsorted(t, begin_s)), off_mm(seen, true)
+        run = slice(begin, begin + len(offsets_mm))
+        seen[run, :3] += np.array(offsets_mm)[:, None] / 1000 * np.array([0.0, -0.8, 0.6])
+        found = repair(t, seen)
+        wrong = np.zeros((len(t), 2), bool)
+        wrong[run, 0] = True
+        np.testing.assert_array_equal(found.wrong, wrong)
+        # A quarter of a second of a reach at 2 m/s that nobody has seen is known to 14 mm.
+        assert off_mm(found.hands, true) < clean_mm + (14 if t[run][-1] - t[run][0] > 0.12 else 5)
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+@pytest.mark.parametrize("samples", [1, 3, 5, 15])
+def test_exchanged_hands_are_put_right(samples: int, tracker: str) -> None:
+    t, true, seen = hands(PATHS["reach at 2 m/s"], tracker, seed=5)
+    begin, clean_mm = int(np.searchsorted(t, 0.1)), off_mm(seen, true)
+    run = slice(begin, begin + samples)
+    seen[run] = np.roll(seen[run], 3, axis=1)
+    found = repair(t, seen)
+    assert np.flatnonzero(found.exchanged).tolist() == list(range(len(t)))[run]
+    assert not found.wrong.any()
+    assert off_mm(found.hands, true) == pytest.approx(clean_mm)
+
+
+def test_hands_that_pass_each_other_are_not_exchanged() -> None:
+    t = np.arange(0.0, 1.0, 1 / 30)
+    left = 0.3 * eased(t / 0.4)
+    passing = np.stack([left, 0 * t, 0 * t, 0.3 - left, 0 * t + 0.03, 0 * t], axis=1)
+    assert not exchanged_samples(t, passing).any()
+
+
+def test_the_noise_of_a_tracker_is_found_in_quick_motion_and_names_its_kind() -> None:
+    kinds: dict[str, NDArray[np.str_] | str] = {}
+    for tracker, (rate_hz, noise_m) in TRACKERS.items():
+        _, _, seen = hands(PATHS["reach at 2 m/s"], tracker, seed=1)
+        assert noise_std_m(seen[:, :3]) == pytest.approx(noise_m, rel=0.4, abs=0.0001)
+        kinds[tracker] = tracker_kind(rate_hz, seen)
+    assert kinds == {"24 Hz": "motion capture", "30 Hz": "camera", "120 Hz": "motion capture"}
+    noisy = hands(PATHS["rest"], "30 Hz", seed=2)[2]
+    assert tracker_kind(200, noisy) == "other"
+
+
+def test_both_truths_of_a_recording_are_kept_and_cleanly_tracked_hands_have_no_jumps(tmp_path: Path) -> None:
+    t, _, seen = hands(PATHS["reach at 1 m/s"], "30 Hz", seed=3)
+    begin = int(np.searchsorted(t, 0.1))
+    seen[begin : begin + 3, 2] += 0.08
+    np.savez(tmp_path / "someone_1.npz", time_s=t, left=seen[:, :3], right=seen[:, 3:])
+    found = {one.group: one for one in recorded(tmp_path, np.zeros(6))}
+    as_recorded = found["recorded"]
+    assert as_recorded.jumping is not None
+    assert as_recorded.tracker == "camera"
+    np.testing.assert_array_equal(as_recorded.truth, found["clean"].truth)
+    off = np.linalg.norm(as_recorded.jumping - as_recorded.truth, axis=1)
+    assert 0.03 < off.max() < 0.08  # low-passed
+    assert off[:50].max() < 0.01
+    clean = found["clean"]
+    at = np.round(clean.stamps / 0.002).astype(int)
+    assert np.abs(clean.samples - clean.truth[np.minimum(at, len(clean.truth) - 1)]).max() < 0.005
+
+
+@pytest.mark.parametrize("kind", SMALL_KINDS)
+def test_the_gain_of_small_motion_is_found_beside_its_drift(kind: str) -> None:
+    for number, rate_hz in enumerate((1.0, 5.0, 12.0)):
+        small = small_motion(np.zeros(6), kind, rate_hz, number)
+        still = small_motion(np.zeros(6), kind, 0.0, number)
+        hand = slice(3 * (number % 2), 3 * (number % 2) + 3)
+        shaken, drift = small.truth[:, hand], still.truth[:, hand]
+        late = np.roll(shaken - drift, round(0.1 / rate_hz / 0.002), axis=0)
+        assert np.abs(shaken - drift).max() <= SMALL_KINDS[kind][0]
+        assert gain(shaken, 1.7 * late + drift, rate_hz) == pytest.approx(1.7, rel=0.02)
