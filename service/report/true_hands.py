@@ -190,13 +190,12 @@ def _track(side: str, ticks: Iterable[Tick], period_s: float) -> Track:
     kept = [i for i, one in enumerate(frames) if one == frame]
     came = np.array([arrived[i] for i in kept])
     stamped = np.array([poses[i].stamp_ns for i in kept], np.int64)
-    rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept]).reshape(-1, 7)
     times = came
     if kept and stamped.min() > 0:
         since_first = (stamped - stamped[0]) / 1e9
-        least, most = np.percentile(came - since_first, (1, 95))
-        if most - least < DELAY_SPREAD_S:
-            is_wrong = np.abs(came - since_first - least) > DELAY_SPREAD_S  # its stamp is: it is not trusted
-            times, rows[is_wrong] = np.where(is_wrong, came, since_first + least), np.nan
+        delays = came - since_first
+        least, most = np.percentile(delays, (1, 95))
+        times = since_first + least if most - least < DELAY_SPREAD_S else came
     stamps, first = np.unique(np.round(1e9 * times).astype(np.int64), return_index=True)
+    rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept]).reshape(-1, 7)
     return Track(f"hands/{side}", side, stamps, stamps, rows[first], frame)

@@ -174,7 +174,7 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
         return found
     begun = round(BEGUN_S / PERIOD_S)
     off = seen.tool[begun:] - targets(skill, hands.jumping[begun:], settings)
-    return replace(found, error_with_jumps_mm=1000 * _rms(off))
+    return replace(found, error_with_jumps_mm=1000 * rms(off))
 
 
 def measure_gain(task: tuple[str, str, float, int]) -> list[float]:

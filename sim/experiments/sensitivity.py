@@ -76,11 +76,11 @@ SLOW_MPS, APART_M = 0.005, 0.04  # speed of a slow hand; distance between the po
 UNSEEN_S, TWO_S = (2.0, 0.3), (3.0, 1.0)  # middle and length of the time without one hand, and with two sources
 BURSTS, BURST, BURST_M = 4, (1, 5), (0.05, 0.4)  # bursts of outliers: how many, of how many samples, how far away
 EXCHANGED_S = (3.0, 0.3)  # middle and length of the time in which the tracker takes each hand for the other one
-RATE_HZ, RESTING_S = 250, 8.0  # of the sessions with resting hands
+RATE_HZ, RESTING_HANDS_S = 250, 8.0  # of the sessions with resting hands
 CLOSED_M = 0.06  # half size of a box around a target, which the tool then does not reach
 DETOUR_RAD = 0.15  # a way out goes so far aside at each joint
 INSIDE_M = 0.005  # distance of a box and the arm, inside of the clearance
-IMPLAUSIBLE_S, EVERY = 8.0, 7  # length of the session, and one of how many samples is implausible
+IMPLAUSIBLE_S, IMPLAUSIBLE_EACH = 8.0, 7  # length of the session, and one of how many samples is implausible
 TREMBLE_RAD, TREMBLE_S = 0.05, 2.0  # an arm trembles by this at first; until when, ever less
 JOINTS_OFF_RAD, JOINTS_RADPS = (0.05, 0.6), (20.0, 300.0)  # of implausible joint states
 FAR_M, SECOND_M, SCATTER_M = (1.5, 12.0), (0.008, 0.03), (0.0, 0.01)  # hands far away; a second source, and its scatter
@@ -563,7 +563,7 @@ def sessions() -> dict[str, Session]:
         drift, ready = random.uniform(0.0, FAST_CLOCK), 0
         for k in range(1, round(IMPLAUSIBLE_S * RATE_HZ)):
             now_s = k / RATE_HZ
-            stamp_ns, is_odd = START_NS + round(1e9 * now_s), random.integers(EVERY) == 0
+            stamp_ns, is_odd = START_NS + round(1e9 * now_s), random.integers(IMPLAUSIBLE_EACH) == 0
             at = joints + max(0.0, 1.0 - now_s / TREMBLE_S) * TREMBLE_RAD * random.uniform(-1.0, 1.0, len(joints))
             rates = np.zeros(len(joints))
             if is_odd and TREMBLE_S < now_s < IMPLAUSIBLE_S / 2:
@@ -611,7 +611,7 @@ def sessions() -> dict[str, Session]:
         aside, frames = random.uniform(-DETOUR_RAD, DETOUR_RAD, len(settings.joints.names)), []
         events: tuple[Event, ...] = ()
         began = ended = 0
-        for k in range(1, round(RESTING_S * RATE_HZ)):
+        for k in range(1, round(RESTING_HANDS_S * RATE_HZ)):
             frames.append(at_hands(controller, hands, k, *events))
             state, events = controller.state, ()
             if not began and state["stuck"]:
@@ -647,7 +647,7 @@ def sessions() -> dict[str, Session]:
             clear_m = Separation(with_box(middle_m), urdf).clearance(joints.copy(), hands.reshape(2, 3))[0]
             near_m, far_m = (middle_m, far_m) if clear_m < INSIDE_M else (near_m, middle_m)
         controller = Controller(with_box(far_m), skill, urdf=urdf)
-        found = np.array([at_hands(controller, hands, k) for k in range(1, round(RATE_HZ * RESTING_S / 2))])
+        found = np.array([at_hands(controller, hands, k) for k in range(1, round(RATE_HZ * RESTING_HANDS_S / 2))])
         moved = np.linalg.norm(found["tool"] - tool, axis=1)
         return {
             "moved_mm": 1000 * float(moved[-1]),
