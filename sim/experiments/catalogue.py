@@ -137,6 +137,7 @@ _SENSITIVITY = Seeds(  # four seeds of each session
         "shown": Stream("demonstration", 2, range(1, 5)),
         "resting": Stream("resting hands", 7, range(4)),
         "implausible": Stream("implausible samples", 8, range(4)),
+        "timed": Stream("timetable", 9, range(4)),
     },
     learned=_SHIPPED,
 )

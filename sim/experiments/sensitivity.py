@@ -80,6 +80,9 @@ RATE_HZ, RESTING_HANDS_S = 250, 8.0  # of the sessions with resting hands
 CLOSED_M = 0.06  # half size of a box around a target, which the tool then does not reach
 DETOUR_RAD = 0.15  # a way out goes so far aside at each joint
 INSIDE_M = 0.005  # distance of a box and the arm, inside of the clearance
+LOST_S = {"briefly": (2.0, 0.75), "for long": (2.0, 1.5)}  # middle and length of the time without one hand
+TIMETABLE_S, SHOWN_HZ, SHOWN = 3.0, 100, 6  # a tool's way after a hand has begun; rate and number of demonstrations
+REST_S, HANDS_S = (0.5, 1.0), (1.5, 4.0)  # hands rest at first, and then move for so long
 IMPLAUSIBLE_S, IMPLAUSIBLE_EACH = 8.0, 7  # length of the session, and one of how many samples is implausible
 TREMBLE_RAD, TREMBLE_S = 0.05, 2.0  # an arm trembles by this at first; until when, ever less
 JOINTS_OFF_RAD, JOINTS_RADPS = (0.05, 0.6), (20.0, 300.0)  # of implausible joint states
@@ -326,6 +329,7 @@ def sessions() -> dict[str, Session]:
     from service.files.recording import Recording
     from service.files.replay import ticks
     from service.files.shipped import recordings, shipped_skill
+    from service.learning.demonstration import Demonstration
     from service.learning.learn import learn
     from service.learning.skill_file import decoded
     from service.learning.via_points import adapted
@@ -506,6 +510,41 @@ def sessions() -> dict[str, Session]:
         found = summary([judged(one, predicted(skill, one)) for one in seen])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
 
+    def lost(seed: int) -> dict[str, float]:
+        """One hand out of sight for a time after which the tool engages anew or goes on."""
+        hands, out = person(seed)[0], []
+        for name, (middle_s, lasts_s) in LOST_S.items():
+            late = np.zeros((len(hands.stamps), 2))
+            late[np.abs(hands.stamps - middle_s) < lasts_s / 2, seed % 2] = np.inf
+            out.append(replaced(hands, group=name, late=late))
+        return follow(out, names, Settings())
+
+    def timed(seed: int) -> dict[str, float]:
+        """A skill with a clock, for a tool that moves by a timetable once a hand has begun."""
+        random, skill = np.random.default_rng([streams["timed"].seed, seed]), shipped_skill()
+        start, times = skill.hands[0], np.arange(0.0, REST_S[1] + HANDS_S[1], 1 / SHOWN_HZ)
+        way, aside = np.array([0.0, 0.2, 0.1, 0.0, -0.1, 0.1]), np.array([0.1, 0.3, -0.1])
+
+        def gone(since_s: Array, lasts_s: float) -> Array:
+            share = np.clip(since_s / lasts_s, 0.0, 1.0)[:, None]
+            return np.asarray(share**3 * (10 - 15 * share + 6 * share**2))
+
+        def shown() -> Demonstration:
+            since_s = times - random.uniform(*REST_S)
+            hands = start + random.normal(0.0, 0.01, 6) + gone(since_s, random.uniform(*HANDS_S)) * way
+            hands += NOISE_M * random.standard_normal(hands.shape)
+            tool = skill.mean(start[None]) + gone(since_s, TIMETABLE_S) * aside
+            turn = np.tile(skill.orientation, (len(tool), 1))
+            left, right, tool = (np.hstack([x, turn]) for x in (hands[:, :3], hands[:, 3:], tool))
+            return Demonstration(START_NS + np.round(1e9 * times).astype(np.int64), left, right, tool)
+
+        learned = learn([shown() for _ in range(SHOWN)])
+        asked = [left_out("", "", shown())]
+        found = summary([judged(one, predicted(learned, one)) for one in asked])
+        return {name: float(found[name] or 0.0) for name in ("rms_mm", "worst_mm")} | {
+            "has_clock": float(learned.model.clock_rows is not None)
+        }
+
     def gripper(seed: int) -> dict[str, float]:
         """The nominal scene with a skill that opens and closes the gripper."""
         stream = streams["shown"]
@@ -685,6 +724,8 @@ def sessions() -> dict[str, Session]:
         "partners": partners,
         "untold": untold,
         "turned": turned,
+        "lost": lost,
+        "timed": timed,
         "gripper": gripper,
         "pulled": pulled,
         "implausible": implausible,
