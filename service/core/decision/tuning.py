@@ -7,7 +7,7 @@ line follows from others.
 
 from __future__ import annotations
 
-from service.core.intake.tuning import ARM_STILL_RAD
+from service.core.intake.tuning import ARM_STILL_RAD, JOINT_JUMP_RAD
 
 # The arm.
 # 0.03 to 0.5. More: a return is fast. Less: a return takes long.
@@ -40,6 +40,5 @@ WAY_RADPS = 1.2  # largest speed of the busiest joint
 WAY_MPS = 0.4  # largest speed of the tool, low because the person does not command this motion
 # 1 to 20. More: postures are approached fast. Less: postures are approached softly.
 WAY_GAIN_PER_S = 4.0  # [1/s] approach to each posture
-# 0.1 to 1. More: paths begin with a detour. Less: late paths are dropped.
-WAY_START_RAD = 0.3  # a way that begins farther from the arm than this is not taken
+WAY_START_RAD = JOINT_JUMP_RAD  # a way that begins farther from the arm than this is not taken
 WAY_NEAR_RAD = ARM_STILL_RAD  # a posture this near is reached; an arm at rest may be as far off

@@ -24,11 +24,10 @@ PLANNED_REACTION_S = 0.02  # smallest reaction time that is planned with; joints
 # Inside of a clearance.
 # 1 to 20. More: the arm returns faster. Less: the arm returns softly.
 CLEARANCE_GAIN_PER_S = 5.0  # [1/s] planned speed / distance left to the clearance; negative inside
-# 0.02 to 0.5. More: fewer postures return. Less: joints are strained.
-RETREAT_AUTHORITY_MPS = 0.1  # a part returns only if the joints can move it at this speed
 # 2e-3 to 0.05. More: the rule is exceeded more. Less: the arm stops for rounding.
 SLIP_SPEED_MPS = 0.01  # excess that is tolerated, as joints do not all reach their velocities at the same time
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # largest speed of the return to the clearance
+RETREAT_AUTHORITY_MPS = 5.0 * RETREAT_SPEED_MPS  # a part returns only if the joints, unstrained, can move it at this
 # 1e-4 to 5e-3. More: excess is allowed deeper inside. Less: the arm stops for rounding.
 SLIP_DEPTH_M = 0.0005  # inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this depth
 
