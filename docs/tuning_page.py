@@ -37,6 +37,8 @@ The sessions are short, so that all numbers can be measured in some hours. A num
 matter there may still matter in a rare situation: look for tests of it before you remove it.
 """
 
+UNREAD, UNCHANGED = "no session reads it", "nothing changes"
+
 
 class NumberText(NamedTuple):
     """The comments of a number: what it is, its range, and what more and less of it do."""
@@ -68,11 +70,16 @@ def page() -> str:
     result = result_of(RESULTS, "sensitivity") or {"tuned": {}, "numbers": {}}
     known, rows = tuning().numbers, result["numbers"]
     measured = {key: rows[key] for key in known if key in rows}
-    unread = sum(not any(found["figures"] for found in row["changed"].values()) for row in measured.values())
+    found = [_measured(row, result["tuned"]) for row in measured.values()]
     why = staleness("sensitivity", result, tree()) if measured else ""
-    state = f"{len(measured)} of {len(known)} numbers have been measured; no session reads {unread} of these."
+    state = (
+        f"{len(measured)} of {len(known)} numbers have been measured. {found.count(UNREAD)} of these are read in no "
+        f"session, and {found.count(UNCHANGED)} change no figure: they matter in rarer situations, or beyond twice or "
+        "half of their value."
+    )
     if why:
-        state = textwrap.fill(f"{state} *Measured with an earlier version: {why}.*", 100, break_long_words=False)
+        state += f" *Measured with an earlier version: {why}.*"
+    state = textwrap.fill(state, 100, break_long_words=False)
     head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
     return head + "".join(
         part
@@ -109,10 +116,10 @@ def _measured(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> str:
     """The largest change by a number, in words."""
     most = max(effects(row, tuned), default=None)
     if most is None:
-        return "no session reads it"
+        return UNREAD
     times, factor, figure, change = most
     if change == 0:
-        return "nothing changes"
+        return UNCHANGED
     return f"×{factor}: {figure} {change:+.3g}, {times:.1f} times the noise"
 
 
