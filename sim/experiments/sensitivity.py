@@ -82,7 +82,7 @@ DETOUR_RAD = 0.15  # a way out goes so far aside at each joint
 INSIDE_M = 0.005  # distance of a box and the arm, inside of the clearance
 LOST_S = {"briefly": (2.0, 0.75), "for long": (2.0, 1.5)}  # middle and length of the time without one hand
 TIMETABLE_S, SHOWN_HZ, SHOWN = 3.0, 100, 6  # a tool's way after a hand has begun; rate and number of demonstrations
-REST_S, HANDS_S = (0.5, 1.0), (1.5, 4.0)  # hands rest at first, and then move for so long
+TIMED_REST_S, TIMED_HANDS_S = (0.5, 1.0), (1.5, 4.0)  # hands rest at first, and then move for so long
 IMPLAUSIBLE_S, IMPLAUSIBLE_EACH = 8.0, 7  # length of the session, and one of how many samples is implausible
 TREMBLE_RAD, TREMBLE_S = 0.05, 2.0  # an arm trembles by this at first; until when, ever less
 JOINTS_OFF_RAD, JOINTS_RADPS = (0.05, 0.6), (20.0, 300.0)  # of implausible joint states
@@ -522,7 +522,7 @@ def sessions() -> dict[str, Session]:
     def timed(seed: int) -> dict[str, float]:
         """A skill with a clock, for a tool that moves by a timetable once a hand has begun."""
         random, skill = np.random.default_rng([streams["timed"].seed, seed]), shipped_skill()
-        start, times = skill.hands[0], np.arange(0.0, REST_S[1] + HANDS_S[1], 1 / SHOWN_HZ)
+        start, times = skill.hands[0], np.arange(0.0, TIMED_REST_S[1] + TIMED_HANDS_S[1], 1 / SHOWN_HZ)
         way, aside = np.array([0.0, 0.2, 0.1, 0.0, -0.1, 0.1]), np.array([0.1, 0.3, -0.1])
 
         def gone(since_s: Array, lasts_s: float) -> Array:
@@ -530,8 +530,8 @@ def sessions() -> dict[str, Session]:
             return np.asarray(share**3 * (10 - 15 * share + 6 * share**2))
 
         def shown() -> Demonstration:
-            since_s = times - random.uniform(*REST_S)
-            hands = start + random.normal(0.0, 0.01, 6) + gone(since_s, random.uniform(*HANDS_S)) * way
+            since_s = times - random.uniform(*TIMED_REST_S)
+            hands = start + random.normal(0.0, 0.01, 6) + gone(since_s, random.uniform(*TIMED_HANDS_S)) * way
             hands += NOISE_M * random.standard_normal(hands.shape)
             tool = skill.mean(start[None]) + gone(since_s, TIMETABLE_S) * aside
             turn = np.tile(skill.orientation, (len(tool), 1))
