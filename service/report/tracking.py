@@ -98,8 +98,8 @@ def lag_ms(target: Vector, tool: Vector, period_s: float, judged: NDArray[np.boo
 
 
 def overshoots(target: Vector, tool: Vector, period_s: float, judged: NDArray[np.bool_]) -> Vector:
-    """How far the tool passes each stop of the target (S,) [m], in the direction of its last
-    motion.
+    """The distance by which the tool passes each stop of the target (S,) [m], along the target's
+    last motion.
     """
     speed = np.linalg.norm(derivative(target, period_s, order=1), axis=1)
     braking, resting = round(BRAKING_S / period_s), round(RESTING_S / period_s)

@@ -498,17 +498,17 @@ def sessions() -> dict[str, Session]:
         found = summary([judged(one, predicted(at, one)) for one, at in zip(seen, there, strict=True)])
         return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "held", "unsure")}
 
-    def untold(seed: int) -> dict[str, float]:
-        """A skill of both hands and their memory, for a task without named via-points."""
-        skill, seen = taught_by_two(UNTOLD_KIND, streams["untold"], seed, named=False)
-        found = summary([judged(one, predicted(skill, one)) for one in seen])
-        return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
+    def untold(kind: str, stream: Stream) -> Session:
+        """A skill of both hands, with their memory or orientation, for a task without named
+        via-points.
+        """
 
-    def turned(seed: int) -> dict[str, float]:
-        """A skill of both hands and their orientation, for a tool that turns with a hand."""
-        skill, seen = taught_by_two(TURNED_KIND, streams["turned"], seed, named=False)
-        found = summary([judged(one, predicted(skill, one)) for one in seen])
-        return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
+        def run_one(seed: int) -> dict[str, float]:
+            skill, seen = taught_by_two(kind, stream, seed, named=False)
+            found = summary([judged(one, predicted(skill, one)) for one in seen])
+            return {name: float(found[name] or 0.0) for name in ("rms_mm", "shifted_rms_mm", "worst_mm", "unsure")}
+
+        return run_one
 
     def lost(seed: int) -> dict[str, float]:
         """One hand out of sight for a time after which the tool engages anew or goes on."""
@@ -560,7 +560,7 @@ def sessions() -> dict[str, Session]:
         }
 
     def pulled(seed: int) -> dict[str, float]:
-        """How far one more via-point moves the target, by the hands' distance from its own."""
+        """How far another via-point moves the target of hands at some distances from it."""
         random, scene = np.random.default_rng([streams["resting"].seed, seed]), Scene()
         skill = reached.taught(shipped_skill(), scene.via_points())
         hands = skill.hands[seed % len(skill.hands)] + random.uniform(-0.1, 0.1, 6)
@@ -594,7 +594,7 @@ def sessions() -> dict[str, Session]:
         """An arm that trembles less and less, joint states and hands that cannot be, a second
         source, and a tracker whose clock is too fast.
         """
-        settings, skill, middle_of, random = resting(seed, source="state")
+        settings, skill, middle_of, _ = resting(seed, source="state")
         random = np.random.default_rng([streams["implausible"].seed, seed])
         controller = Controller(settings, skill, urdf=robot_description(settings))
         joints, names, trusted = np.array(settings.arm.posture), settings.joints.names, 0
@@ -722,8 +722,8 @@ def sessions() -> dict[str, Session]:
         "thrust": scene("thrust"),
         "box": beside_a_box,
         "partners": partners,
-        "untold": untold,
-        "turned": turned,
+        "untold": untold(UNTOLD_KIND, streams["untold"]),
+        "turned": untold(TURNED_KIND, streams["turned"]),
         "lost": lost,
         "timed": timed,
         "gripper": gripper,
