@@ -15,7 +15,7 @@ from kmp import AffineMean
 from service.cli.usage import UsageError, check_writable, places_in, reached
 from service.client import Client, Tracker
 from service.contract import cdr
-from service.contract.explain import ExplainedError, in_words
+from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import Status
@@ -30,12 +30,11 @@ from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.learning.records import Evidence
 from service.learning.residual_risk import LONGEST_NAME, OPTION
-from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
+from service.learning.skill_file import StoredSkill, skill_in
 from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
-from service.settings.file_content import UnusableError, content
 
 COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 
@@ -126,10 +125,7 @@ def _replay_with(args: argparse.Namespace) -> int:
 
 def _refined(path: Path) -> StoredSkill:
     """The skill in a file, whose demonstrations can be read. Raises SkillError."""
-    try:
-        skill = decoded(content(path, LARGEST_FILE), origin=str(path))
-    except (OSError, UnusableError) as error:
-        raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
+    skill = skill_in(path)
     stored_demonstrations(skill)  # before the new ones are read
     return skill
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import Any
+from pathlib import Path
 
 import msgspec
 
 from service.cli.report_command import plain_console, print_table
 from service.cli.usage import UsageError, check_writable
-from service.contract.explain import in_words
 from service.contract.printable import printable
 from service.files.recorded_hands import recorded_hands
 from service.files.shipped import cell_of
-from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
+from service.learning.skill_file import skill_in
 from service.process.progress import progress, say, steps
 from service.report.tables import NONE, Table
 from service.report.variants import CHANGES, JudgedHands, VariantFigures, best, toml, tried
-from service.settings.file_content import UnusableError, content
 
 
 def tune(args: argparse.Namespace) -> int:
@@ -29,7 +27,9 @@ def tune(args: argparse.Namespace) -> int:
         raise UsageError(f"--part {args.part[0]:g} {args.part[1]:g}: two times [s], the first below the second, needed")
     settings = cell_of(args.config) if args.config else None
     part = tuple(args.part) if args.part else None
-    hands = recorded_hands(args.file, settings=settings, skill=_skill(args.skill), part=part)
+    hands = recorded_hands(
+        args.file, settings=settings, skill=skill_in(Path(args.skill)) if args.skill else None, part=part
+    )
     for line in hands.remarks:
         say(line)
     with steps("tuning") as doing:
@@ -60,16 +60,6 @@ def tune(args: argparse.Namespace) -> int:
     if args.plot:
         print(f"picture {printable(str(args.plot))}")
     return 0
-
-
-def _skill(path: Any) -> StoredSkill | None:
-    """The skill in a file; None without a path. Raises SkillError."""
-    if path is None:
-        return None
-    try:
-        return decoded(content(path, LARGEST_FILE), origin=str(path))
-    except (OSError, UnusableError) as error:
-        raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
 
 
 def _hands_table(judged_hands: JudgedHands) -> Table:

@@ -19,17 +19,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.contract.explain import in_words
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.way_out import WayOut
 from service.learning.corrections import Effect, corrected
 from service.learning.reach import beyond_m
-from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill, decoded
+from service.learning.skill_file import SkillError, StoredSkill, decoded, skill_in
 from service.learning.via_points import MAX_GAIN, adapted
 from service.process import child
 from service.settings.config import Settings, robot_description
-from service.settings.file_content import UnusableError, content
 
 MODULE = "service.daemon.skill_worker"
 WORK_TIMEOUT_S = 25.0  # shorter than a client's timeout
@@ -188,10 +186,7 @@ def skill_of(
             decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain
         )
     else:
-        try:
-            skill = decoded(content(source, LARGEST_FILE), origin=str(source))
-        except (OSError, UnusableError) as error:
-            raise SkillError(f"cannot read skill {source}: {in_words(error, named=False)}") from None
+        skill = skill_in(source)
     return prepared(skill)
 
 

@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from kmp import KMP
 from kmp.named_arrays import from_arrays, to_arrays
 from kmp.storage import checksum
-from service.contract.explain import ExplainedError, validated
+from service.contract.explain import ExplainedError, in_words, validated
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import ViaPoint
 from service.core.skill import MAX_SKILL_DISTANCE_M
@@ -32,6 +33,7 @@ from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import MODELS, Skill
 from service.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT
 from service.learning.residual_risk import ResidualRisk
+from service.settings.file_content import UnusableError, content
 
 POSED = 4  # format of a skill with an orientation or a gripper; other skills have their model's formats
 FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
@@ -206,6 +208,14 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
     except Exception as error:  # NumPy does not document what a damaged archive raises
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill
+
+
+def skill_in(path: Path) -> StoredSkill:
+    """The skill in a file. Raises SkillError."""
+    try:
+        return decoded(content(path, LARGEST_FILE), origin=str(path))
+    except (OSError, UnusableError) as error:
+        raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
 
 
 def _regions(numbers: list[float]) -> Regions:
