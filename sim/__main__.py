@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from service.cli.usage import option
+from service.cli.usage import UsageError, add_end_with, end_with, option
 from service.client import client_settings, endpoints, open_session
 from service.contract import requests
 from service.contract.channels import ENDPOINT
@@ -81,6 +81,7 @@ def parser() -> argparse.ArgumentParser:
     dropout = "hide one hand from START of the script for DURATION seconds"
     p.add_argument("--dropout", metavar=("START", "DURATION"), type=float, nargs=2, help=dropout)
     option(p, "--dropout-hand", None, "the hand that --dropout hides", "left", choices=("left", "right"))
+    add_end_with(p)
     return p
 
 
@@ -106,7 +107,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (SceneError, LaunchError, UnreadableError) as error:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
-    except SettingsError as error:
+        if args.end_with is not None:
+            end_with(args.end_with)
+    except (SettingsError, UsageError) as error:
         p.error(str(error))
     from sim.bench import Bench, BenchHands
     from sim.engines import world_of

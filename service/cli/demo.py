@@ -24,7 +24,7 @@ from service.contract.explain import ExplainedError
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
 from service.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
-from service.files.shipped import cell_of
+from service.files.shipped import ARMS, cell_of
 from service.process.child import python
 from service.process.progress import say
 from service.trackers.cell_view import Latest
@@ -33,6 +33,7 @@ from service.trackers.web_server import Address
 
 DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
+MOUSE_RATE_HZ = 100  # at 500 Hz, a browser that draws without a GPU leaves two cores too little for the arm
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
@@ -57,12 +58,13 @@ def demo(args: argparse.Namespace) -> int:
     if args.open and args.mouse is None:
         raise UsageError("--open opens the page of --mouse; --mouse needed with it")
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
+    rate_hz = MOUSE_RATE_HZ if page and args.rate is None and args.arm in ARMS else args.rate
     report = run(
         args.output,
         scene=args.scene,
         arm=args.arm,
         engine=args.engine,
-        rate_hz=args.rate,
+        rate_hz=rate_hz,
         page=page,
         browser=args.open,
         say=say,

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import calibrate_options, record_options
-from service.cli.usage import ARM_HELP, Parser, UsageError, option, reaching, within
+from service.cli.usage import ARM_HELP, Parser, UsageError, add_end_with, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
@@ -37,6 +37,10 @@ RUN_BY = {  # the modules that are not named as their command
 }
 SIM = "Runs the simulated bench: it publishes hands and joint states, and follows commands."
 RATE = "the rate of the control loop (default: the rate in the cell's settings)"
+DEMO_RATE = (
+    "the rate of the control loop (default: the rate in the cell's settings; 100 Hz for a shipped arm with --mouse, "
+    "because a browser without a GPU needs a core for itself)"
+)
 ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
@@ -88,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--arm", "ARM", ARM_HELP, "wam")
     engine = "the physics engine of the bench (default: the first that is installed)"
     c.add_argument("--engine", choices=("pybullet", "mujoco"), help=engine)
-    option(c, "--rate", "HZ", RATE)
+    option(c, "--rate", "HZ", DEMO_RATE)
     mouse = (
         "play the hands yourself, with a mouse or a finger, on a page that is served at this address (default: any "
         "port of this machine)"
@@ -141,7 +145,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
-    option(c, "--end-with", "PID", "stop when this process ends, as after SIGTERM", type=within(int, 1, 2**31 - 1))
+    add_end_with(c)
 
     c = command(
         "play",

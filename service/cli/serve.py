@@ -6,7 +6,6 @@ import argparse
 import gc
 import logging
 import os
-import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from service.cli.usage import UsageError
+from service.cli.usage import UsageError, end_with
 from service.contract.explain import in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
@@ -29,7 +28,7 @@ def serve(args: argparse.Namespace) -> int:
     os.umask(0o077)  # files are private to the user
     _open_standard_streams()
     if args.end_with is not None:
-        _end_with(args.end_with)
+        end_with(args.end_with)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -64,14 +63,6 @@ def serve(args: argparse.Namespace) -> int:
         missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
-
-
-def _end_with(pid: int) -> None:
-    """Send this process SIGTERM when another one ends. Raises UsageError if there is none."""
-    try:
-        child.when_ended(pid, lambda: os.kill(os.getpid(), signal.SIGTERM))
-    except ProcessLookupError:
-        raise UsageError(f"--end-with {pid}: no such process; the number of a running one accepted") from None
 
 
 def _open_standard_streams() -> None:

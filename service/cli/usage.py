@@ -7,6 +7,7 @@ import contextlib
 import difflib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -171,3 +172,19 @@ def added_in(path: Path) -> Add:
 def places_in(path: Path) -> tuple[ViaPoint, ...]:
     """The via-points in a file, see `added_in`. Raises RequestError with the name of the file."""
     return added_in(path).points
+
+
+def add_end_with(parser: argparse.ArgumentParser) -> None:
+    """Add the option of commands that another process runs."""
+    about = "stop when this process ends, as after SIGTERM"
+    option(parser, "--end-with", "PID", about, type=within(int, 1, 2**31 - 1))
+
+
+def end_with(pid: int) -> None:
+    """Send this process SIGTERM when another one ends. Raises UsageError if there is none."""
+    from service.process.child import when_ended
+
+    try:
+        when_ended(pid, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    except ProcessLookupError:
+        raise UsageError(f"--end-with {pid}: no such process; the number of a running one accepted") from None

@@ -101,8 +101,7 @@ def launched(
         f"{described(settings or Settings())}{network}[files]\nrerun = {json.dumps(rerun)}\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
-    ends = ("--end-with", str(os.getpid()))  # also if this process is killed
-    command, environment = python(*program, "serve", "--config", str(config), *ends, *arguments)
+    command, environment = python(*program, "serve", "--config", str(config), *_end_with_this(), *arguments)
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
     with process:
@@ -172,7 +171,7 @@ def played(
     called with its progress, and `begun` with its process. Raises LaunchError.
     """
     at = ("--connect", endpoint, "--cell", "thirdhand")
-    command, environment = python("-m", "sim", *at, "--once", "--output", "-", *arguments)
+    command, environment = python("-m", "sim", *at, *_end_with_this(), "--once", "--output", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     clock = threading.Timer(timeout_s, process.kill)
     clock.start()
@@ -194,6 +193,11 @@ def played(
         process.kill()
         process.communicate()
     return next((line for line in report.splitlines() if line.startswith("{")), "")
+
+
+def _end_with_this() -> tuple[str, str]:
+    """The option by which a command ends with this process, also if this one is killed."""
+    return "--end-with", str(os.getpid())
 
 
 def free_port() -> int:

@@ -146,13 +146,13 @@ def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Pat
 def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals) -> None:
     said = tmp_path / "said"
     process = begun(["demo", "--output", str(tmp_path / "demo")], said)
-    wait_for(lambda: "service at" in said.read_text(), 100)
+    wait_for(lambda: "commands arrive" in said.read_text(), 100)
 
     def services() -> list[bytes]:
         lines = subprocess.run(["ps", "-ewwo", "args"], capture_output=True, check=True).stdout.splitlines()
         return [line for line in lines if str(tmp_path).encode() in line and b"defunct" not in line]
 
-    assert len(services()) == 2  # the demo and its daemon
+    assert len(services()) == 3  # the demo, its daemon and its bench
     process.send_signal(number)
     assert process.wait(60) == (130 if number == signal.SIGINT else -number)
     if number == signal.SIGINT:
