@@ -80,8 +80,8 @@ CONFIRMED_S = 0.02  # successive samples that confirm a jump span at least this 
 SOURCES_APART_M = 0.012  # smallest distance between the positions that two sources report
 # 0.1 to 0.8. More: noise looks like two sources. Less: noisy sources are mixed.
 SOURCE_SPREAD_SHARE = 0.4  # largest scatter of one source's samples / distance between the sources
-# 20 to 200. More: fast hands are spared. Less: fast hands look like two sources.
-TO_AND_FRO_MPS2 = 50.0  # [m/s²] below this acceleration, a single hand could have moved like that
+# [m/s²] below this acceleration, twice that of the strongest tremor, a single hand could have moved like that
+TO_AND_FRO_MPS2 = 2.0 * MAX_TREMOR_M * TREMOR_RATE_PER_S**2
 # 0.1 to 0.5. More: two sources are tolerated longer. Less: outliers hold the arm.
 CONTESTED_ON_SHARE = 0.25  # a source is contested above this share of contradicting samples
 TO_AND_FRO_MAX_SHARE = 2.0 * CONTESTED_ON_SHARE  # alternating samples raise the contested share up to this limit

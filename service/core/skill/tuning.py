@@ -12,8 +12,7 @@ from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS, STILLNESS_LOWPA
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
 # 0.03 to 0.5. More: stages learn apart. Less: stages share more.
 STAGE_DISTANCE = 0.12  # distance between stages as an input: small, as most of what one shows holds in all; learned in
-# 0.1 to 2. More: stages learn apart. Less: stages share more.
-STAGE_DISTANCE_BESIDE = 0.5  # the same for orientation and gripper, which belong to one stage
+STAGE_DISTANCE_BESIDE = 4.0 * STAGE_DISTANCE  # the same for orientation and gripper, which belong to one stage
 # 1 to 10. More: resting hands are drawn to ends. Less: rests on the way count.
 REST_SHARPNESS = 4.0  # exponent n in λⁿ / (λⁿ + (1 - λ)ⁿ) of a hand that rests at an end
 # 0.02 to 0.1. More: resting hands are drawn to ends. Less: rests on the way count.
@@ -87,6 +86,5 @@ CLOCK_LAG_S = STILLNESS_LOWPASS_S  # time constant with which the clock's rate c
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
 GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure
 GRIPPER_CLOSE_ABOVE = 1.0 - GRIPPER_OPEN_BELOW  # the gripper closes above this closure; between both, it does not move
-# 0.1 to 2. More: it acts rarely. Less: it acts often.
-GRIPPER_MOVES_S = 0.5  # within this time after a command it gets no other one
+GRIPPER_MOVES_S = AMBIGUOUS_S  # within this time after a command it gets no other one: stages change meanwhile
 GRIPPER_THERE_M = LEAST_SEGMENT_M  # it moves only if the tool is this near to its target, which is one via-point
