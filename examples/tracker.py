@@ -9,7 +9,7 @@ import contextlib
 import math
 import time
 
-from service.client import Tracker, client_settings
+from thirdhand import Tracker, client_settings
 
 RATE_HZ = 100
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # frame base [m]: x forward from the arm, y to its left, z up

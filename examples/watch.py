@@ -9,7 +9,7 @@ import contextlib
 import math
 import time
 
-from service.client import cells, client_settings
+from thirdhand import cells, client_settings
 
 
 def main(arguments: list[str] | None = None) -> None:

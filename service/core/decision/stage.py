@@ -43,16 +43,18 @@ class Decision:
         self._way_out = WayOut(settings)
         self.measured = (0.0, 0.0)
 
-    def step(self, state: Record, frame: Record, here: Records, known: int, *, gate_m: float, threshold: float) -> int:
-        """Determine mode and reason of this tick from the arm's kinematics `here` (1,) and `known`,
-        flags of `codes.Condition`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if the arm
-        starts.
+    def step(
+        self, state: Record, frame: Record, here: Records, conditions: int, *, gate_m: float, threshold: float
+    ) -> int:
+        """Determine mode and reason of this tick from the arm's kinematics `here` (1,) and the
+        `conditions`, flags of `codes.Condition`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if
+        the arm starts.
 
         `gate_m` [m] is compared with the skill's `threshold` [m]; it is NaN if the skill predicts
         nothing.
         """
         gates = gate_m, threshold
-        starts, error, speed = step(as_array(state), as_array(frame), here, self._parameters, known, *gates)
+        starts, error, speed = step(as_array(state), as_array(frame), here, self._parameters, conditions, *gates)
         frame["mode"], frame["reason"] = state["mode"], state["reason"]
         if error >= 0.0:
             self.measured = error, speed

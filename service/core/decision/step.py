@@ -64,7 +64,7 @@ def step(
     frames: Records,
     heres: Records,
     parameters: Records,
-    known: int,
+    conditions: int,
     gate_m: float,
     threshold: float,
 ) -> tuple[int, float, float]:
@@ -94,29 +94,29 @@ def step(
     state = states[0]
     if state.mode == FAULT:
         return 0, -1.0, -1.0
-    starts, fault, error, speed = _arm(states, heres, parameters, known)
+    starts, fault, error, speed = _arm(states, heres, parameters, conditions)
     if fault != NONE:
         state.mode, state.reason = FAULT, fault
         return starts, error, speed
-    _note_hold(states, known)
-    if known & CONTESTED:
+    _note_hold(states, conditions)
+    if conditions & CONTESTED:
         reason = TWO_SOURCES
-    elif known & ARM_GUIDED and not parameters[0].is_assumed:
+    elif conditions & ARM_GUIDED and not parameters[0].is_assumed:
         reason = GUIDED
-    elif state.arm_ready != READY and not (state.arm_ready == RETURNING and known & CLUTCH_RELEASED):
+    elif state.arm_ready != READY and not (state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED):
         reason = NOT_READY
     elif state.operator_hold:
         reason = OPERATOR
-    elif known & CLUTCH_RELEASED:
+    elif conditions & CLUTCH_RELEASED:
         reason = CLUTCH
     elif math.isnan(gate_m):
-        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not known & ONE_HAND
+        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not conditions & ONE_HAND
         reason = NO_HANDS if unseen else STALE_HAND
-    elif known & sum(UNSEEN) and (known & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
+    elif conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
         reason = STALE_HAND
     else:
         ease = END_SHARE if state.reason == FAR else 1.0
-        reason = FAR if gate_m > ease * threshold else AMBIGUOUS if known & STAGE_AMBIGUOUS else NONE
+        reason = FAR if gate_m > ease * threshold else AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
     if reason == NONE:
         state.stuck = _stuck(states, frames, heres, parameters)
         reason = BLOCKED if state.stuck == HELD else NONE
@@ -127,7 +127,7 @@ def step(
 
 
 @compiled
-def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tuple[int, int, float, float]:
+def _arm(states: Records, heres: Records, parameters: Records, conditions: int) -> tuple[int, int, float, float]:
     """Update the state of the arm: it starts, is no longer ready, or causes a fault. Returns
     STARTS_ASSUMED, STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or
     -1 twice.
@@ -144,7 +144,7 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
     """
-    state, config, heard, inside = states[0], parameters[0], known & ARM_HEARD, known & ARM_INSIDE
+    state, config, heard, inside = states[0], parameters[0], conditions & ARM_HEARD, conditions & ARM_INSIDE
     if config.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
@@ -152,16 +152,16 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
     moving = False
     for joint in range(state.joints.shape[1]):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
-    if known & ARM_GUIDED:
+    if conditions & ARM_GUIDED:
         state.operator_hold, state.arm_ready, state.leaves, state.guided_tick = 1, 0, 0, state.tick
         state.stuck = state.way_count = 0
         return 0 if moving else STARTS_MEASURED, NONE, -1.0, -1.0
     if not state.arm_ready:
         state.stuck = state.way_count = 0
-        if not known & ARM_STILL:
+        if not conditions & ARM_STILL:
             state.leaves = 0
         # Commanded joints that move come to rest first; the reported posture must be constant.
-        if not known & ARM_STILL or moving or (inside and not state.leaves):
+        if not conditions & ARM_STILL or moving or (inside and not state.leaves):
             return 0, NONE, -1.0, -1.0
         state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
         state.slow_tick = state.stuck_tick = state.tick
@@ -186,14 +186,14 @@ def _arm(states: Records, heres: Records, parameters: Records, known: int) -> tu
 
 
 @compiled
-def _note_hold(states: Records, known: int) -> None:
+def _note_hold(states: Records, conditions: int) -> None:
     """Store hands and stage at the start of an operator's hold; its end clears them.
 
     The stage is the most probable one, if its probability is above 1/2.
     """
     state = states[0]
     if state.operator_hold and not state.held:
-        state.held = HELD_SEEN if known & HANDS_KNOWN and not known & sum(UNSEEN) else HELD_UNSEEN
+        state.held = HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
         state.held_tick, state.held_stage = state.tick, -1
         for side in range(2):
             for axis in range(3):

@@ -80,7 +80,7 @@ CONFIRMED_S = 0.02  # successive samples that confirm a jump span at least this 
 SOURCES_APART_M = 0.012  # smallest distance between the positions that two sources report
 # 0.1 to 0.8. More: noise looks like two sources. Less: noisy sources are mixed.
 SOURCE_SPREAD_SHARE = 0.4  # largest scatter of one source's samples / distance between the sources
-# [m/s²] below this acceleration, twice that of the strongest tremor, a single hand could have moved like that
+# [m/s²] below twice the acceleration of the strongest tremor, a single hand may move to and fro
 TO_AND_FRO_MPS2 = 2.0 * MAX_TREMOR_M * TREMOR_RATE_PER_S**2
 # 0.1 to 0.5. More: two sources are tolerated longer. Less: outliers hold the arm.
 CONTESTED_ON_SHARE = 0.25  # a source is contested above this share of contradicting samples

@@ -28,7 +28,8 @@ CLEARANCE_GAIN_PER_S = 5.0  # [1/s] planned speed / distance left to the clearan
 SLIP_SPEED_MPS = 0.01  # excess that is tolerated, as joints do not all reach their velocities at the same time
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # largest speed of the return to the clearance
 RETREAT_AUTHORITY_MPS = 5.0 * RETREAT_SPEED_MPS  # a part returns only if the joints, unstrained, can move it at this
-# Inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this depth: what it slips in a reaction.
+# Inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this depth: the arm
+# slips by as much in a reaction time.
 SLIP_DEPTH_M = SLIP_SPEED_MPS * PLANNED_REACTION_S
 
 # Hands: what may happen until the arm reacts.
