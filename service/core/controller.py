@@ -129,15 +129,15 @@ class Controller:
         Over omitted indices, the hands' motion is extrapolated; the arm moves by one period only.
         """
         state, frame = self._state, self._blank.copy()[0]
-        known = self._take_in(tick, frame)
+        conditions = self._take_in(tick, frame)
         lap("intake")
-        known |= self._alone(frame)
-        unseen = UNSEEN.index(side) if (side := known & sum(UNSEEN)) else None
-        wanted = self._skill.step(state, frame, unseen) if known & HANDS_KNOWN else None
+        conditions |= self._alone(frame)
+        unseen = UNSEEN.index(side) if (side := conditions & sum(UNSEEN)) else None
+        wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
         if wanted is not None:
-            known |= STAGE_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
+            conditions |= STAGE_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
         lap("skill")
-        here = self._decide(frame, known, math.nan if wanted is None else wanted.gate_m)
+        here = self._decide(frame, conditions, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
         self._separation.step(state, frame, here.record)
         lap("separation")
@@ -187,13 +187,13 @@ class Controller:
         self._skill.adopt(self._state, skill)
         self._separation.set_contacts(skill.via_points)
 
-    def _decide(self, frame: Frame, known: int, gate_m: float) -> Kinematics:
+    def _decide(self, frame: Frame, conditions: int, gate_m: float) -> Kinematics:
         """Determine the mode, and start an arm that has become ready. Returns its kinematics."""
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if state["arm_ready"] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            known |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > CAPSULE_EXCESS_M)
-        starts = self.decision.step(state, frame, here.record, known, gate_m=gate_m, threshold=threshold)
+            conditions |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > CAPSULE_EXCESS_M)
+        starts = self.decision.step(state, frame, here.record, conditions, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
         if starts:
