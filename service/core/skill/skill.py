@@ -35,7 +35,7 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
 
     For a position outside, the outward components of velocity and acceleration are removed.
     """
-    if _is_inside(position, box, _numbers(reach)):
+    if is_inside(position, box, reach_of(reach)):
         return Target(position, velocity, acceleration, clamped=False)
     boxed = np.minimum(np.maximum(position, box[0]), box[1])
     inside = boxed == position
@@ -47,14 +47,14 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
 
 
 @functools.cache
-def _numbers(reach: Reach) -> Vector:
-    """Reach (7,) for `_is_inside`: centre, inner and outer radius, least x and z [m]."""
+def reach_of(reach: Reach) -> Vector:
+    """Reach (7,) for `is_inside`: centre, inner and outer radius, least x and z [m]."""
     return np.array([*reach.centre, reach.inner, reach.outer, reach.min_x, reach.min_z])
 
 
 @compiled
-def _is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
-    """True if a position (3,) [m] is inside the box (2, 3) and the reach (7,) of `_numbers`."""
+def is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
+    """True if a position (3,) [m] is inside the box (2, 3) and the reach (7,) of `reach_of`."""
     square = 0.0
     for i in range(3):
         if not box[0, i] <= position[i] <= box[1, i]:

@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from kmp.arrays.immutable import frozen
-from service.core.codes import AMBIGUOUS
-from service.core.frame import Record, Vector, as_array
-from service.core.intake.tuning import END_SHARE
+from service.core.frame import Record, as_array, parameters
 from service.core.numerics import UNPRIMED_DECIDED
 from service.core.skill import ORDER
 from service.core.skill.memory import remember, turn_lag_s
-from service.core.skill.model import REGION_95, Wanted
+from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
-from service.core.skill.skill import NEVER, Skill, clamp
-from service.core.skill.step import calibrate, recent, write
-from service.core.skill.support import error_probability
+from service.core.skill.skill import NEVER, Skill, clamp, reach_of
+from service.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_stage
 from service.core.skill.task_clock import move
-from service.core.skill.tuning import (
-    AMBIGUOUS_PROBABILITY,
-    AMBIGUOUS_S,
-    MEMORY_LAG_S,
-    MEMORY_LONGEST_STEP_S,
-    UNSURE_M,
-)
+from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
 from service.core.skill.unseen import off_m
 from service.settings.config import Settings
-
-NO_STAGE = -1  # stage in a frame while it is not known
 
 
 class SkillStage:
@@ -41,12 +27,23 @@ class SkillStage:
 
     def _take(self, skill: Skill) -> None:
         """Put a skill into force, with the time constant of the hands' memory that it needs."""
-        self.skill, self._ratios = skill, frozen(np.array(skill.regions.ratios))
+        self.skill = skill
         delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
         self._clock, side = skill.model.clock_rows, skill.conductor
         self._sides = np.array([0, 1] if side is None else [side, side])
+        regions = skill.regions
+        self._doubts = regions.alarm > 0.0 and bool(skill.model.names)
+        self._rules = parameters(
+            period_s=self._period_s,
+            workspace=skill.workspace,
+            reach=reach_of(self._reach),
+            scale=regions.scale,
+            std_s=regions.std_s,
+            ratios=regions.ratios,
+            alarm=regions.alarm,
+        )
 
     def adopt(self, state: Record, skill: Skill) -> None:
         """Replace the skill. The belief is kept if the new skill has the same via-points, the
@@ -73,9 +70,7 @@ class SkillStage:
         self._count(state)
         remember(as_array(state), self._period_s, self._lag_s, self._turn_lag_s)
         hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
-        belief = state["stage_belief"]
-        is_new = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0
-        before = None
+        is_new, before = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0, None
         if not is_new:
             before = known, state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
         found = self.skill.predict(
@@ -86,7 +81,7 @@ class SkillStage:
             before=before,
             past=state["memory"],
             turns=state["turns"],
-            belief=belief,
+            belief=state["stage_belief"],
             period_s=self._period_s,
             lead_s=self._lead_s,
             clock=state["task_clock"],
@@ -94,26 +89,15 @@ class SkillStage:
         if is_new:
             state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
             state["closure"], state["known_gate_m"] = found.closure, found.gate_m
-        target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
-        write(frame, found, target)
-        passed_s, state["trail_tick"] = (tick - int(state["trail_tick"])) * self._period_s, tick
-        recent_mps = recent(found.position, passed_s, state["trail"])
-        reach_m = calibrate(found.covariance, recent_mps, *self.skill.regions[:2], frame["covariance"])
+        frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
         off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
-        frame["error_probability"] = error_probability(frame["covariance"], off**2 / REGION_95, self._ratios)
-        ease, alarm = END_SHARE if state["unsure"] else 1.0, self.skill.regions.alarm
-        if alarm > 0.0:
-            if self.skill.model.names:
-                self._doubt_start(state, frame)
-            state["unsure"] = frame["error_probability"] > ease * alarm
-        else:
-            state["unsure"] = math.hypot(reach_m, off) > ease * UNSURE_M
-        frame["closure"] = state["closure"]
-        _tell_stage(belief, frame)
-        most = AMBIGUOUS_PROBABILITY * (END_SHARE if state["reason"] == AMBIGUOUS else 1.0)
-        if found.ambiguity <= most:
-            state["sure_tick"] = tick
-        is_ambiguous = (tick - int(state["sure_tick"])) * self._period_s > AMBIGUOUS_S
+        doubt = self._doubt_of_start(state) if self._doubts else 0.0
+        told = conclude(as_array(state), as_array(frame), self._rules, found[:6], found.closure, off, doubt)
+        target = Target(*found[:3], clamped=bool(told & IS_OUTSIDE))
+        if target.clamped:
+            target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
+            frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
+        is_ambiguous = bool(told & IS_AMBIGUOUS)
         return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
 
     def _count(self, state: Record) -> None:
@@ -126,16 +110,14 @@ class SkillStage:
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
         move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
 
-    def _doubt_start(self, state: Record, frame: Record) -> None:
-        """Add to the error probability that the task did not begin at its first stage."""
+    def _doubt_of_start(self, state: Record) -> float:
+        """Probability that the task did not begin at its first stage."""
         unprimed = state["unprimed_belief"]
         if unprimed[0] == UNPRIMED_DECIDED:
-            return
-        doubt = self.skill.elsewhere(
+            return 0.0
+        return self.skill.elsewhere(
             state["hands"], state["hand_stillness"], self._period_s, state["stage_belief"], unprimed
         )
-        found = frame["error_probability"]
-        frame["error_probability"] = found + (1.0 - found) * doubt
 
     def set_stage(self, state: Record, name: str) -> None:
         """Set the belief to the stage that begins at the via-point of this name (at the last
@@ -150,11 +132,4 @@ class SkillStage:
         state["unsure"], state["sure_tick"] = 0, state["tick"]
         frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
         frame["closure"] = state["closure"]
-        _tell_stage(state["stage_belief"], frame)
-
-
-def _tell_stage(belief: Vector, frame: Record) -> None:
-    """Write the most probable stage and its probability into the frame."""
-    most = int(belief.argmax())
-    frame["stage_belief"] = belief[most]
-    frame["stage"] = most if belief[most] > 0.0 else NO_STAGE
+        tell_stage(as_array(state), as_array(frame))

@@ -1,4 +1,6 @@
-"""Compiled step of the skill: calibrate the prediction's covariance and write it into the frame."""
+"""Compiled step of the skill: calibrate the prediction's covariance, and write what follows from it
+into the state and the frame.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +9,16 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Record, Vector
-from service.core.skill.model import COVARIANCE_ROUND_TO, REGION_95, Target
-from service.core.skill.skill import Prediction
-from service.core.skill.tuning import TRAIL_S
+from service.core.codes import AMBIGUOUS
+from service.core.frame import Records, Vector
+from service.core.intake.tuning import END_SHARE
+from service.core.skill.model import COVARIANCE_ROUND_TO, REGION_95
+from service.core.skill.skill import is_inside
+from service.core.skill.support import error_probability
+from service.core.skill.tuning import AMBIGUOUS_PROBABILITY, AMBIGUOUS_S, TRAIL_S, UNSURE_M
 
-
-def write(frame: Record, found: Prediction, target: Target) -> None:
-    """Write the clamped target, the gate's distance and the orientation into the frame."""
-    frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-    frame["gate_m"] = found.gate_m
-    frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
+NO_STAGE = -1  # stage in a frame while it is not known
+IS_AMBIGUOUS, IS_OUTSIDE = 1, 2  # what `conclude` returns, added
 
 
 @compiled
@@ -56,3 +57,56 @@ def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, 
         half = 0.5 * (a * b * c + 2.0 * d * e * f - a * f * f - b * e * e - c * d * d) / spread**3
         mean += 2.0 * spread * math.cos(math.acos(min(max(half, -1.0), 1.0)) / 3.0)
     return math.sqrt(REGION_95 * max(mean, 0.0))
+
+
+@compiled
+def conclude(
+    states: Records,
+    frames: Records,
+    rules: Records,
+    motion: tuple[Vector, Vector, Vector, Vector, float, float],
+    closure: float,
+    off: float,
+    doubt: float,
+) -> int:
+    """Write a prediction into the frame with its calibrated covariance, the probability of an error
+    p and the most probable stage; update the skill's part of the state.
+
+    `motion` are the first parts of a `Prediction`; `off` [m] is the possible error because a
+    hand is not seen, and `doubt` the probability that the task did not begin at its first stage:
+
+        p = p_C + (1 - p_C) doubt,   p_C = error_probability(C, off² / REGION_95)
+
+    The skill is unsure if p is above its alarm, or without an alarm, if its region reaches farther
+    than UNSURE_M. Returns IS_AMBIGUOUS if the stage has been ambiguous for longer than AMBIGUOUS_S,
+    plus IS_OUTSIDE if the position has to be clamped.
+    """
+    state, frame, rule = states[0], frames[0], rules[0]
+    position, velocity, acceleration, covariance, gate_m, ambiguity = motion
+    frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = position, velocity, acceleration
+    frame.gate_m, frame.closure = gate_m, closure
+    passed_s, state.trail_tick = (state.tick - state.trail_tick) * rule.period_s, state.tick
+    moved = recent(position, passed_s, state.trail)
+    reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
+    found = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
+    frame.error_probability = found + (1.0 - found) * doubt
+    ease = END_SHARE if state.unsure else 1.0
+    if rule.alarm > 0.0:
+        state.unsure = frame.error_probability > ease * rule.alarm
+    else:
+        state.unsure = math.hypot(reach_m, off) > ease * UNSURE_M
+    tell_stage(states, frames)
+    if ambiguity <= AMBIGUOUS_PROBABILITY * (END_SHARE if state.reason == AMBIGUOUS else 1.0):
+        state.sure_tick = state.tick
+    is_ambiguous = (state.tick - state.sure_tick) * rule.period_s > AMBIGUOUS_S
+    inside = is_inside(position, rule.workspace, rule.reach)
+    return (IS_AMBIGUOUS if is_ambiguous else 0) + (0 if inside else IS_OUTSIDE)
+
+
+@compiled
+def tell_stage(states: Records, frames: Records) -> None:
+    """Write the most probable stage and its probability into the frame."""
+    belief, frame = states[0].stage_belief, frames[0]
+    most = belief.argmax()
+    frame.stage_belief = belief[most]
+    frame.stage = most if belief[most] > 0.0 else NO_STAGE
