@@ -35,7 +35,7 @@ def computed():
 
 out = {"tuned": computed()}
 out["marked"] = [key for key, one in known.items() if sensitivity.marks[one.at]]
-for key, factor in (("setpoint.TRACKER_RATE_SHARE", 0.5), ("intake.MODE_VELOCITY_REVERSIONS_PER_S2", 2.0)):
+for key, factor in (("arm.POSITION_GAIN_RATE_SHARE", 0.5), ("intake.MODE_VELOCITY_REVERSIONS_PER_S2", 2.0)):
     one = known[key]
     sensitivity.values[one.at : one.at + one.size] = one.changed(factor)
     out[key] = computed()
@@ -49,12 +49,12 @@ def test_a_number_in_memory_changes_what_reads_it_and_nothing_else() -> None:
     found = json.loads(done.stdout)
     (gains, motion), (other, same), (_, changed) = (
         found["tuned"],
-        found["setpoint.TRACKER_RATE_SHARE"],
+        found["arm.POSITION_GAIN_RATE_SHARE"],
         found["intake.MODE_VELOCITY_REVERSIONS_PER_S2"],
     )
     assert gains != other
     assert motion == same != changed
-    assert {"setpoint.TRACKER_RATE_SHARE", "intake.TREMOR_DAMPING"} <= set(found["marked"])
+    assert {"arm.POSITION_GAIN_RATE_SHARE", "intake.TREMOR_DAMPING"} <= set(found["marked"])
     assert "arm.DAMPING_M2" not in found["marked"]
 
 

@@ -32,7 +32,7 @@ from service.core.limiter.step import (
     step,
     take,
 )
-from service.core.limiter.tuning import CANCELLED_MOTION_SHARE, STOP_SPEED_SHARE
+from service.core.limiter.tuning import STOP_SPEED_SHARE
 from service.core.separation.stage import Separation
 from service.core.stops import stop_together
 from service.settings.config import JointSettings, Settings
@@ -252,15 +252,12 @@ class LimiterStage:
     def _largest_speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
         """Largest speed [m/s] of the tool if the joints stop after the step `moved`.
 
-        The stop is sampled only if the tool may exceed its limit there:
-
-            speed + CANCELLED_MOTION_SHARE total > max_speed
-
-        where total, the sum of the joints' contributions, is at least the speed. All speeds above
-        max_speed / (1 + CANCELLED_MOTION_SHARE), 77 % of the limit, are therefore sampled.
+        The stop is sampled only if the tool could exceed its limit there: if the sum of the joints'
+        contributions to its speed exceeds max_speed. Joints end their accelerations at different
+        times in a stop, so their motions may cancel less of each other.
         """
         _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
         most = self._max_speed
-        if speed <= STOP_SPEED_SHARE * most and speed + CANCELLED_MOTION_SHARE * total > most:
+        if speed <= STOP_SPEED_SHARE * most and total > most:
             return max(float(speed), self._limiter.speed_in_stop(moved, here))
         return float(speed)

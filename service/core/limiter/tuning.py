@@ -11,7 +11,3 @@ from service.core.arm.tuning import TOOL_SPEED_SHARE
 
 # The joints stop when the tool's speed in a stop would exceed this share of max_speed.
 STOP_SPEED_SHARE = 0.5 * (1.0 + TOOL_SPEED_SHARE)  # midway between that of motion to the setpoint and 1
-# Joints end their accelerations at different times in a stop, so their motions cancel less of each
-# other: the tool gains at most this share of the sum of what they contribute (0.16 seen).
-# 0.16 to 1. More: more stops are checked. Less: ticks are cheaper.
-CANCELLED_MOTION_SHARE = 0.3  # share of the joints' contributions that may cancel
