@@ -15,7 +15,6 @@ from kmp.compiled import compiled
 from service.core.arm.least_squares import solve
 from service.core.arm.tuning import (
     IDLE_BRAKE_SHARE,
-    NEAR_LIMIT_RAD,
     POSTURE_GAIN_PER_S,
     POSTURE_SPEED_RADPS,
 )
@@ -37,6 +36,10 @@ def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) 
 
         tasks (5 or 6, J) = (Jv; l R^T Jw)                row 5, if present, is the turn about +z
         damping [m²] = damping0 + singular_damping max(1 - sqrt(det(Jv Jv^T)) / singular_volume, 0)²
+        singular_volume [m³] = sqrt(singular_damping) outer²
+
+    So damping is added when the weakest direction has less of a lever than sqrt(singular_damping),
+    if the two others have that of the outer radius of the reach.
 
     With 5 tasks, the last row of R^T Jw is left out.
     """
@@ -161,7 +164,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     flags, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
     for j in range(joints):
         low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
-        if min(low, high) < NEAR_LIMIT_RAD * arm.per_rad[j]:
+        if min(low, high) < arm.near_limit_rad * arm.per_rad[j]:
             flags |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]

@@ -9,22 +9,21 @@ from __future__ import annotations
 
 import numpy as np
 
-# Costs of the least-squares problem. Lever, dampings in m² and volume are for the WAM's reach, and
-# scale with that of the arm.
+from service.core.separation.tuning import SLIP_SPEED_MPS
+
+# Costs of the least-squares problem. Lever and dampings in m² are for the WAM's reach, and scale
+# with that of the arm.
 # 3e-3 to 0.1. More: orientation is kept better. Less: position is kept better.
 TURN_LEVER_M = 0.0115  # an error of 1 rad/s in the tool's turn costs as much as one of 0.0115 m/s in its velocity
 # 1e-6 to 1e-3. More: joints move less. Less: the tool is more exact.
 DAMPING_M2 = 1e-5  # [m²] cost of joint velocity, (m/s)² of the tool for each (rad/s)²
 # 1e-4 to 0.02. More: joints are calm when stretched. Less: the stretched tool is exact.
-SINGULAR_DAMPING_M2 = 2e-3  # [m²] additional damping at a singular posture
-# 0.01 to 0.1. More: damping begins earlier. Less: damping begins later.
-SINGULAR_VOLUME_M3 = 0.04  # [m³] manipulability below which damping is added; 0.06 to 0.13 over the WAM's table
+SINGULAR_DAMPING_M2 = 2e-3  # [m²] additional damping at a singular posture; it begins where it weighs as much
 # 0 to 20. More: unreachable targets are calm. Less: far targets close faster.
 FAR_DAMPING_S2 = 4.0  # [s²] damping at unreachable targets / (closing speed - half of the largest one)²
 # Speed of the tool that constraints take away, at which half of SINGULAR_DAMPING_M2 is added. Where
 # several constraints leave few directions free, the least motion would change the solution much.
-# 5e-3 to 0.1. More: constrained joints move more. Less: constrained joints are calm.
-CONSTRAINED_SPEED_MPS = 0.02  # speed lost to constraints at which half of SINGULAR_DAMPING_M2 is added
+CONSTRAINED_SPEED_MPS = 2.0 * SLIP_SPEED_MPS  # speed lost to constraints at which half of SINGULAR_DAMPING_M2 is added
 # 0 to 2. More: weak joints move less. Less: all joints move alike.
 SPARING_POWER = 0.8  # weight of a joint's speed = acceleration limit ^ -power: joints with low limits move less
 
@@ -48,9 +47,6 @@ TOOL_SPEED_SHARE = 0.5 * (1.0 + float(PLANNED_LIMIT_SHARES[0]))  # speed of setp
 # The posture, in what is left free.
 # 0.1 to 10. More: the posture is kept closely. Less: the posture may drift.
 POSTURE_GAIN_PER_S = 1.0  # [1/s] pull to the configured posture
-# 0.03 to 1. More: the posture returns faster. Less: idle joints move less.
-POSTURE_SPEED_RADPS = 0.3  # largest speed of this pull, for each joint
+POSTURE_SPEED_RADPS = CLOSING_SPEED_MPS  # [rad/s] largest speed of this pull, for each joint, on a lever of 1 m
 # 0.05 to 1. More: idle motion ends sooner. Less: idle motion ends softly.
 IDLE_BRAKE_SHARE = 0.25  # share of the joints' acceleration for braking motion that does not move the tool
-# 0.02 to 0.3. More: the flag comes earlier. Less: the flag comes later.
-NEAR_LIMIT_RAD = 0.1  # a joint nearer to its limit than this is reported

@@ -8,24 +8,28 @@ import numpy as np
 
 from service.contract import cdr
 from service.core.codes import HELD
-from service.core.decision.tuning import (
-    WAY_GAIN_PER_S,
-    WAY_MPS,
-    WAY_NEAR_RAD,
-    WAY_RADPS,
-    WAY_START_RAD,
-)
+from service.core.decision.tuning import WAY_NEAR_RAD, WAY_SLOW_RAD, WAY_START_RAD
 from service.core.frame import Event, Record, Vector
-from service.settings.config import Settings
+from service.settings.config import PRISMATIC_M, Settings
+
+
+def speeds_of_ways(settings: Settings) -> tuple[float, float]:
+    """Largest speeds of the tool [m/s] and of the busiest joint [rad/s] on a way out.
+
+    The tool has half of `max_speed`, because the person does not command this motion. A joint has
+    the speed that moves the tool as fast on a lever of PRISMATIC_M, or that of the slowest joint.
+    """
+    mps = 0.5 * settings.tool.max_speed
+    slowest = np.array(settings.joints.velocity) / np.array(settings.joints.per_rad)
+    return mps, min(mps / PRISMATIC_M, float(slowest.min()))
 
 
 class WayOut:
     """Way out in the state: postures that the arm approaches one after the other."""
 
     def __init__(self, settings: Settings) -> None:
-        self._mps = min(WAY_MPS, settings.tool.max_speed)
+        self._mps, self._radps = speeds_of_ways(settings)
         self._per_rad = np.array(settings.joints.per_rad)
-        self._radps = min(WAY_RADPS, float((np.array(settings.joints.velocity) / self._per_rad).min()))
 
     def take(self, state: Record, event: Event) -> None:
         """Start on a planned way out, if the tool is still stuck and the way begins within
@@ -44,7 +48,7 @@ class WayOut:
         With the difference d (J,) from the commanded joints, D = max |d_j| / per_rad_j and the
         tool's Jacobian J_p, the first three rows of `tasks`:
 
-            u = d min(radps, WAY_GAIN_PER_S D) / max(D, WAY_NEAR_RAD)
+            u = d radps min(1, D / WAY_SLOW_RAD) / max(D, WAY_NEAR_RAD)
             velocity = u / max(1, |J_p u| / mps)
 
         radps [rad/s] and mps [m/s] are the largest speeds of a joint and of the tool. A posture is
@@ -54,6 +58,6 @@ class WayOut:
             return None
         off: Vector = state["way"][state["way_next"]] - state["joints"][0]
         far = float((np.abs(off) / self._per_rad).max())
-        velocity: Vector = off * (min(self._radps, WAY_GAIN_PER_S * far) / max(far, WAY_NEAR_RAD))
+        velocity: Vector = off * (self._radps * min(1.0, far / WAY_SLOW_RAD) / max(far, WAY_NEAR_RAD))
         state["way_next"] += far < WAY_NEAR_RAD
         return velocity / max(1.0, float(np.linalg.norm(tasks[:3] @ velocity)) / self._mps)

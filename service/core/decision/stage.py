@@ -8,9 +8,9 @@ import numpy as np
 
 from service.contract.records import Reason
 from service.core.codes import AMBIGUOUS, BLOCKED, FAR, FAULT, HOLD, NOT_READY, RETURNING, STALE_HAND
-from service.core.decision.leave import WayOut
+from service.core.decision.leave import WayOut, speeds_of_ways
 from service.core.decision.step import step
-from service.core.decision.tuning import BRIEF_HOLD_S, RETURN_RADPS
+from service.core.decision.tuning import BRIEF_HOLD_S, LONGEST_WAY_RAD, RETURN_RADPS
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
 from service.settings.config import Settings
 
@@ -37,6 +37,7 @@ class Decision:
             max_speed=float(settings.tool.max_speed),
             engaging_speed=float(settings.tool.engaging_speed),
             per_rad=np.array(limits.per_rad),
+            way_timeout_s=LONGEST_WAY_RAD / speeds_of_ways(settings)[1],
         )
         self._brief_ticks = round(BRIEF_HOLD_S / settings.period_s)
         self._return_speed = RETURN_RADPS * np.array(limits.per_rad)

@@ -51,7 +51,6 @@ from service.core.decision.tuning import (
     STUCK_GAP_M,
     STUCK_S,
     TOO_FAST_S,
-    WAY_TIMEOUT_S,
 )
 from service.core.frame import Records, Vector
 from service.core.intake.tuning import END_SHARE
@@ -220,13 +219,13 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
-    WAY_TIMEOUT_S has passed. If no way out was found, it lasts until the target has moved by
+    `way_timeout_s` has passed. If no way out was found, it lasts until the target has moved by
     ANOTHER_TARGET_M.
     """
     state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
     gap, moved = distance(frame.target, tool), distance(frame.target, state.stuck_target)
     passed_s = (state.tick - state.stuck_tick) * config.period_s
-    if state.way_next < state.way_count and passed_s < WAY_TIMEOUT_S:
+    if state.way_next < state.way_count and passed_s < config.way_timeout_s:
         return HELD
     if state.stuck == HELD and not state.way_count and moved < ANOTHER_TARGET_M:
         return HELD

@@ -252,8 +252,9 @@ class LimiterStage:
     def _largest_speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
         """Largest speed [m/s] of the tool if the joints stop after the step `moved`.
 
-        The stop is sampled only if the tool may exceed its limit there: if the sum of the joints'
-        contributions, which cancel less of each other during a stop, exceeds it.
+        The stop is sampled only if the tool could exceed its limit there: if the sum of the joints'
+        contributions to its speed exceeds it. Joints end their accelerations at different times in
+        a stop, so their motions may cancel less of each other.
         """
         _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
         most = self._max_speed

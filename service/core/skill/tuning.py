@@ -21,8 +21,7 @@ SEGMENT_MIDDLE_M = 2.0 * SEGMENT_END_M  # one that rests this far from both ends
 FULL_SEGMENT_M = 3.0 * SEGMENT_MIDDLE_M  # a shorter segment has thirds instead: begin, middle, end
 # 3e-3 to 0.03. More: small motions count as rest. Less: drift counts as a segment.
 LEAST_SEGMENT_M = 0.01  # a hand whose via-points are nearer to each other than this rests
-# 1 to 8. More: the tool joins a hand later. Less: the tool joins a hand sooner.
-WITH_HAND_POWER = 4  # exponent of the share with which the tool moves with a hand to or from a via-point
+WITH_HAND_POWER = int(REST_SHARPNESS)  # exponent of the share with which the tool moves with a hand at a via-point
 # 0.03 to 0.2. More: stages change sooner. Less: stages change later.
 STAGE_END_M = 0.08  # width of the Gaussian around a via-point in which stages change
 # 0.3 to 5. More: stages change and are repeated sooner. Less: they change later.
@@ -42,8 +41,7 @@ DIRECTION_SPEED_MPS = 0.15  # evidence of a direction = tanh(speed along the seg
 LEAST_STAGE_PROBABILITY = 0.01  # a less probable stage is left out; less than 1 / 64, or all of 64 might be
 # 0.1 to 0.5. More: the arm holds less. Less: the arm holds more.
 AMBIGUOUS_PROBABILITY = 0.3  # the skill is ambiguous if the tool belongs elsewhere with this probability
-# 0.1 to 1. More: the arm holds later. Less: transitions hold the arm.
-AMBIGUOUS_S = 0.3  # shorter ambiguity is a transition between stages
+AMBIGUOUS_S = 1.5 * SAMPLE_CORRELATION_S  # shorter ambiguity is a transition between stages
 
 # Errors of the prediction.
 # 0.05 to 1. More: errors are averaged wider. Less: errors are local.
@@ -56,8 +54,7 @@ SUPPORT_MASS = 0.1  # a place is supported where errors of demonstrations weigh 
 SUPPORT_SHARPNESS = 4.0  # sharpness of the kernel of errors / of the primitive's kernel, over the hands' inputs
 # 1e-3 to 0.01. More: the region is larger. Less: the region is smaller.
 LEAST_STD_M = 0.003  # lower limit of the standard deviation on each axis
-# 0.05 to 0.3. More: fewer targets are unsure. Less: more targets are unsure.
-UNSURE_M = 0.10  # a tool farther than this from where it belongs is wrong: it may be at another thing
+UNSURE_M = SEGMENT_MIDDLE_M  # a tool farther than this from where it belongs is wrong: it may be at another thing
 AMBIGUOUS_M = 0.5 * UNSURE_M  # tools of two stages farther apart than this belong to different things
 TRAIL_S = SAMPLE_CORRELATION_S  # mean velocity over this time, by the error of timing, adds to the covariance
 
@@ -65,8 +62,9 @@ TRAIL_S = SAMPLE_CORRELATION_S  # mean velocity over this time, by the error of 
 CALM_MPS = DIRECTION_SPEED_MPS  # a slower hand may tremble: its velocity does not predict its motion
 # 1 to 10. More: targets turn sharply. Less: targets turn softly.
 MAX_TARGET_MPS2 = 3.0  # [m/s²] upper limit of the target's acceleration on each axis
-# 10 to 200. More: via-points act locally. Less: via-points act widely.
-PULL_SHARPNESS_PER_M2 = 50.0  # [1/m²] k: a via-point moves the tool with the weight exp(-k |hands - its hands|²)
+# [1/m²] k: a via-point moves the tool with the weight exp(-k |hands - its hands|²), a Gaussian with
+# the standard deviation SEGMENT_MIDDLE_M
+PULL_SHARPNESS_PER_M2 = 0.5 / SEGMENT_MIDDLE_M**2
 
 # Memory of the hands.
 # 0.2 to 1. More: older motion counts. Less: recent motion counts.
@@ -86,5 +84,5 @@ CLOCK_LAG_S = STILLNESS_LOWPASS_S  # time constant with which the clock's rate c
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
 GRIPPER_OPEN_BELOW = 0.1  # the gripper opens below this closure
 GRIPPER_CLOSE_ABOVE = 1.0 - GRIPPER_OPEN_BELOW  # the gripper closes above this closure; between both, it does not move
-GRIPPER_MOVES_S = AMBIGUOUS_S  # within this time after a command it gets no other one: stages change meanwhile
+GRIPPER_MOVES_S = MEMORY_LAG_S  # within this time after a command it gets no other one
 GRIPPER_THERE_M = LEAST_SEGMENT_M  # it moves only if the tool is this near to its target, which is one via-point
