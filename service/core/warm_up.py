@@ -72,14 +72,15 @@ def _rarely(settings: Settings, urdf: str) -> None:
 
 
 def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
-    """Follow two resting hands for FOLLOWED_TICKS, lose sight of one, and hold."""
+    """Wait for hands, follow two resting ones for FOLLOWED_TICKS, lose sight of one, and hold."""
     controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
     count = still_ticks(settings) + FOLLOWED_TICKS
-    for index in range(count):
+    controller.step(Tick(0))
+    for index in range(1, count):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 0 else []
+        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 1 else []
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         controller.step(Tick(index, (*hands, measured)))
     deviation_m(as_array(controller.state), 0, settings.period_s)  # runs only for a hand out of sight
