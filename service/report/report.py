@@ -24,8 +24,8 @@ from service.report.stages import stages
 from service.report.visits import places
 
 SHARES = (50, 99, 100)
-POSTURES = 200  # limits of the tool are computed at this many postures, at most
-MOVING_MPS = 0.02  # the direction of a slower tool is not judged
+JUDGED_POSTURES = 200  # limits of the tool are computed at this many postures, at most
+DIRECTED_MPS = 0.02  # the direction of a slower tool is not judged
 REACHED_MM = 20.0  # a tool this near has reached its first target
 
 
@@ -274,8 +274,8 @@ def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
     from service.core.tool_limits import tool_limits
 
     speed = np.linalg.norm(following["setpoint_velocity"], axis=1)
-    moving = following[speed > MOVING_MPS]
-    moving = moving[:: -(-len(moving) // POSTURES) or 1]
+    moving = following[speed > DIRECTED_MPS]
+    moving = moving[:: -(-len(moving) // JUDGED_POSTURES) or 1]
     if not len(moving) or not columns.recording.urdf:
         return {}
     settings, velocities = columns.recording.settings, moving["setpoint_velocity"]
