@@ -17,8 +17,12 @@ import numpy as np
 from service.arms.first_posture import first_posture, limit_margins, middle_of_range
 from service.arms.plate import plate_of, turn_of_tool
 from service.arms.rates import RISE_S, rates, velocities
+from service.contract.requests import ANY_DIRECTION, ToolLimits
+from service.core.arm.stage import Arm
+from service.core.geometry import quaternion_of
 from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
+from service.core.tool_limits import limits_of_task, tool_limits
 from service.settings.arm_description import description
 from service.settings.config import Settings, converted, robot_description
 from service.settings.mesh_cover import found_meshes
@@ -59,6 +63,8 @@ class Proposal(NamedTuple):
     """True if the accelerations depend on the URDF's masses and efforts too"""
     unmet: tuple[str, ...]
     """names of DEMO_TOOL_M that are out of reach"""
+    tool_limits: dict[str, ToolLimits]
+    """limits of the tool on the way through DEMO_TOOL_M; if one is out of reach, in the posture"""
 
     @property
     def plate(self) -> str:
@@ -105,6 +111,7 @@ def proposed(
     arm = msgspec.structs.replace(settings.arm, posture=tuple(posture.round(3).tolist()))
     settings = msgspec.structs.replace(settings, arm=arm)
     clearance = Separation(settings, robot).clearance(np.array(arm.posture), np.empty((0, 3)))[0]
+    unmet = tuple(name for name, place in DEMO_TOOL_M.items() if not _is_in(place, shell))
     return Proposal(
         urdf,
         settings,
@@ -118,8 +125,18 @@ def proposed(
         float(limit_margins(np.array(arm.posture), settings).min()),
         tilt,
         efforts,
-        tuple(name for name, place in DEMO_TOOL_M.items() if not _is_in(place, shell)),
+        unmet,
+        _limits(settings, robot, is_demo=not unmet),
     )
+
+
+def _limits(settings: Settings, robot: str, *, is_demo: bool) -> dict[str, ToolLimits]:
+    """Limits of the tool on the way through DEMO_TOOL_M, or in the posture alone."""
+    arm, posture = Arm(settings, robot), np.array(settings.arm.posture)
+    orientation = np.empty(4)
+    quaternion_of(arm.at(posture).rotation, orientation)
+    found = limits_of_task(settings, robot, np.array([*DEMO_TOOL_M.values()]), orientation) if is_demo else {}
+    return found or {ANY_DIRECTION: tool_limits(arm, settings, posture[None])}
 
 
 def _with_reach_of(settings: Settings, workspace: Workspace) -> Settings:

@@ -126,6 +126,11 @@ def text(proposal: Proposal, path: Path) -> str:
         f"{100 * proposal.clearance:.0f} cm from the table and itself, and the nearest limit "
         f"{100 * proposal.margin:.0f} % of half a range away",
     ]
+    where = "in this posture" if proposal.unmet else "where the demo's tool goes"
+    for number, (direction, one) in enumerate(proposal.tool_limits.items()):
+        lines.append(f"  {'' if number else 'can do':<9} {direction}, {where}: {one.text}")
+    allowed = f"{settings.tool.max_speed:g} m/s and {settings.tool.acceleration:g} m/s²"
+    lines.append(f"            [tool] allows {allowed}; a joint in brackets allows less")
     if any(settings.tool.plate_from_tool[3:6]):
         lines.append(
             "  tool      the plate's +z does not point away from the arm: [tool] plate_from_tool turns it, "

@@ -11,6 +11,7 @@ from service.cli.usage import reached
 from service.client import Cell
 from service.client import cells as served_cells
 from service.contract.incidents import in_brief
+from service.contract.requests import ANY_DIRECTION
 
 
 def cells(args: argparse.Namespace) -> int:
@@ -35,4 +36,7 @@ def description(cell: Cell) -> str:
         return f"alive as Zenoh session {cell.session}, but without a status: it is starting, or denies access"
     mode = in_brief(now.mode, now.reason)
     hands = ", ".join(now.hand_age_ms) or "no hands"
-    return f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"
+    limits = f"  tool {now.tool_limits[ANY_DIRECTION].text}" if ANY_DIRECTION in now.tool_limits else ""
+    limits += f", now limited by {now.binding}" * bool(now.binding)
+    parts = f"{mode:<24} {now.rate_hz:7.2f} Hz  {now.missed} missed  {hands}  skill {now.skill}  version {now.version}"
+    return parts + limits

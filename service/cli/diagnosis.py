@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
@@ -31,6 +32,7 @@ MAX_BELOW_TABLE_M = 0.03  # a hand that is farther below the table top shows tha
 OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
 COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
 LATE_ARM_MS = 30.0  # largest lag of an arm, with the delay of its driver's playback
+BOUND_SHARE = 0.1  # a limit that binds in a larger share of the statuses is noted
 MOVED_SHARE = 0.1  # a joint that moved less than this share of it has not moved
 OFF_TARGET_M, OFF_TARGET_S = 0.05, 1.5  # a tool that is farther away for longer does not only lag
 LEVEL_M, RAISED_M = 0.03, 0.10  # if z spans less than the first and y more than the second, y is the height
@@ -112,6 +114,7 @@ def _in_order_of_cause(
     yield from _hands_and_skill(seen)
     yield _mode(now)
     yield from _tool(seen)
+    yield from _limits(seen)
     yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
@@ -149,6 +152,17 @@ def _lag(lag_ms: float | None) -> Finding:
     found, wanted = f"the arm follows its commands {lag_ms:.0f} ms late", f"up to {LATE_ARM_MS:.0f} ms"
     level = "ok" if lag_ms <= LATE_ARM_MS else "note"
     return Finding(level, what, found, wanted, what_to_do(Condition.ARM_LATE))
+
+
+def _limits(seen: Sequence[Status]) -> Iterator[Finding]:
+    """Limits of the tool where the task is, and the one that binds most often."""
+    if limits := seen[-1].tool_limits:
+        yield Finding("ok", "tool's limits", "; ".join(f"{where} {one.text}" for where, one in limits.items()))
+    bound = Counter(one.binding for one in seen if one.binding)
+    name, count = bound.most_common(1)[0] if bound else ("", 0)
+    if count > BOUND_SHARE * len(seen):
+        found, wanted = f"{name}, in {count / len(seen):.0%} of the time", f"in less than {BOUND_SHARE:.0%}"
+        yield Finding("note", "limit that binds", found, wanted, what_to_do(Condition.LIMIT_BINDS))
 
 
 def _tool(seen: Sequence[Status]) -> Iterator[Finding]:

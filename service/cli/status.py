@@ -139,6 +139,8 @@ def rows(now: Status) -> dict[str, str]:
         "offer": now.offer,
         "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
         "turned": _turned(now),
+        "tool's limits": "; ".join(f"{where} {limits.text}" for where, limits in now.tool_limits.items()),
+        "limited by": now.binding,
         "gripper": now.gripper + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
         or "none",

@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF",
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS",
 )
 
 
@@ -159,6 +159,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "wait; if the tool does not catch up with the hands, hold them still for a moment"),
         Incident(Flag.SPEED_LIMITED, Mode.FOLLOW, "at a speed limit",
             "the hands require more than the limits of the tool or a joint", "nothing: the tool arrives later"),
+        Incident(Condition.LIMIT_BINDS, None, "one limit binds",
+            "one limit of a joint or of the tool keeps the tool from following faster",
+            "move the task to where the arm is faster, or choose another `[arm] posture`; raise that limit in the "
+            "cell's settings only if the arm's data sheet and the task allow more"),
         Incident(Flag.NEAR_JOINT_LIMIT, Mode.FOLLOW, "near a joint limit",
             "a joint is close to its position limit; the tool may deviate from its direction",
             "work where this joint is farther from its limit"),

@@ -236,6 +236,24 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
 
 
+ANY_DIRECTION, ALONG_TASK = "in any direction", "along the task"
+
+
+class ToolLimits(msgspec.Struct, frozen=True):
+    """Largest speed and acceleration of the tool; the joint that limits each, empty: `[tool]`."""
+
+    speed: float  # [m/s]
+    speed_joint: str
+    acceleration: float  # [m/s²]
+    acceleration_joint: str
+
+    @property
+    def text(self) -> str:
+        """The limits in words."""
+        speed, acceleration = (joint or "[tool]" for joint in (self.speed_joint, self.acceleration_joint))
+        return f"{self.speed:.2f} m/s ({speed}) and {self.acceleration:.1f} m/s² ({acceleration})"
+
+
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """The status of a cell, as on `<cell>/status`."""
 
@@ -288,6 +306,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     error_probability: float | None = None  # probability that the tool belongs more than 10 cm from its target
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
+    tool_limits: dict[str, ToolLimits] = {}  # of the demonstrated places, by ANY_DIRECTION and ALONG_TASK
+    binding: str = ""  # the limit that holds the tool back now; empty: none
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none
     residual_risk: str = ""  # of the skill, and who accepted it; empty: none

@@ -46,6 +46,7 @@ from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, skill_of
 from service.daemon.start import Startup
 from service.daemon.status import CellStatus, MeasuredArm, outcome
+from service.daemon.task_limits import TaskLimits
 from service.daemon.way_finder import WayFinder
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
@@ -109,6 +110,7 @@ class Daemon:
             self._own.append(order("stage", reached))
             log.info("the task continues at via-point %s, which an earlier run had reached", reached)
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
+        self._task_limits = TaskLimits(settings, skill_worker, self.note)
         self._notes = (0, 0)  # time [s] and the number of notes in this second
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
@@ -378,6 +380,7 @@ class Daemon:
             endpoints=self.endpoints,
             version=self._version,
             tool_measured_m=self._measured_arm.position(state),
+            tool_limits=self._task_limits.of(self._file),
         )
 
 

@@ -19,8 +19,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.contract.requests import ViaPoint
+from service.contract.requests import ToolLimits, ViaPoint
 from service.core.frame import Vector
+from service.core.tool_limits import limits_of_task, path_of
 from service.core.way_out import WayOut
 from service.learning.corrections import Effect, corrected
 from service.learning.reach import beyond_m
@@ -99,6 +100,15 @@ class SkillWorker:
         distances: Vector = self._ask(timeout_s, beyond_m, settings, positions)
         return distances
 
+    def tool_limits(
+        self, settings: Settings, file: bytes, *, timeout_s: float = WORK_TIMEOUT_S
+    ) -> dict[str, ToolLimits]:
+        """The result of `limits_of_task` for the cell and the skill in force (the bytes of its
+        file). Raises SkillError, also after `timeout_s` [s].
+        """
+        limits: dict[str, ToolLimits] = self._ask(timeout_s, tool_limits_of, settings, file)
+        return limits
+
     def close(self) -> None:
         """End the process, also while it works."""
         if (running := self._child) is not None and running.has_begun():
@@ -172,6 +182,12 @@ def way_out_of(settings: Settings, *arguments: Vector) -> list[Vector]:
 def has_posture_of(settings: Settings, *arguments: Vector) -> bool:
     """The result of `WayOut.has_posture` for the cell."""
     return WayOut(settings, robot_description(settings)).has_posture(*arguments)
+
+
+def tool_limits_of(settings: Settings, file: bytes) -> dict[str, ToolLimits]:
+    """The result of `limits_of_task` for the cell and the skill in this file."""
+    skill = decoded(file, origin="the skill in force")
+    return limits_of_task(settings, robot_description(settings), path_of(skill), skill.orientation)
 
 
 def skill_of(

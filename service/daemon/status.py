@@ -24,6 +24,7 @@ from service.core.skill.model import standard_deviations
 from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
 from service.core.skill.task_clock import CLOCK_S
+from service.core.tool_limits import binding
 from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.learning.corrections import offer_of
 from service.settings.config import Settings
@@ -102,6 +103,7 @@ class CellStatus(NamedTuple):
             threshold_m=round(skill.threshold, 5),
             guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
             offer=offer_of(skill),
+            binding=next((name for name, _ in binding(settings, np.asarray(frame).reshape(1))), "") if begun else "",
             **more,
         )
 

@@ -25,9 +25,9 @@ from service.files.steps import Gap, Step
 from service.learning.skill_file import SkillError, decoded
 
 KEPT = (
-    *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "tool", "joints"),
-    *("joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages", "rejected"),
-    *("mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability"),
+    *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
+    *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
+    *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability"),
 )
 BLOCK = 4096  # ticks whose whole frames are held in memory
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from service.contract.incidents import word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
-from service.core.frame import Vector
+from service.contract.requests import ALONG_TASK, ANY_DIRECTION, ToolLimits
+from service.core.frame import Records, Vector
 from service.files.recording import Recording
 from service.learning.corrections import offer_of
 from service.report.causes import before, why
@@ -23,6 +24,8 @@ from service.report.stages import stages
 from service.report.visits import places
 
 SHARES = (50, 99, 100)
+JUDGED_POSTURES = 200  # limits of the tool are computed at this many postures, at most
+DIRECTED_MPS = 0.02  # the direction of a slower tool is not judged
 REACHED_MM = 20.0  # a tool this near has reached its first target
 
 
@@ -80,7 +83,7 @@ class Approach(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A limit that was active: its duration, number of times, and first time [s]."""
+    """A limit that was active or that bound: its duration, number of times, and first time [s]."""
 
     name: str
     lasts_s: float
@@ -149,6 +152,8 @@ class Report:
         self.places = tuple(places(columns))
         self.stages = tuple(stages(columns))
         self.limits = tuple(_limits(columns))
+        self.binding = tuple(_binding(columns))
+        self.tool_limits = _tool_limits(columns, following)
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
         stale_ticks = recording.settings.hands.stale_ms / 1000 / columns.period_s
@@ -249,6 +254,36 @@ def _limits(columns: Columns) -> Iterator[Limit]:
         if begins:
             lasts_s = float(raised.sum()) * columns.period_s
             yield Limit(word(flag), lasts_s, len(begins), float(columns.times[begins[0]]))
+
+
+def _binding(columns: Columns) -> Iterator[Limit]:
+    """The limits that the motion met, the one that bound longest first."""
+    from service.core.tool_limits import binding  # its import is slow, and other parts of this module need none
+
+    found = []
+    for name, met in binding(columns.recording.settings, columns.frames):
+        begins = [begin for begin, _ in runs(met) if met[begin]]
+        lasts_s = float(met.sum()) * columns.period_s
+        found.append(Limit(name, lasts_s, len(begins), float(columns.times[begins[0]])))
+    yield from sorted(found, key=lambda limit: -limit.lasts_s)
+
+
+def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
+    """Limits of the tool at the postures in which the arm followed, and along its motion there."""
+    from service.core.arm.stage import Arm
+    from service.core.tool_limits import tool_limits
+
+    speed = np.linalg.norm(following["setpoint_velocity"], axis=1)
+    moving = following[speed > DIRECTED_MPS]
+    moving = moving[:: -(-len(moving) // JUDGED_POSTURES) or 1]
+    if not len(moving) or not columns.recording.urdf:
+        return {}
+    settings, velocities = columns.recording.settings, moving["setpoint_velocity"]
+    arm, directions = Arm(settings, columns.recording.urdf), velocities / np.linalg.norm(velocities, axis=1)[:, None]
+    return {
+        ANY_DIRECTION: tool_limits(arm, settings, moving["joints"]),
+        ALONG_TASK: tool_limits(arm, settings, moving["joints"], directions),
+    }
 
 
 def _joints(columns: Columns, sent: Any) -> Iterator[Joint]:

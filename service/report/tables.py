@@ -106,6 +106,32 @@ def _tables(report: Report) -> Iterator[Table]:
         ),
         numbers=0,
     )
+    followed_s = max(report.seconds(Mode.FOLLOW), report.columns.period_s)
+    yield Table(
+        "binding",
+        "What limited the tool while it followed",
+        ("limit", "for [s]", "share [%]", "times", "first at [s]"),
+        tuple(
+            (one.name, _s(one.lasts_s), f"{100 * one.lasts_s / followed_s:.1f}", str(one.times), _s(one.first_s))
+            for one in report.binding
+        ),
+    )
+    yield Table(
+        "tool_limits",
+        "What the arm can do where the tool was",
+        ("direction", "speed [m/s]", "limited by", "acceleration [m/s²]", "limited by"),
+        tuple(
+            (
+                where,
+                f"{one.speed:.2f}",
+                one.speed_joint or "[tool] max_speed",
+                f"{one.acceleration:.1f}",
+                one.acceleration_joint or "[tool] max_acceleration",
+            )
+            for where, one in report.tool_limits.items()
+        ),
+        numbers=0,
+    )
     yield Table(
         "joints",
         "Use of the joints' limits",

@@ -36,6 +36,9 @@ def test_it_prints_what_was_understood(made: tuple[Path, str]) -> None:
         "capsules",
         "reach     0.36 to 0.91 m from (0.00, 0.00, 0.09)",
         "posture   [",
+        "can do    in any direction, where the demo's tool goes: 0.80 m/s ([tool]) and ",
+        "            along the task, where the demo's tool goes: ",
+        "[tool] allows 0.8 m/s and 10 m/s²; a joint in brackets allows less",
         f"next:    thirdhand demo --arm {folder / 'cell.toml'}",
     ):
         assert wanted in text, wanted

@@ -14,7 +14,7 @@ import pytest
 from service.cli.diagnosis import Y_UP, Finding, findings
 from service.cli.status import line, rows
 from service.contract.incidents import what_to_do
-from service.contract.requests import Percentiles, Source, Status
+from service.contract.requests import ANY_DIRECTION, Percentiles, Source, Status, ToolLimits
 from service.core.geometry import rotation
 from service.settings.config import converted
 
@@ -77,6 +77,16 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     assert {finding.level for finding in found} == {"ok"}
     told = {finding.what for finding in found}
     assert told >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
+
+
+def test_what_the_arm_can_do_is_told_and_a_limit_that_binds_is_noted() -> None:
+    limits = {ANY_DIRECTION: ToolLimits(0.42, "elbow", 10.0, "")}
+    found = {one.what: one for one in diagnosed(tool_limits=limits)}
+    assert found["tool's limits"].found == "in any direction 0.42 m/s (elbow) and 10.0 m/s² ([tool])"
+    assert "limit that binds" not in found
+    (note,) = (one for one in diagnosed(binding="speed of elbow") if one.level == "note")
+    assert "limit that binds   speed of elbow, in 50% of the time" in note.text()
+    assert "what to do: move the task to where the arm is faster" in note.text()
 
 
 def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:

@@ -195,6 +195,19 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][known].min()
 
 
+def test_what_bound_and_what_the_arm_could_do_are_told(session: Report) -> None:
+    names = session.columns.recording.settings.joints.names
+    assert session.binding
+    assert all(one.name.startswith("[tool] ") or one.name.split(" of ")[1] in names for one in session.binding)
+    assert 0.0 < sum(one.lasts_s for one in session.binding) < session.seconds(Mode.FOLLOW)
+    least, along = session.tool_limits.values()
+    assert 0.1 < least.speed <= along.speed <= 0.8
+    assert 1.0 < least.acceleration <= along.acceleration <= 10.0
+    shown = {one.name: one for one in tables(session)}
+    assert shown["tool_limits"].rows[0][:2] == ("in any direction", f"{least.speed:.2f}")
+    assert shown["binding"].rows[0][0] == session.binding[0].name
+
+
 def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
     by_name = [(place.name, place.start_s) for place in session.places]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}

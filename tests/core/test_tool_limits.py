@@ -1,0 +1,91 @@
+"""What the joints leave to the tool: against joint motion that is computed here, and by hand."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.contract.records import Flag, Mode
+from service.contract.requests import ALONG_TASK, ANY_DIRECTION
+from service.core.arm.stage import Arm
+from service.core.arm.tuning import PLANNED_LIMIT_SHARES
+from service.core.frame import blank, frame_layout
+from service.core.skill.skill import Skill
+from service.core.tool_limits import BINDING_SHARE, binding, limits_of_task, path_of, tool_limits
+from service.files.shipped import ARMS, cell_of
+from service.settings.config import Settings, robot_description
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_at_its_limit_the_tool_needs_all_that_is_planned_of_the_joint_that_is_named(name: str) -> None:
+    settings = cell_of(name)
+    fast = msgspec.structs.replace(settings.tool, max_speed=100.0, max_acceleration=1000.0, fault_speed=200.0)
+    arm, random = Arm(settings, robot_description(settings)), np.random.default_rng(0)
+    quick = msgspec.structs.replace(settings, tool=fast)  # its own limits never bind
+    for _ in range(20):
+        q = np.array(settings.arm.posture) + random.uniform(-0.2, 0.2, len(settings.joints.names))
+        u = random.normal(size=3)
+        u /= np.linalg.norm(u)
+        found, least = tool_limits(arm, quick, q[None], u[None]), tool_limits(arm, quick, q[None])
+        here = arm.at(q)
+        for order, (kind, value, joint) in enumerate(
+            (
+                ("velocity", found.speed, found.speed_joint),
+                ("acceleration", found.acceleration, found.acceleration_joint),
+            )
+        ):
+            limits = np.array(getattr(settings.joints, kind))
+            weights = limits / limits.mean()
+            jacobian = here.tasks[:3] * weights
+            moved = weights * (
+                jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + here.damping * np.eye(3), value * u)
+            )
+            shares = np.abs(moved) / limits
+            assert shares.max() == pytest.approx(PLANNED_LIMIT_SHARES[order], rel=0.01)
+            assert settings.joints.names[int(shares.argmax())] == joint
+        assert least.speed <= found.speed + 1e-3
+        assert least.acceleration <= found.acceleration + 1e-2
+
+
+def test_of_a_task_the_limits_follow_the_joints_until_the_tool_has_its_own(skill: Skill) -> None:
+    settings = Settings()
+    urdf, path = robot_description(settings), path_of(skill)
+
+    def limits(share: float, max_speed: float = 0.8) -> dict[str, tuple[float, str]]:
+        joints = msgspec.structs.replace(settings.joints, velocity=tuple(share * v for v in settings.joints.velocity))
+        tool = msgspec.structs.replace(settings.tool, max_speed=max_speed)
+        cell = msgspec.structs.replace(settings, joints=joints, tool=tool)
+        return {
+            where: (one.speed, one.speed_joint)
+            for where, one in limits_of_task(cell, urdf, path, skill.orientation).items()
+        }
+
+    whole, half, slow = limits(1.0), limits(0.5), limits(1.0, 0.1)
+    assert set(whole) == {ANY_DIRECTION, ALONG_TASK}
+    assert whole[ANY_DIRECTION] <= whole[ALONG_TASK]
+    assert all(joint in settings.joints.names for _, joint in whole.values())
+    for where, (speed, _) in whole.items():
+        assert half[where][0] == pytest.approx(0.5 * speed, rel=0.1)  # the postures differ a little
+        assert slow[where] == (0.1, "")
+    assert limits_of_task(settings, urdf, path + np.array([3.0, 0.0, 0.0]), skill.orientation) == {}
+
+
+def test_a_frame_meets_the_one_limit_of_which_it_uses_most() -> None:
+    settings = Settings()
+    frames = np.repeat(blank(frame_layout(7)).reshape(1), 6)
+    frames["mode"] = Mode.FOLLOW
+    frames["joint_velocities"][0, 2] = -settings.joints.velocity[2]
+    frames["joint_accelerations"][0, 1] = 0.95 * settings.joints.acceleration[1]
+    frames["setpoint_velocity"][1] = (0.0, 0.0, settings.tool.max_speed)
+    frames["setpoint_acceleration"][2] = (-settings.tool.acceleration, 0.0, 0.0)
+    frames["setpoint_velocity"][3] = (settings.tool.engaging_speed, 0.0, 0.0)
+    frames["flags"][3] = Flag.ENGAGING
+    frames["joint_velocities"][4, 2] = 0.99 * BINDING_SHARE * settings.joints.velocity[2]
+    frames["joint_velocities"][5, 2], frames["mode"][5] = settings.joints.velocity[2], Mode.HOLD
+    assert {name: np.flatnonzero(met).tolist() for name, met in binding(settings, frames)} == {
+        "speed of wam/shoulder_yaw_joint": [0],
+        "[tool] max_speed": [1],
+        "[tool] max_acceleration": [2],
+        "[tool] engage_speed": [3],
+    }
