@@ -145,6 +145,10 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
+    log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
+    c.add_argument("--log", choices=("text", "json"), default="text", help=log)
+    check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
+    c.add_argument("--check", action="store_true", help=check)
     add_end_with(c)
 
     c = command(
@@ -336,6 +340,7 @@ def parser() -> argparse.ArgumentParser:
     c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")
     c.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
+    c.add_argument("--exit-code", action="store_true", help="exit with code 1 also if the cell is at fault")
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
