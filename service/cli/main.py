@@ -145,6 +145,8 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
+    hold = "begin in hold, until `thirdhand resume`: for a service manager, which starts the daemon unattended"
+    c.add_argument("--hold", action="store_true", help=hold)
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
     check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"

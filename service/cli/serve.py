@@ -77,7 +77,7 @@ def _run(args: argparse.Namespace) -> int:
                 log.warning("%s (standard output: %s)", line, in_words(error))
 
         skill, scribe = _skill(settings, args), Scribe(settings, folder=folder, live_port=args.live)
-        parts = {"skills": skills, "scribe": scribe, "start": start, "announce": announce}
+        parts = {"skills": skills, "scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
         missing = daemon.serve(settings, skill, **parts)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries

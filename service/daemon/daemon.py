@@ -83,6 +83,7 @@ class Daemon:
         skills: Path,
         scribe: Scribe,
         start: Startup,
+        hold: bool = False,
     ) -> None:
         skill = stored.for_loop()
         # Files by digest, of the skill in force and of one that the loop adopts next.
@@ -134,6 +135,8 @@ class Daemon:
             keep=scribe.keep,
             failed=self._fail,
         )
+        if hold:
+            self._queryables.begin_in_hold()
 
     def stop(self, *_: Any) -> None:
         """Request the loop to stop the arm and end. Safe in a signal handler."""
@@ -170,6 +173,7 @@ class Daemon:
         finally:
             brake(self._settings, self._frame, self._clock, self._streams)
             self._ended.set()
+            self._start.systemd.notify("STOPPING=1", "STATUS=closing its files")
             gc.unfreeze()
             self._status.close()
             if reporter is not None:
@@ -298,6 +302,7 @@ class Daemon:
                 log.info("started in %.0f s", self._start.age_s)
                 self._queryables.open(self._session)
                 announce(self)
+                self._start.systemd.notify("READY=1")
 
     def _report(self, announce: Callable[[Daemon], None]) -> None:
         """Publish the status, log changes, and supervise the scribe ten times a second. A status is
@@ -305,6 +310,7 @@ class Daemon:
         """
         run_beside_real_time()
         self._open(announce)
+        systemd = self._start.systemd
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
         due_s = time.monotonic()
@@ -320,6 +326,7 @@ class Daemon:
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
+            systemd.progressed(status.tick)
             if is_due:
                 due_s = time.monotonic() + STATUS_S
                 self._way_finder.poll(self._frame, self._controller.state)
@@ -341,6 +348,7 @@ class Daemon:
             if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
+                systemd.notify(f"STATUS={in_brief(*logged_mode)}")
 
     def _moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""
@@ -423,8 +431,10 @@ def serve(
     scribe: Scribe,
     start: Startup,
     announce: Callable[[Daemon], None],
+    hold: bool = False,
 ) -> str:
-    """Run a daemon and return a message on ticks that were not recorded (empty: none).
+    """Run a daemon, which if `hold` begins in an operator's hold, and return a message on ticks
+    that were not recorded (empty: none).
 
     Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
     LoopError if the control loop cannot continue.
@@ -434,7 +444,9 @@ def serve(
         skill_worker.start()  # before the loop, which the start of a process would delay
         with start.counting():
             skill = load_skill(skill_path, settings)
-            daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start)
+            daemon = Daemon(
+                settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
+            )
         for number in STOPPING:
             signal.signal(number, daemon.stop)
         return daemon.serve(announce)
