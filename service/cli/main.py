@@ -47,7 +47,7 @@ GROUPS = {
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "replay", "tune", "bench"),
+    "check": ("doctor", "cells", "metrics", "replay", "tune", "bench"),
     "set up": ("arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
@@ -150,7 +150,7 @@ def parser() -> argparse.ArgumentParser:
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
     check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
-    c.add_argument("--check", action="store_true", help=check)
+    c.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
     add_end_with(c)
 
     c = command(
@@ -341,8 +341,9 @@ def parser() -> argparse.ArgumentParser:
 
     c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")
-    c.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
-    c.add_argument("--exit-code", action="store_true", help="exit with code 1 also if the cell is at fault")
+    kinds = c.add_mutually_exclusive_group()
+    kinds.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
+    kinds.add_argument("--exit-code", action="store_true", help="exit with code 1 also if the cell is at fault")
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
@@ -355,6 +356,11 @@ def parser() -> argparse.ArgumentParser:
         "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
+    _reach(c, one=False)
+
+    about = "Serves the statuses of all cells on a network as metrics for Prometheus."
+    c = command("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
+    option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
 
     c = command(

@@ -30,8 +30,6 @@ def serve(args: argparse.Namespace) -> int:
     """Run the daemon until it is stopped; exit code 0, or 1 if recordings lack ticks."""
     os.umask(0o077)  # files are private to the user
     _open_standard_streams()
-    if args.check:
-        return _check(args)
     if args.end_with is not None:
         end_with(args.end_with)
     handler = logging.StreamHandler(sys.stderr)
@@ -42,15 +40,13 @@ def serve(args: argparse.Namespace) -> int:
     except Exception as error:
         if args.log != "json":
             raise
-        is_explained = isinstance(error, OSError | ValueError | ExplainedError)
-        log.error("%s", in_file(in_words(error)), exc_info=not is_explained)
+        log.error(in_file(in_words(error)), exc_info=not isinstance(error, OSError | ValueError | ExplainedError))
         return 2 if isinstance(error, UsageError | SettingsError) and not isinstance(error, UnreadableError) else 1
 
 
 def _run(args: argparse.Namespace) -> int:
     """Run the daemon until it is stopped, and end the process."""
-    settings = _settings(args)
-    skills = skills_folder(settings)
+    settings = settings_of(args)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:
         try:
@@ -76,26 +72,19 @@ def _run(args: argparse.Namespace) -> int:
             except OSError as error:  # the daemon runs on without a reader of its output
                 log.warning("%s (standard output: %s)", line, in_words(error))
 
-        skill, scribe = _skill(settings, args), Scribe(settings, folder=folder, live_port=args.live)
-        parts = {"skills": skills, "scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
-        missing = daemon.serve(settings, skill, **parts)
+        skill, scribe = skill_path(settings, args), Scribe(settings, folder=folder, live_port=args.live)
+        more = {"scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
+        missing = daemon.serve(settings, skill, skills=skills_folder(settings), **more)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
 
 
-def _check(args: argparse.Namespace) -> int:
-    """Examine the conditions of a start; exit code 1 if it would fail."""
-    from service.cli.serve_check import check  # only this option needs it
-
-    return check(lambda: _settings(args), lambda settings: _skill(settings, args), args.live)
-
-
-def _settings(args: argparse.Namespace) -> Settings:
+def settings_of(args: argparse.Namespace) -> Settings:
     """The settings of the cell, overridden by the options of the command line."""
     return _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
 
 
-def _skill(settings: Settings, args: argparse.Namespace) -> Path:
+def skill_path(settings: Settings, args: argparse.Namespace) -> Path:
     """The file of the skill to run."""
     return Path(args.skill or skills_folder(settings) / SHIPPED_SKILL)
 
@@ -115,13 +104,10 @@ class JsonFormatter(logging.Formatter):
     """A formatter that writes each record as one JSON object on one line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a line: time (RFC 3339, UTC), level, logger, message and, if one was
-        raised, exception.
-        """
+        """The record as a line: time (UTC), level, logger, message and, if any, exception."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
         line = {"time": time, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
+        line |= {"exception": self.formatException(record.exc_info)} if record.exc_info else {}
         return msgspec.json.encode(line).decode()
 
 

@@ -13,7 +13,7 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from service.cli.clients import ask
-from service.cli.usage import UsageError, reached
+from service.cli.usage import reached
 from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
 from service.contract.incidents import SOURCE_NAMES, in_brief, what_happened, what_to_do, word
@@ -30,15 +30,11 @@ STUCK = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers; with --watch, 1 when it ends, and with --exit-code, 1 if the
-    cell is at fault.
-    """
-    if args.watch and args.exit_code:
-        raise UsageError("--watch and --exit-code given; one of them accepted")
+    """Exit code 0 if a daemon answers; 1 at a fault with --exit-code, and when --watch ends."""
     if args.watch:
         return _watch(args)
     now = msgspec.convert(ask(args, "status"), Status)
-    code = 1 if args.exit_code and now.mode == "fault" else 0
+    code = int(args.exit_code and now.mode == "fault")
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(now)).decode())
         return code

@@ -210,9 +210,7 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
 
 
 def check_files(certificate: str | Path, zenoh_config: str | Path) -> None:
-    """Raise UnreachableError if `open_session` would refuse this folder or this file; empty: none
-    is used.
-    """
+    """Raise UnreachableError if `open_session` would refuse this folder or file; empty: none."""
     _zenoh_config(zenoh_config)
     _tls(certificate)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import signal
 import threading
 import time
@@ -37,7 +38,7 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
-from service.daemon.machine import BUSY_WINDOW_S, Machine
+from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
@@ -310,7 +311,6 @@ class Daemon:
         """
         run_beside_real_time()
         self._open(announce)
-        systemd = self._start.systemd
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
         due_s = time.monotonic()
@@ -326,7 +326,7 @@ class Daemon:
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
-            systemd.progressed(status.tick)
+            self._start.systemd.progressed(status.tick)
             if is_due:
                 due_s = time.monotonic() + STATUS_S
                 self._way_finder.poll(self._frame, self._controller.state)
@@ -348,7 +348,7 @@ class Daemon:
             if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
-                systemd.notify(f"STATUS={in_brief(*logged_mode)}")
+                self._start.systemd.notify(f"STATUS={in_brief(*logged_mode)}")
 
     def _moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""
@@ -367,7 +367,7 @@ class Daemon:
         sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
-        machine = self._machine
+        machine, scribe = self._machine, self._scribe.status()
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
         known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
@@ -380,7 +380,8 @@ class Daemon:
             lateness_us=self._lateness.percentiles(),
             work_us=self._work.percentiles(),
             latency_ms=self._latency.percentiles(),
-            scribe=self._scribe.status(),
+            scribe=scribe,
+            memory_mb=resident_mb(daemon=os.getpid(), scribe=scribe["pid"]),
             command_heard=self._streams.is_followed,
             busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,

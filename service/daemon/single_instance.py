@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import psutil
 import zenoh
 
 from service.client import Client, RefusedError, UnreachableError
@@ -99,9 +98,9 @@ class Lock:
 
 
 def holder_of(settings: Settings) -> tuple[int, frozenset[str]] | None:
-    """The number of the process of this machine that serves a cell, and its endpoints; None: there
-    is none, or it is another user's. The lock is not touched.
-    """
+    """The process that serves a cell, and its endpoints; None: none here, or another user's."""
+    import psutil  # no start needs it
+
     path = state_folder(settings) / "daemon.lock"
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, psutil.Error):
         found = json.loads(content(path, MAX_HOLDER_BYTES))

@@ -10,11 +10,7 @@ from collections.abc import Mapping
 
 
 class Systemd:
-    """The service manager, if it started this process with `Type=notify`; else nothing is sent.
-
-    With `WatchdogSec=` it restarts the process when no ping arrives for that time. A ping is sent
-    only after the control loop has taken another tick, so a loop that stands still is noticed.
-    """
+    """The service manager, if it started this process with `Type=notify`; else nothing is sent."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
@@ -32,8 +28,8 @@ class Systemd:
                 sender.sendto("\n".join(assignments).encode(), self._address)
 
     def progressed(self, tick: int) -> None:
-        """Ping twice in the watchdog's time, if the loop's newest tick has changed since the last
-        ping. Call it more often than that.
+        """Ping twice in the watchdog's time, if the loop has taken another tick since the last
+        ping: so a loop that stands still is noticed. Call it more often than that.
         """
         now_s = time.monotonic()
         if self._ping_every_s and tick > self._pinged_tick and now_s >= self._ping_s + self._ping_every_s:

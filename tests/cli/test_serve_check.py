@@ -5,6 +5,7 @@ behind. `thirdhand status --exit-code`: a fault is seen from the exit code.
 from __future__ import annotations
 
 import contextlib
+import datetime
 import os
 import re
 import socket
@@ -54,7 +55,7 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
     assert done.returncode == code, done.stdout + done.stderr
     found: dict[str, list[str]] = {}
     for line in done.stdout.splitlines():
-        match = re.fullmatch(r"(ok|note|wrong) +(\w+) +(.+)", line)
+        match = re.fullmatch(r"(ok|wrong) +(\w+) +(.+)", line)
         assert match is not None, line
         found.setdefault(f"{match[1]} {match[2]}", []).append(match[3])
     return found
@@ -105,7 +106,8 @@ def test_certificates_are_dated_and_keys_in_endpoints_are_not_shown(tmp_path: Pa
     secured = f"certificate = '{tmp_path}/new/daemon'\n"
     endpoint = "tls/127.0.0.1:0#connect_private_key_base64=c2VjcmV0"
     found = lines(tmp_path, code=0, listen=endpoint, network=secured)
-    assert "make new ones in time" in found["note certificates"][0]
+    end = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=20)
+    assert f"valid until {end:%Y-%m-%d}" in found["ok certificates"][0]
     assert "c2VjcmV0" not in str(found)
 
 
