@@ -47,7 +47,7 @@ GROUPS = {
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "metrics", "replay", "tune", "bench"),
+    "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
     "set up": ("arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
@@ -357,6 +357,15 @@ def parser() -> argparse.ArgumentParser:
     )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
     _reach(c, one=False)
+
+    about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
+    c = command("bundle", about, "thirdhand bundle --config cell.toml")
+    option(c, "--output", "FILE", "write this file (default: thirdhand-CELL-TIME.tar.gz)")
+    option(c, "--config", "FILE", "the cell's settings, for the archive and for the folder of its recordings")
+    minutes = "take the recordings of this time, and at least the newest one"
+    option(c, "--minutes", "N", minutes, 10.0, type=within(float, 0, 1e6, " minutes"))
+    option(c, "--log", "FILE", "take the end of this log (default: the journal of the unit thirdhand@NAME)")
+    _reach(c)
 
     about = "Serves the statuses of all cells on a network as metrics for Prometheus."
     c = command("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
