@@ -4,6 +4,7 @@ loop, restarts that do not follow by themselves, and the unit in examples/.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -18,7 +19,8 @@ import pytest
 from service.cli.main import parser
 from service.client import Client, RefusedError
 from service.daemon.systemd import Systemd
-from support.cell import Daemon, Tracker, serving
+from sim.scene import Scene
+from support.cell import Daemon, Tracker, serving, told
 from support.paths import ROOT
 
 UNIT = ROOT / "examples" / "thirdhand@.service"
@@ -165,3 +167,39 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
             capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
         assert bool(done.returncode or done.stderr) == bool(spoilt), done.stderr
+
+
+def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
+    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, filled = tmp_path / "disk", tmp_path / "disk" / "filled"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("a small disk cannot be mounted here")
+    try:
+        (disk / "state").mkdir()
+        (tmp_path / "state").symlink_to(disk / "state")
+        with contextlib.suppress(OSError), filled.open("wb", buffering=0) as file:
+            while file.write(bytes(4096)):
+                pass
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
+        with serving(tmp_path, "--arm", "assumed", "--record", str(disk / "records")) as daemon:
+            checked = told(
+                "serve", "--check", "--config", str(tmp_path / "cell.toml"), "--record", str(disk / "records")
+            )
+            assert (checked.returncode, "wrong  disk" in checked.stdout) == (1, True), checked.stdout
+            assert manager.heard(30, "READY=1")[-1] == "READY=1"
+            with pytest.raises(RefusedError, match=r"cannot save via-points in .*: No space left on device"):
+                Client(daemon.session).add(Scene().via_points())
+            assert Client(daemon.session).status().places == ()
+            assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+            filled.unlink()
+            Client(daemon.session).add(Scene().via_points())
+            daemon.until(lambda now: now["scribe"]["state"] == "recording", 30)
+            assert daemon.end() == 1  # the recording lacks ticks, which its last line counts
+            assert daemon.log.read_text().endswith("ticks are not recorded\n")
+        assert len(list((disk / "state" / "thirdhand").glob("places-*.json"))) == 1
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
