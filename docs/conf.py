@@ -47,6 +47,7 @@ GROUPS = {
         "viewing",
         "reports",
         "recordings",
+        "operate",
         "network",
         "access",
         "ros2",

@@ -47,7 +47,7 @@ GROUPS = {
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "replay", "tune", "bench"),
+    "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
     "set up": ("arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
@@ -145,6 +145,12 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
+    hold = "begin in hold, until `thirdhand resume`: for a service manager, which starts the daemon unattended"
+    c.add_argument("--hold", action="store_true", help=hold)
+    log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
+    c.add_argument("--log", choices=("text", "json"), default="text", help=log)
+    check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
+    c.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
     add_end_with(c)
 
     c = command(
@@ -335,7 +341,9 @@ def parser() -> argparse.ArgumentParser:
 
     c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
     c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")
-    c.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
+    kinds = c.add_mutually_exclusive_group()
+    kinds.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
+    kinds.add_argument("--exit-code", action="store_true", help="exit with code 1 also if the cell is at fault")
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     c.add_argument("--json", action="store_true", help="print the findings as JSON")
@@ -348,6 +356,20 @@ def parser() -> argparse.ArgumentParser:
         "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
+    _reach(c, one=False)
+
+    about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
+    c = command("bundle", about, "thirdhand bundle --config cell.toml")
+    option(c, "--output", "FILE", "write this file (default: thirdhand-CELL-TIME.tar.gz)")
+    option(c, "--config", "FILE", "the cell's settings, for the archive and for the folder of its recordings")
+    minutes = "take the recordings of this time, and at least the newest one"
+    option(c, "--minutes", "N", minutes, 10.0, type=within(float, 0, 1e6, " minutes"))
+    option(c, "--log", "FILE", "take the end of this log (default: the journal of the unit thirdhand@NAME)")
+    _reach(c)
+
+    about = "Serves the statuses of all cells on a network as metrics for Prometheus."
+    c = command("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
+    option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
 
     c = command(

@@ -8,19 +8,22 @@ import logging
 import os
 import sys
 import tempfile
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from service.cli.usage import UsageError, end_with
-from service.contract.explain import in_words
+from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process import child
 from service.settings.config import Settings, converted
-from service.settings.file_content import SettingsError
+from service.settings.file_content import SettingsError, UnreadableError
+
+log = logging.getLogger("thirdhand")
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -30,10 +33,20 @@ def serve(args: argparse.Namespace) -> int:
     if args.end_with is not None:
         end_with(args.end_with)
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s"))
+    handler.setFormatter(JsonFormatter() if args.log == "json" else PrintableFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    settings = _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
-    skills = skills_folder(settings)
+    try:
+        return _run(args)
+    except Exception as error:
+        if args.log != "json":
+            raise
+        log.error(in_file(in_words(error)), exc_info=not isinstance(error, OSError | ValueError | ExplainedError))
+        return 2 if isinstance(error, UsageError | SettingsError) and not isinstance(error, UnreadableError) else 1
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Run the daemon until it is stopped, and end the process."""
+    settings = settings_of(args)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:
         try:
@@ -57,12 +70,23 @@ def serve(args: argparse.Namespace) -> int:
             try:
                 print(line, flush=True)
             except OSError as error:  # the daemon runs on without a reader of its output
-                logging.getLogger("thirdhand").warning("%s (standard output: %s)", line, in_words(error))
+                log.warning("%s (standard output: %s)", line, in_words(error))
 
-        skill, scribe = args.skill or skills / SHIPPED_SKILL, Scribe(settings, folder=folder, live_port=args.live)
-        missing = daemon.serve(settings, skill, skills=skills, scribe=scribe, start=start, announce=announce)
+        skill, scribe = skill_path(settings, args), Scribe(settings, folder=folder, live_port=args.live)
+        more = {"scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
+        missing = daemon.serve(settings, skill, skills=skills_folder(settings), **more)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
+
+
+def settings_of(args: argparse.Namespace) -> Settings:
+    """The settings of the cell, overridden by the options of the command line."""
+    return _overridden(cell_of(str(args.config)) if args.config else Settings(), args)
+
+
+def skill_path(settings: Settings, args: argparse.Namespace) -> Path:
+    """The file of the skill to run."""
+    return Path(args.skill or skills_folder(settings) / SHIPPED_SKILL)
 
 
 def _open_standard_streams() -> None:
@@ -74,6 +98,17 @@ def _open_standard_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
+
+
+class JsonFormatter(logging.Formatter):
+    """A formatter that writes each record as one JSON object on one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as a line: time (UTC), level, logger, message and, if any, exception."""
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        line = {"time": time, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        line |= {"exception": self.formatException(record.exc_info)} if record.exc_info else {}
+        return msgspec.json.encode(line).decode()
 
 
 class PrintableFormatter(logging.Formatter):

@@ -30,18 +30,19 @@ STUCK = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers; with --watch, 1 when it ends."""
+    """Exit code 0 if a daemon answers; 1 at a fault with --exit-code, and when --watch ends."""
     if args.watch:
         return _watch(args)
     now = msgspec.convert(ask(args, "status"), Status)
+    code = int(args.exit_code and now.mode == "fault")
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(now)).decode())
-        return 0
+        return code
     found = rows(now)
     width = max(map(len, found))
     for name, text in found.items():
         print(f"{name:<{width}}  {text}")
-    return 0
+    return code
 
 
 def _watch(args: argparse.Namespace) -> int:

@@ -209,14 +209,21 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     return {"transport/link/tls": settings}  # replaces any other TLS settings
 
 
-def check_dates(path: Path) -> None:
-    """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason.
-    Without the package cryptography, which the client alone does not need, nothing is checked.
+def check_files(certificate: str | Path, zenoh_config: str | Path) -> None:
+    """Raise UnreachableError if `open_session` would refuse this folder or file; empty: none."""
+    _zenoh_config(zenoh_config)
+    _tls(certificate)
+
+
+def check_dates(path: Path) -> datetime.datetime | None:
+    """Return the time until which a certificate is valid. Raise UnreachableError for one that is
+    not valid now, as Zenoh gives no reason. Without the package cryptography, which the client
+    alone does not need, nothing is checked, and None returned.
     """
     try:
         from cryptography import x509  # most sessions need no certificate
     except ModuleNotFoundError:
-        return
+        return None
 
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
@@ -233,6 +240,7 @@ def check_dates(path: Path) -> None:
             f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, but the clock here shows {now:%Y-%m-%d %H:%M}: "
             "is it right?"
         )
+    return end
 
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:

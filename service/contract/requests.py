@@ -312,6 +312,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none
     residual_risk: str = ""  # of the skill, and who accepted it; empty: none
     guided: bool = False  # True while the arm's driver reports that it is led by hand
+    memory_mb: dict[str, float] = {}  # resident memory of the processes `daemon` and `scribe`
     offer: str = ""  # what to learn from corrections that were repeated; empty: nothing
 
     @property

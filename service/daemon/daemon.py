@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import signal
 import threading
 import time
@@ -37,7 +38,7 @@ from service.daemon.clock import (
     run_beside_real_time,
 )
 from service.daemon.input_monitor import InputMonitor
-from service.daemon.machine import BUSY_WINDOW_S, Machine
+from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
 from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
@@ -84,6 +85,7 @@ class Daemon:
         skills: Path,
         scribe: Scribe,
         start: Startup,
+        hold: bool = False,
     ) -> None:
         skill = stored.for_loop()
         # Files by digest, of the skill in force and of one that the loop adopts next.
@@ -136,6 +138,8 @@ class Daemon:
             keep=scribe.keep,
             failed=self._fail,
         )
+        if hold:
+            self._queryables.begin_in_hold()
 
     def stop(self, *_: Any) -> None:
         """Request the loop to stop the arm and end. Safe in a signal handler."""
@@ -172,6 +176,7 @@ class Daemon:
         finally:
             brake(self._settings, self._frame, self._clock, self._streams)
             self._ended.set()
+            self._start.systemd.notify("STOPPING=1", "STATUS=closing its files")
             gc.unfreeze()
             self._status.close()
             if reporter is not None:
@@ -300,6 +305,7 @@ class Daemon:
                 log.info("started in %.0f s", self._start.age_s)
                 self._queryables.open(self._session)
                 announce(self)
+                self._start.systemd.notify("READY=1")
 
     def _report(self, announce: Callable[[Daemon], None]) -> None:
         """Publish the status, log changes, and supervise the scribe ten times a second. A status is
@@ -322,6 +328,7 @@ class Daemon:
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
+            self._start.systemd.progressed(status.tick)
             if is_due:
                 due_s = time.monotonic() + STATUS_S
                 self._way_finder.poll(self._frame, self._controller.state)
@@ -343,6 +350,7 @@ class Daemon:
             if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
                 logged_mode = (status.mode, status.reason)
                 log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
+                self._start.systemd.notify(f"STATUS={in_brief(*logged_mode)}")
 
     def _moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""
@@ -361,7 +369,7 @@ class Daemon:
         sources = self._sources.update(self._controller, state, now_s)
         inside = self._measured_arm.inside(state)
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
-        machine = self._machine
+        machine, scribe = self._machine, self._scribe.status()
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
         known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
@@ -374,7 +382,8 @@ class Daemon:
             lateness_us=self._lateness.percentiles(),
             work_us=self._work.percentiles(),
             latency_ms=self._latency.percentiles(),
-            scribe=self._scribe.status(),
+            scribe=scribe,
+            memory_mb=resident_mb(daemon=os.getpid(), scribe=scribe["pid"]),
             command_heard=self._streams.is_followed,
             busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,
@@ -426,8 +435,10 @@ def serve(
     scribe: Scribe,
     start: Startup,
     announce: Callable[[Daemon], None],
+    hold: bool = False,
 ) -> str:
-    """Run a daemon and return a message on ticks that were not recorded (empty: none).
+    """Run a daemon, which if `hold` begins in an operator's hold, and return a message on ticks
+    that were not recorded (empty: none).
 
     Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
     LoopError if the control loop cannot continue.
@@ -437,7 +448,9 @@ def serve(
         skill_worker.start()  # before the loop, which the start of a process would delay
         with start.counting():
             skill = load_skill(skill_path, settings)
-            daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start)
+            daemon = Daemon(
+                settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
+            )
         for number in STOPPING:
             signal.signal(number, daemon.stop)
         return daemon.serve(announce)

@@ -4,6 +4,8 @@ processes that wait for a processor.
 
 from __future__ import annotations
 
+import contextlib
+import resource
 from collections import deque
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +17,16 @@ MISSED_SHARE = 0.01  # the machine is too busy if a larger share of deadlines is
 LATE_LOOP_MS = 20.0  # an arm brakes if its commands are this late
 WAITING_SHARE = 0.8  # the machine is overloaded if some process waits for a processor in a larger share of the time
 PRESSURE = Path("/proc/pressure/cpu")  # a file of Linux; if it is missing, only the loop is measured
+
+
+def resident_mb(**processes: int | None) -> dict[str, float]:
+    """Resident memory [MB] of processes by name, given by their numbers, of those that exist."""
+    found = {}
+    for name, number in processes.items():
+        with contextlib.suppress(OSError):
+            pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
+            found[name] = round(pages * resource.getpagesize() / 1e6, 1)
+    return found
 
 
 class _Sample(NamedTuple):

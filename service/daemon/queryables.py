@@ -311,6 +311,10 @@ class Queryables:
         mode, reason = outcome(self._frame())
         return Reply(tick, mode=word(mode), reason=word(reason))
 
+    def begin_in_hold(self) -> None:
+        """Hold from the first tick on, until an operator's `resume`."""
+        self._ordered("hold", "")
+
     def _ordered(self, suffix: str, by: str) -> PendingEvent:
         """The event of an order, on its way to the loop. Raises RequestError for the resume of one
         who holds while others hold too.

@@ -21,6 +21,7 @@ from service.client.presence import living
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.settings.config import Settings
+from service.settings.file_content import content
 
 MAX_SESSIONS = 64
 MAX_DESCRIPTORS = 65536
@@ -94,6 +95,18 @@ class Lock:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
+
+
+def holder_of(settings: Settings) -> tuple[int, frozenset[str]] | None:
+    """The process that serves a cell, and its endpoints; None: none here, or another user's."""
+    import psutil  # no start needs it
+
+    path = state_folder(settings) / "daemon.lock"
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, psutil.Error):
+        found = json.loads(content(path, MAX_HOLDER_BYTES))
+        if any(file.path == str(path) for file in psutil.Process(int(found["pid"])).open_files()):
+            return int(found["pid"]), frozenset(found["endpoints"])
+    return None
 
 
 def _holder(descriptor: int | None) -> str:

@@ -21,11 +21,13 @@ from service.contract.printable import CLEAR
 from service.contract.requests import STARTING
 from service.contract.roles import access_control
 from service.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
+from service.daemon.systemd import Systemd
 from service.settings.config import Settings
 
 log = logging.getLogger("thirdhand")
 REPORT_EVERY_S = 1.0  # interval of reports on a terminal
 LOG_EVERY_S = 20.0  # interval of reports in the log
+MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 
@@ -38,7 +40,7 @@ class Startup:
     """
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
-        self.lock, self.session = lock, session
+        self.lock, self.session, self.systemd = lock, session, Systemd()
         self._compiled: list[str] = []  # functions in compilation, callers first; empty for a library's functions
         self._functions: list[Any] = []  # all compiled functions that the loop may call, once they are imported
         self._is_over, self._begun_s = threading.Event(), time.monotonic()
@@ -101,9 +103,12 @@ class Startup:
             query.reply_err(self.progress.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
 
     def _report(self) -> None:
-        logged, logged_s, quarter, terminal = "", -math.inf, -1, sys.stderr.isatty()
+        logged, logged_s, quarter, terminal, notified = "", -math.inf, -1, sys.stderr.isatty(), ""
         while not self._is_over.is_set():
             progress, now_s = self.progress, time.monotonic()
+            if progress != notified:
+                notified = progress
+                self.systemd.notify(f"STATUS={progress}", f"EXTEND_TIMEOUT_USEC={MAX_PAUSE_US}")
             now_in = 4 * self._ready // len(self._functions) if self._functions else -1
             if terminal:
                 width = shutil.get_terminal_size().columns - 1

@@ -31,7 +31,7 @@ from service.files.mcap_reader import FileFault, Messages
 from service.files.pose_streams import ENDINGS
 from service.files.steps import REPLAYED, Gap, Step, layout_in, steps
 from service.files.urdf_markers import with_markers
-from service.settings.config import Settings, robot_description
+from service.settings.config import Settings, robot_description, without_secrets
 
 OBJECTS_NOTE = "objects"
 # Settings that earlier recordings lack, with the values at which these versions behaved.
@@ -75,7 +75,7 @@ class Recorder(McapFile):
         self.kept = self.pending = 0  # number of ticks in the file, and in the unfinished chunk
         try:
             self.writer.add_metadata("thirdhand", about)
-            self.attach("settings.json", msgspec.json.encode(settings), time_ns)
+            self.attach("settings.json", msgspec.json.encode(without_secrets(settings)), time_ns)
             self.attach("skill.npz", skill, time_ns)
             self.attach("arm.urdf", self._urdf.encode(), time_ns)
             if checksums:

@@ -16,6 +16,11 @@ from service.settings.config import Settings
 MB = 1e6
 
 
+def existing_folder(folder: Path) -> Path:
+    """The folder, or the nearest path above it that exists."""
+    return next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+
+
 class RecordingPaths:
     """The paths of successive recordings.
 

@@ -18,7 +18,7 @@ from typing import Literal
 
 from service.core.frame import Record
 from service.files.recording import Recorder
-from service.scribe.paths import MB, RecordingPaths
+from service.scribe.paths import MB, RecordingPaths, existing_folder
 from service.scribe.protocol import TickMessage
 from service.settings.config import Settings
 
@@ -112,7 +112,7 @@ class Segments:
     def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
         assert self._skill is not None
         try:
-            if self._full and shutil.disk_usage(_existing_folder(path)).free < MIN_FREE_BYTES:
+            if self._full and shutil.disk_usage(existing_folder(path.parent)).free < MIN_FREE_BYTES:
                 return None
             return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
         except OSError as error:
@@ -123,7 +123,7 @@ class Segments:
     def free_mb(self) -> float | None:
         """Free space on the disk of the recording [MB]; None without a recording."""
         with contextlib.suppress(OSError):
-            return None if self.path is None else round(shutil.disk_usage(_existing_folder(self.path)).free / 1e6)
+            return None if self.path is None else round(shutil.disk_usage(existing_folder(self.path.parent)).free / 1e6)
         return None
 
     def mb_per_hour(self) -> float | None:
@@ -299,8 +299,3 @@ def _discard(path: Path) -> None:
     if path.is_file():
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def _existing_folder(path: Path) -> Path:
-    """The nearest folder above a path that exists."""
-    return next((folder for folder in path.parents if folder.is_dir()), Path("/"))

@@ -409,6 +409,13 @@ class Settings(Section, frozen=True):
         return 1.0 / self.rate_hz
 
 
+def without_secrets(settings: Settings) -> Settings:
+    """The settings without the parameters of endpoints, which may hold keys."""
+    network = settings.network
+    listen, connect = (tuple(one.partition("#")[0] for one in some) for some in (network.listen, network.connect))
+    return msgspec.structs.replace(settings, network=msgspec.structs.replace(network, listen=listen, connect=connect))
+
+
 def urdf_path(settings: Settings) -> Path:
     """The path of the arm's URDF."""
     return Path(settings.arm.urdf).expanduser() if settings.arm.urdf else WAM

@@ -172,6 +172,31 @@ def test_stamps_are_drawn_to_a_system_clock_that_drifts_without_a_jump() -> None
     assert abs(deadlines.stamp_ns - clock.wall_ns()) < 1_000_000
 
 
+def test_stamps_follow_a_leap_second_that_is_smeared_over_a_day_within_a_hundredth_of_a_millisecond() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    stamps(clock, deadlines, 5)
+    smeared_ns = 0.0
+    for _ in range(3000):
+        smeared_ns += PERIOD_NS / 86_400
+        clock.set_by_ns = -round(smeared_ns)
+        before = deadlines.stamp_ns
+        deadlines.wait()
+        assert abs(deadlines.stamp_ns - before - PERIOD_NS) <= 100
+    assert abs(deadlines.stamp_ns - clock.wall_ns()) < 10_000
+
+
+def test_a_machine_that_was_suspended_has_missed_nothing_and_its_stamps_follow_at_once() -> None:
+    """The monotonic clock stands still meanwhile, and the system clock does not."""
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    before = stamps(clock, deadlines, 5)[-1]
+    clock.set_by_ns += 8 * 3_600_000_000_000
+    index, _ = deadlines.wait()
+    assert (index, deadlines.missed) == (5, 0)
+    assert deadlines.stamp_ns - before == PERIOD_NS + 8 * 3_600_000_000_000
+
+
 def test_an_empty_window_tells_zeros() -> None:
     assert Window(10).percentiles() == Percentiles(0.0, 0.0, 0.0)
 

@@ -187,6 +187,17 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
     assert result.exact, result.text()
 
 
+def test_a_daemon_that_was_paused_counts_what_it_missed_and_goes_on(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed") as daemon, Tracker(daemon.session):
+        before = daemon.until(lambda now: now["mode"] == "follow")
+        daemon.process.send_signal(signal.SIGSTOP)
+        time.sleep(1.0)
+        daemon.process.send_signal(signal.SIGCONT)
+        after = daemon.until(lambda now: now["tick"] > before["tick"] + 400 and now["mode"] == "follow")
+        assert after["missed"] - before["missed"] >= 400
+        assert after["tick"] - before["tick"] > after["missed"] - before["missed"]
+
+
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     """Nor where Zenoh does not show it the first; a daemon of another cell does. That a cell is
     free once its daemon has ended or was killed: test_taught_places_survive_a_restart.

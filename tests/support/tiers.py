@@ -48,6 +48,8 @@ SLOW = (  # the longest first: so they begin first
     "daemon/test_survival.py",
     "daemon/test_daemon.py",
     "daemon/test_start.py",
+    "daemon/test_systemd.py",
+    "cli/test_serve_check.py",
     "core/test_warm_up.py",
     "scribe/test_scribe.py",
     "test_static.py",

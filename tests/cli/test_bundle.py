@@ -1,0 +1,149 @@
+"""`thirdhand bundle`: what the archive holds, that no secret is in it, and that it is whole or not
+there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from service.cli.bundle import without_keys
+from service.cli.main import main
+from service.files.mcap_reader import Messages
+from service.files.replay import replay
+from service.settings.config import Settings
+from support.cell import Tracker, serving, told
+from support.paths import ROOT
+
+SECRET = "c2VjcmV0LWtleQ"  # the planted parameter of an endpoint
+KEY = "-----BEGIN EC PRIVATE KEY-----\nMHcCAQEEI-planted\n-----END EC PRIVATE KEY-----"
+CELL = """
+[network]
+listen = ["tcp/127.0.0.1:0#iface=lo;connect_private_key_base64={secret}"]
+[files]
+state = "{folder}/state"
+record = "{folder}/recordings"
+rerun = false
+"""
+
+
+def unpacked(path: Path) -> dict[str, bytes]:
+    """The files of an archive by name."""
+    with tarfile.open(path) as archive:
+        entries = archive.getmembers()
+        assert all(one.isfile() and not one.name.startswith(("/", "..")) for one in entries)
+        return {one.name: archive.extractfile(one).read() for one in entries}  # type: ignore[union-attr]
+
+
+def everything_in(name: str, content: bytes, folder: Path) -> bytes:
+    """A file's content, of a recording all that its compressed parts hold."""
+    if not name.endswith(".mcap"):
+        return content
+    (folder / "taken.mcap").write_bytes(content)
+    messages = Messages(folder / "taken.mcap")
+    data = b"".join(message.data for _, _, message in messages)
+    assert len(data) > 10_000
+    return b"".join([content, data, *messages.attachments.values(), repr(messages.metadata).encode()])
+
+
+def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, output = tmp_path / "bench.toml", tmp_path / "bundle.tar.gz"
+    config.write_text(f"# {SECRET}\n" + CELL.format(folder=tmp_path, secret=SECRET))
+    assert told("certificates", str(tmp_path / "keys")).returncode == 0
+    keys = [path.read_text() for path in (tmp_path / "keys").rglob("*key*") if path.is_file()]
+    assert len(keys) > 5
+    network = f'[network]\nlisten = ["tcp/127.0.0.1:0#iface=lo;connect_private_key_base64={SECRET}"]\n'
+    arguments = ("--arm", "assumed", "--record", str(tmp_path / "recordings"))
+    with serving(tmp_path, *arguments, network=network) as daemon, Tracker(daemon.session):
+        daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
+        daemon.until(lambda now: os.stat(now["scribe"]["recording"]).st_size > 50_000)
+        with daemon.log.open("a") as log:  # as if somebody had printed them
+            log.write(f"a line\ntls/bench:7447#connect_private_key_base64={SECRET}\n{KEY}\n{keys[0]}\n")
+        options = ("--config", str(config), "--log", str(daemon.log), "--connect", daemon.endpoint)
+        assert main(["bundle", "--output", str(output), *options]) == 0
+        printed = capsys.readouterr().out
+        assert daemon.end() == 0
+
+    found = unpacked(output)
+    (recording,) = (name for name in found if name.startswith("recordings/"))
+    assert set(found) == {
+        *("README.txt", "status.json", "doctor.txt", "versions.txt", "log.txt", "settings.json", recording),
+    }
+    listed = [line.split(": ")[0] for line in printed.splitlines()[1:]]
+    assert set(listed) == set(found) - {"README.txt"}
+    assert all(f"{name}: " in found["README.txt"].decode() for name in listed)
+    for name, content in found.items():
+        whole = everything_in(name, content, tmp_path)
+        for secret in (SECRET, "planted", *(line for key in keys for line in key.splitlines()[1:-1])):
+            assert secret.encode() not in whole, name
+    assert output.stat().st_mode & 0o077 == 0
+
+    assert json.loads(found["status.json"])["mode"] == "follow"
+    settings = msgspec.json.decode(found["settings.json"], type=Settings)
+    assert (settings.network.listen, settings.files.rerun) == (("tcp/127.0.0.1:0",), False)
+    assert "left hand" in found["doctor.txt"].decode()
+    versions = found["versions.txt"].decode()
+    assert all(f"{name}: " in versions for name in ("thirdhand", "python", "cpu", "eclipse-zenoh"))
+    assert "listening" not in found["log.txt"].decode()  # that is on standard output
+    assert "a line\ntls/bench:7447#(left out)\n(a private key, left out)\n" in found["log.txt"].decode()
+    (tmp_path / "cut.mcap").write_bytes(found[recording])
+    result = replay(tmp_path / "cut.mcap")  # a recording that was being written, up to its cut
+    assert result.identical == result.ticks > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("listen tcp/[::1]:7447#a=b, as", "listen tcp/[::1]:7447#(left out), as"),
+        ('["tls/bench.local:7447#key=y","udp/1.2.3.4:1"]', '["tls/bench.local:7447#(left out)","udp/1.2.3.4:1"]'),
+        ("unixsock-stream//run/x.sock#key=y", "unixsock-stream//run/x.sock#(left out)"),
+        ("# a comment, stage #2, tcp/127.0.0.1:7447", "# a comment, stage #2, tcp/127.0.0.1:7447"),
+        ("cut: -----BEGIN PRIVATE KEY-----\nMHcC", "cut: (a private key, left out)"),
+    ],
+)  # fmt: skip
+def test_only_what_may_be_secret_is_left_out_of_a_text(text: str, left: str) -> None:
+    assert without_keys(text) == left
+
+
+def test_without_a_daemon_the_archive_says_so_and_has_the_newest_recording(tmp_path: Path) -> None:
+    config, output = tmp_path / "bench.toml", tmp_path / "bundle.tar.gz"
+    config.write_text(CELL.format(folder=tmp_path, secret=SECRET))
+    (tmp_path / "recordings").mkdir()
+    for name in ("thirdhand-20260101T000000Z", "thirdhand-20260102T000000Z", "thirdhand-b-20260103T000000Z"):
+        (tmp_path / "recordings" / f"{name}.mcap").write_bytes(b"a recording")
+        os.utime(tmp_path / "recordings" / f"{name}.mcap", (0, 0))
+    done = told("bundle", "--output", str(output), "--config", str(config), "--connect", "tcp/127.0.0.1:1")
+    assert done.returncode == 0, done.stderr
+    found = unpacked(output)
+    assert "nothing listens" in found["status.json"].decode()
+    assert "nothing listens" in found["doctor.txt"].decode()
+    assert found["log.txt"]
+    assert [name for name in found if "recordings/" in name] == ["recordings/thirdhand-20260102T000000Z.mcap"]
+
+
+def test_what_prevents_an_archive_is_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    reach = ("--connect", "tcp/127.0.0.1:1")
+    for code, words, arguments in (
+        (1, "nowhere.log: No such file or directory", ("--log", "nowhere.log")),
+        (2, "there is no folder", ("--output", str(tmp_path / "nowhere" / "x.tar.gz"))),
+        (2, "is a folder", ("--output", str(tmp_path))),
+        (1, "cannot read configuration", ("--config", "nowhere.toml")),
+    ):
+        output = ("--output", str(tmp_path / "bundle.tar.gz"))
+        done = told("bundle", *output, *reach, *arguments)
+        assert (done.returncode, words in done.stderr) == (code, True), done.stderr
+    command = [sys.executable, "-m", "service", "bundle", "--output", str(tmp_path / "bundle.tar.gz"), *reach]
+    full = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+    )  # fmt: skip
+    assert (full.returncode, "File too large" in full.stderr, "Traceback" in full.stderr) == (1, True, False)
+    assert list(tmp_path.iterdir()) == []

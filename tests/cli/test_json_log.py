@@ -1,0 +1,44 @@
+"""`thirdhand serve --log json`: each line of the log is an object, also the last one."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from support.cell import serving, thirdhand
+from support.paths import ROOT
+
+
+def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(tmp_path: Path) -> None:
+    with serving(tmp_path, "--arm", "assumed", "--log", "json") as daemon:
+        daemon.client.ask("hold")
+        daemon.client.ask("resume")
+        assert daemon.end() == 0
+        lines = [json.loads(line) for line in daemon.log.read_text().splitlines()]
+    assert {tuple(line) for line in lines} == {("time", "level", "logger", "message")}
+    assert "ended: the daemon of cell thirdhand" in lines[-1]["message"]
+    assert lines[0]["time"].endswith("+00:00")
+    for code, words, arguments in (
+        (2, "cell: '*' given", ("--cell", "*")),
+        (1, "cannot read configuration", ("--config", "nowhere.toml")),
+        (1, "nowhere.npz", ("--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
+    ):
+        done = thirdhand("serve", "--log", "json", *arguments, env=os.environ | {"HOME": str(tmp_path)})
+        last = json.loads(done.stderr.splitlines()[-1])
+        assert (done.returncode, last["level"], words in last["message"]) == (code, "error", True), done.stderr
+
+
+def test_an_unexpected_failure_is_an_object_with_its_exception(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom service.cli import serve\nfrom service.cli.main import main\n"
+        "serve.starting = None\nsys.exit(main(['serve', '--log', 'json']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
+    line = json.loads(done.stderr)
+    assert (done.returncode, line["level"]) == (1, "error")
+    assert "Traceback" in line["exception"]

@@ -1,0 +1,206 @@
+"""`thirdhand metrics`: a scrape, parsed by Prometheus's own client, and the alerts on it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import Metric
+from prometheus_client.parser import text_string_to_metric_families
+from prometheus_client.registry import Collector
+
+from service.cli.metrics import exposed
+from service.client import Client
+from service.contract.records import Mode, Reason
+from service.contract.requests import Status
+from service.daemon.launch import free_port
+from support.cell import Tracker, serving, thirdhand, told, until
+from support.paths import ROOT
+
+RULES = ROOT / "examples" / "thirdhand.rules.yml"
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def samples(text: str) -> Samples:
+    """The values of a scraped page by name and labels, without the cell."""
+    found = {}
+    for family in text_string_to_metric_families(text):
+        for one in family.samples:
+            labels = frozenset((name, value) for name, value in one.labels.items() if name != "cell")
+            assert (one.name, labels) not in found
+            found[one.name, labels] = one.value
+    return found
+
+
+def value(found: Samples, name: str, **labels: str) -> float | None:
+    return found.get((f"thirdhand_{name}", frozenset(labels.items())))
+
+
+@contextlib.contextmanager
+def page(endpoint: str) -> Iterator[str]:
+    """The address of the page that `thirdhand metrics` serves, until the context ends."""
+    command = [sys.executable, "-m", "service", "metrics", "--listen", "127.0.0.1:0", "--connect", endpoint]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        timer = threading.Timer(60, process.kill)
+        timer.start()
+        try:
+            assert process.stderr is not None
+            found = re.search(r"http://127\.0\.0\.1:\d+/metrics", process.stderr.readline())
+            assert found is not None
+            yield found[0]
+        finally:
+            timer.cancel()
+            process.terminate()
+
+
+def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(tmp_path: Path) -> None:
+    network = f"[network]\nlisten = ['tcp/127.0.0.1:{free_port()}']\n"
+    arguments = ("--arm", "assumed", "--record", str(tmp_path / "records"))
+
+    def scrape() -> Samples:
+        with urllib.request.urlopen(address, timeout=20) as reply:
+            assert reply.headers["Content-Type"].startswith("text/plain")
+            return samples(reply.read().decode())
+
+    with contextlib.ExitStack() as closing:
+        with serving(tmp_path, *arguments, network=network) as daemon:
+            address = closing.enter_context(page(daemon.endpoint))
+            with Tracker(daemon.session):
+                daemon.session.put("thirdhand/hands/left", b"no message")
+                now = daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
+                found = scrape()
+            later = Client(daemon.session).status()
+            assert value(found, "up") == 1
+            assert value(found, "info", version=later.version, skill=later.skill) == 1
+            assert [value(found, "mode", mode=mode) for mode in ("hold", "follow", "fault")] == [0, 1, 0]
+            assert value(found, "reason", reason="operator") == 0
+            assert now["tick"] < (value(found, "ticks_total") or 0) <= later.tick + 1
+            assert value(found, "rejected_samples_total", cause="malformed hands/left") == 1
+            assert 0 < (value(found, "lateness_seconds", quantile="0.5") or 0) < 1
+            assert 0 < (value(found, "work_seconds", quantile="0.99") or 0) < 1
+            assert 0 < (value(found, "latency_seconds", quantile="1") or 0) < 10
+            assert 20e6 < (value(found, "memory_bytes", process="scribe") or 0) < 5e9
+            assert 20e6 < (value(found, "memory_bytes", process="daemon") or 0) < 5e9
+            assert (value(found, "disk_free_bytes") or 0) > 0
+            assert value(found, "recording") == 1
+            daemon.process.kill()
+            daemon.process.wait(20)
+        assert scrape() == {("thirdhand_up", frozenset()): 0.0}
+        with serving(tmp_path, *arguments, network=network):
+            until(lambda: value(scrape(), "up") == 1, "it did not connect again", within_s=30)
+
+
+STATUS = {
+    "cell": "lab/one",
+    "mode": "hold",
+    "reason": "stale_hand",
+    "flags": ["stuck"],
+    "tick": 99,
+    "rate_hz": 499.5,
+    "missed": 7,
+    "realtime": True,
+    "memory_locked": False,
+    "skill": 'a "skill"\\',
+    "places": [],
+    "rejected": {"jumped": 3},
+    "hand_age_ms": {},
+    "hand_distance_m": 0.25,
+    "hand_limit_m_s": 0.3,
+    **{name: {"p50": 1.0, "p99": 2.0, "max": 4.0} for name in ("lateness_us", "work_us", "latency_ms")},
+    "scribe": {"state": "recording", "lost": 5, "restarts": 1, "free_mb": 1000, "mb_per_hour": 500.0},
+    "endpoints": [],
+    "version": "0.1.0",
+    "sources": {"left": {"rate_hz": 100.0, "age_ms": 20.0}, "right": {}},
+    "stage": ["handover", "carry"],
+    "stage_belief": 0.75,
+    "error_probability": 0.5,
+    "memory_mb": {"daemon": 100.0},
+}
+
+
+def exposition(statuses: dict[str, Status | None]) -> str:
+    """The page for statuses of cells by name."""
+
+    class Given(Collector):
+        def collect(self) -> Iterator[Metric]:
+            return iter(exposed(statuses))
+
+    registry = CollectorRegistry()
+    registry.register(Given())
+    return generate_latest(registry).decode()
+
+
+def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
+    now = msgspec.convert(STATUS, Status)
+    found = samples(exposition({"lab/one": now}))
+    expected = {
+        ("ticks_total",): 100,
+        ("missed_deadlines_total",): 7,
+        ("memory_locked",): 0,
+        ("lateness_seconds", ("quantile", "0.99")): 2e-6,
+        ("latency_seconds", ("quantile", "1")): 4e-3,
+        ("source_age_seconds", ("source", "left")): 0.02,
+        ("source_age_seconds", ("source", "right")): None,
+        ("stage_probability", ("begin", "handover"), ("end", "carry")): 0.75,
+        ("disk_free_bytes",): 1e9,
+        ("recording_bytes_per_hour",): 5e8,
+        ("memory_bytes", ("process", "daemon")): 1e8,
+        ("lost_ticks_total",): 5,
+        ("flag", ("flag", "stuck")): 1,
+        ("flag", ("flag", "unsure")): 0,
+        ("info", ("version", "0.1.0"), ("skill", 'a "skill"\\')): 1,
+    }
+    for (name, *labels), figure in expected.items():
+        assert value(found, name, **dict(labels)) == (None if figure is None else pytest.approx(figure)), name
+    for kind, codes in (("mode", Mode), ("reason", Reason)):
+        states = [one for (name, _), one in found.items() if name == f"thirdhand_{kind}"]
+        assert (len(states), sum(states)) == (len(codes) - (codes is Reason), 1)
+    two = exposition({"lab/one": now, "lab/two": None})
+    assert 'thirdhand_up{cell="lab/two"} 0.0' in two
+    assert two.count('"lab/two"') == 1
+    assert two.count("# TYPE thirdhand_up gauge") == 1
+
+
+def test_the_alerts_use_metrics_that_exist() -> None:
+    rules = [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
+    known = {name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))}
+    named = {name for rule in rules for name in re.findall(r"thirdhand_\w+", rule["expr"])}
+    assert len(rules) == 10
+    assert len(named) > 8
+    assert named <= known
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
+def test_prometheus_accepts_the_alerts() -> None:
+    done = subprocess.run(
+        ["promtool", "check", "rules", str(RULES)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_prevents_the_page_is_a_sentence_and_an_exit_code(tmp_path: Path) -> None:
+    done = told("metrics", "--connect", "tcp/127.0.0.1:1")
+    assert (done.returncode, "is a daemon or a router running there?" in done.stderr) == (1, True)
+    done = told("metrics", "--listen", "no-port")
+    assert (done.returncode, "PORT or HOST:PORT needed" in done.stderr) == (2, True)
+    with serving(tmp_path, "--arm", "assumed") as daemon, socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        done = thirdhand("metrics", "--listen", address, "--connect", daemon.endpoint)
+        assert (done.returncode, f"--listen {address}: Address already in use" in done.stderr) == (1, True)
+    code = "import sys; sys.modules['prometheus_client'] = None; from service.cli.main import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "metrics"], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
+    assert (done.returncode, "pip install 'thirdhand[metrics]'" in done.stderr) == (1, True)

@@ -1,0 +1,157 @@
+"""`thirdhand serve --check`: one line for each condition of a start, and nothing started or left
+behind. `thirdhand status --exit-code`: a fault is seen from the exit code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.daemon.launch import free_port
+from support.cell import serving, told
+from support.paths import RECORDINGS, ROOT
+
+TLS, FOREIGN = "tls/127.0.0.1:0", "tcp/192.0.2.1:7447"  # the second is an address that no machine has
+FAILS_ONCE = """
+import pathlib
+from service.core import controller
+
+def step(self, tick, *rest, honest=controller.Controller.step):
+    if (mark := pathlib.Path({mark!r})).exists():
+        mark.unlink()
+        raise RuntimeError("sabotaged")
+    return honest(self, tick, *rest)
+
+controller.Controller.step = step
+"""
+CELL = """
+[network]
+listen = ["{listen}"]
+{network}
+[files]
+state = "{folder}/state"
+record = "{folder}/recordings"
+{files}
+"""
+
+
+def cell(folder: Path, *, listen: str = "tcp/127.0.0.1:0", network: str = "", files: str = "", before: str = "") -> str:
+    """The path of a cell's settings in a folder."""
+    path = folder / "cell.toml"
+    path.write_text(before + CELL.format(listen=listen, folder=folder, network=network, files=files))
+    return str(path)
+
+
+def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str, list[str]]:
+    """What the check prints, by level and condition, after its exit code was compared."""
+    done = told("serve", "--check", "--config", cell(folder, **settings), *arguments)
+    assert done.returncode == code, done.stdout + done.stderr
+    found: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        match = re.fullmatch(r"(ok|wrong) +(\w+) +(.+)", line)
+        assert match is not None, line
+        found.setdefault(f"{match[1]} {match[2]}", []).append(match[3])
+    return found
+
+
+def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_path: Path) -> None:
+    found = lines(tmp_path, code=0)
+    assert list(found) == [
+        *("ok configuration", "ok arm", "ok skill", "ok state", "ok recordings", "ok disk", "ok port"),
+    ]
+    assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
+
+
+@pytest.mark.parametrize(
+    ("condition", "words", "settings", "arguments"),
+    [
+        ("configuration", "rate_hz: 3 given; a whole number from 50 to 1000", {"before": "rate_hz = 3\n"}, ()),
+        ("configuration", "cannot read configuration nowhere.toml", {}, ("--config", "nowhere.toml")),
+        ("configuration", "other machines could move the arm", {}, ("--listen", "tcp/10.0.0.1:7447")),
+        ("configuration", "no-arm.urdf", {"before": '[arm]\nurdf = "no-arm.urdf"\n'}, ()),
+        ("skill", "nowhere.npz", {}, ("--skill", "nowhere.npz")),
+        ("skill", "golden.mcap", {}, ("--skill", str(RECORDINGS / "golden.mcap"))),
+        ("state", "is not a folder", {"before": "cell = 'lab/x'\n"}, ()),
+        ("recordings", "README.md is not a folder", {}, ("--record", str(ROOT / "README.md" / "x"))),
+        ("disk", "room on that disk needed", {"files": "segment_mb = 1e12"}, ()),
+        ("certificates", "certificate.pem: a folder made by", {"listen": TLS, "network": "certificate = 'none'"}, ()),
+        ("certificates", "cannot read the Zenoh configuration", {"network": "zenoh_config = 'none.json5'"}, ()),
+        ("router", "Connection refused", {}, ("--connect", "tcp/127.0.0.1:1")),
+        ("port", "Address already in use", {}, ("--listen", "TAKEN")),
+        ("port", "Cannot assign requested address", {"network": "allow_insecure = true"}, ("--listen", FOREIGN)),
+    ],
+)
+def test_what_prevents_a_start_is_one_line_and_exit_code_1(
+    condition: str, words: str, settings: dict[str, str], arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    if condition == "state":
+        (tmp_path / "state").write_text("a file")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        given = [f"tcp/127.0.0.1:{taken.getsockname()[1]}" if one == "TAKEN" else one for one in arguments]
+        found = lines(tmp_path, *given, code=1, **settings)
+    assert [level for level in found if level.startswith("wrong ")] == [f"wrong {condition}"]
+    assert words in found[f"wrong {condition}"][0]
+    assert {path.name for path in tmp_path.iterdir()} <= {"cell.toml", "state"}
+
+
+def test_certificates_are_dated_and_keys_in_endpoints_are_not_shown(tmp_path: Path) -> None:
+    assert told("certificates", str(tmp_path / "new"), "--days", "20").returncode == 0
+    secured = f"certificate = '{tmp_path}/new/daemon'\n"
+    endpoint = "tls/127.0.0.1:0#connect_private_key_base64=c2VjcmV0"
+    found = lines(tmp_path, code=0, listen=endpoint, network=secured)
+    end = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=20)
+    assert f"valid until {end:%Y-%m-%d}" in found["ok certificates"][0]
+    assert "c2VjcmV0" not in str(found)
+
+
+@contextlib.contextmanager
+def unprivileged() -> Iterator[None]:
+    """A context in which this process has no rights of the superuser."""
+    own = os.geteuid()
+    os.seteuid(65534 if own == 0 else own)
+    try:
+        yield
+    finally:
+        os.seteuid(own)
+
+
+def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
+    for folder in (ROOT, *ROOT.parents):
+        if os.geteuid() == 0 and folder.stat().st_mode & 0o005 != 0o005:
+            pytest.skip(f"other users cannot read {folder}")
+    lines(tmp_path, code=0)  # all imports and files of this check have been read
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(0o755)
+    tmp_path.chmod(0o555)
+    try:
+        with unprivileged():
+            done = told("serve", "--check", "--config", str(tmp_path / "cell.toml"))
+    finally:
+        tmp_path.chmod(0o755)
+    assert done.returncode == 1, done.stdout
+    assert done.stdout.count(f"{tmp_path} cannot be written by user") == 2, done.stdout
+
+
+def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(tmp_path: Path) -> None:
+    listen, mark = f"tcp/127.0.0.1:{free_port()}", tmp_path / "mark"
+    network, sabotage = f"[network]\nlisten = ['{listen}']\n", FAILS_ONCE.format(mark=str(mark))
+    with serving(tmp_path, "--arm", "assumed", network=network, before=sabotage) as daemon:
+        found = lines(tmp_path, code=0, listen=listen)
+        assert found["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
+        found = lines(tmp_path, "--cell", "another", code=1, listen=listen)
+        assert "Address already in use" in found["wrong port"][0]
+        status = ("status", "--exit-code", "--connect", daemon.endpoint)
+        assert told(*status).returncode == 0
+        mark.touch()
+        daemon.until(lambda now: now["mode"] == "fault")
+        for more in ((), ("--json",)):
+            done = told(*status, *more)
+            assert (done.returncode, "fault" in done.stdout) == (1, True)
+    assert told("status", "--exit-code", "--watch").returncode == 2

@@ -1,0 +1,205 @@
+"""The daemon under a service manager: the notifications that systemd gets, the watchdog of the
+loop, restarts that do not follow by themselves, and the unit in examples/.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.cli.main import parser
+from service.client import Client, RefusedError
+from service.daemon.systemd import Systemd
+from sim.scene import Scene
+from support.cell import Daemon, Tracker, serving, told
+from support.paths import ROOT
+
+UNIT = ROOT / "examples" / "thirdhand@.service"
+PING_S = 0.2
+STANDS_STILL = """
+import pathlib, time
+from service.core import controller
+
+def step(self, tick, *rest, honest=controller.Controller.step):
+    while pathlib.Path({mark!r}).exists():
+        time.sleep(0.01)
+    return honest(self, tick, *rest)
+
+controller.Controller.step = step
+"""
+
+
+class Manager:
+    """A service manager's end of the notifications."""
+
+    def __init__(self, path: Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(path))
+
+    def heard(self, seconds: float, until: str = "\n") -> list[str]:
+        """The assignments that arrive within this time, or until one of them arrives."""
+        found, end = list[str](), time.monotonic() + seconds
+        while until not in found and (left := end - time.monotonic()) > 0:
+            self.socket.settimeout(left)
+            try:
+                found += self.socket.recv(4096).decode().splitlines()
+            except TimeoutError:
+                break
+        return found
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    found = Manager(tmp_path / "notify")
+    with found.socket:
+        yield found
+
+
+def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
+    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "mark"
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
+    arguments = ("--arm", "assumed", "--hold")
+    with serving(tmp_path, *arguments, before=STANDS_STILL.format(mark=str(mark))) as daemon, Tracker(daemon.session):
+        started = manager.heard(30, "READY=1")
+        assert started[-1] == "READY=1"
+        assert "STATUS=starting: importing" in started[0]
+        assert any(one.startswith("EXTEND_TIMEOUT_USEC=") for one in started)
+        for _ in range(3):
+            assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+
+        engaged_by_resume(daemon)
+        mark.touch()
+        manager.heard(3 * PING_S)  # a ping for the last tick may be under way
+        before = daemon.client.ask("status")["tick"]
+        assert "WATCHDOG=1" not in manager.heard(8 * PING_S)
+        assert daemon.client.ask("status")["tick"] == before  # all but the loop goes on
+        mark.unlink()
+        assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+
+        daemon.process.send_signal(signal.SIGKILL)
+        daemon.process.wait(20)
+    manager.heard(0.1)
+    with serving(tmp_path, *arguments) as daemon, Tracker(daemon.session):
+        assert manager.heard(30, "READY=1")[-1] == "READY=1"
+        engaged_by_resume(daemon)
+        assert daemon.end() == 0
+    assert {"STOPPING=1"} < set(manager.heard(1.0))
+
+
+def engaged_by_resume(daemon: Daemon) -> None:
+    """Check that the arm holds, with both hands in sight, until an operator's resume."""
+    daemon.until(lambda now: len(now["hand_age_ms"]) == 2 and max(now["hand_age_ms"].values()) < 100)
+    client, end = Client(daemon.session), time.monotonic() + 1.0
+    while time.monotonic() < end:
+        now = client.status()
+        assert (now.mode, now.reason) == ("hold", "operator")
+    with pytest.raises(RefusedError, match="does not hold the arm"):
+        client.resume("somebody")
+    client.resume()
+    daemon.until(lambda now: now["mode"] == "follow")
+
+
+def test_without_a_manager_nothing_is_sent_and_a_wrong_environment_does_not_matter(
+    manager: Manager, tmp_path: Path
+) -> None:
+    address = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+    for environment in (
+        {"WATCHDOG_USEC": "1"},
+        address,
+        address | {"WATCHDOG_USEC": "soon"},
+        address | {"WATCHDOG_USEC": "1", "WATCHDOG_PID": str(os.getppid())},
+        {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1"},
+    ):
+        Systemd(environment).progressed(1)
+        Systemd(environment | {"NOTIFY_SOCKET": environment.get("NOTIFY_SOCKET", "")}).progressed(1)
+    assert manager.heard(0.1) == []
+    pinged = Systemd(address | {"WATCHDOG_USEC": "2", "WATCHDOG_PID": str(os.getpid())})
+    for tick in (5, 5, 5, 6):
+        pinged.progressed(tick)
+        time.sleep(0.001)
+    assert manager.heard(0.1) == ["WATCHDOG=1", "WATCHDOG=1"]
+
+
+def test_an_abstract_socket_is_reached() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0thirdhand-{os.getpid()}")
+        manager.settimeout(5)
+        Systemd({"NOTIFY_SOCKET": f"@thirdhand-{os.getpid()}"}).notify("READY=1")
+        assert manager.recv(100) == b"READY=1"
+
+
+def commands() -> dict[str, list[str]]:
+    """The commands of the unit by the name of their setting, as words."""
+    lines = (line.partition("=") for line in UNIT.read_text(encoding="utf-8").splitlines())
+    return {name: value.split() for name, _, value in lines if name.startswith("Exec")}
+
+
+def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
+    options = {name: parser().parse_args(words[1:]) for name, words in commands().items()}
+    assert [options[name].run for name in ("ExecStartPre", "ExecStart")] == ["cli.serve_check.check", "cli.serve.serve"]
+    assert options["ExecStart"].hold
+    assert {str(one.config) for one in options.values()} == {"/etc/thirdhand/%i.toml"}
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+    program = tmp_path / "thirdhand"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    unit = tmp_path / UNIT.name
+    text = UNIT.read_text(encoding="utf-8").replace(commands()["ExecStart"][0], str(program))
+    for spoilt in ("", "WatchdogSec=soon\n"):  # the second one is refused, so the tool reads the file
+        unit.write_text(text.replace("[Install]", f"{spoilt}[Install]"))
+        done = subprocess.run(
+            ["systemd-analyze", "verify", str(tmp_path / "thirdhand@bench.service")],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert bool(done.returncode or done.stderr) == bool(spoilt), done.stderr
+
+
+def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
+    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, filled = tmp_path / "disk", tmp_path / "disk" / "filled"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("a small disk cannot be mounted here")
+    try:
+        (disk / "state").mkdir()
+        (tmp_path / "state").symlink_to(disk / "state")
+        with contextlib.suppress(OSError), filled.open("wb", buffering=0) as file:
+            while file.write(bytes(4096)):
+                pass
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
+        with serving(tmp_path, "--arm", "assumed", "--record", str(disk / "records")) as daemon:
+            checked = told(
+                "serve", "--check", "--config", str(tmp_path / "cell.toml"), "--record", str(disk / "records")
+            )
+            assert (checked.returncode, "wrong  disk" in checked.stdout) == (1, True), checked.stdout
+            assert manager.heard(30, "READY=1")[-1] == "READY=1"
+            with pytest.raises(RefusedError, match=r"cannot save via-points in .*: No space left on device"):
+                Client(daemon.session).add(Scene().via_points())
+            assert Client(daemon.session).status().places == ()
+            assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+            filled.unlink()
+            Client(daemon.session).add(Scene().via_points())
+            daemon.until(lambda now: now["scribe"]["state"] == "recording", 30)
+            assert daemon.end() == 1  # the recording lacks ticks, which its last line counts
+            assert daemon.log.read_text().endswith("ticks are not recorded\n")
+        assert len(list((disk / "state" / "thirdhand").glob("places-*.json"))) == 1
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
