@@ -111,8 +111,8 @@ class Daemon:
         if reached := self._saved_stage.read(stored):
             self._own.append(order("stage", reached))
             log.info("the task continues at via-point %s, which an earlier run had reached", reached)
-        self._way_finder = WayFinder(settings, skill_worker, self._own.append, self.note)
-        self._task_limits = TaskLimits(settings, skill_worker, self.note)
+        self._way_finder = WayFinder(settings, skill_worker, self._own.append, self._note_beside)
+        self._task_limits = TaskLimits(settings, skill_worker, self._note_beside)
         self._notes = (0, 0)  # time [s] and the number of notes in this second
         self._failed_at: int | None = None
         self._late_ns = self._began_ns = 0
@@ -156,6 +156,11 @@ class Daemon:
         self._notes = (second, self._notes[1] + 1)
         if self._notes[1] <= MAX_NOTES_PER_S:
             self._say(text)
+
+    def _note_beside(self, text: str) -> None:
+        """Note what work beside the loop tells, unless the daemon ends, which ends this work too."""
+        if not self._stop.is_set():
+            self.note(text)
 
     def _say(self, text: str) -> None:
         log.info(text)
