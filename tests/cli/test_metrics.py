@@ -53,7 +53,7 @@ def page(endpoint: str) -> Iterator[str]:
     """The address of the page that `thirdhand metrics` serves, until the context ends."""
     command = [sys.executable, "-m", "service", "metrics", "--listen", "127.0.0.1:0", "--connect", endpoint]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        timer = threading.Timer(60, process.kill)
+        timer = threading.Timer(300, process.kill)
         timer.start()
         try:
             assert process.stderr is not None
