@@ -123,4 +123,4 @@ class ScribeReport(msgspec.Struct, frozen=True):
     errors: tuple[str, ...] = ()  # new error messages
     free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
     mb_per_hour: float | None = None  # recent growth of recordings and drawings; None: not known yet
-    keep_mb_left: float | None = None  # growth before the oldest recordings are deleted; None: no limit
+    keep_mb_left: float | None = None  # growth until each file takes an older one's place; None: without end

@@ -26,10 +26,11 @@ from service.process import child
 from service.process.child import Child, Progress
 from service.scribe.protocol import pack, unpack
 from service.scribe.scribe import Scribe
-from service.settings.config import Files, Settings
+from service.settings.config import Files, RecordingSettings, Settings
 from support.recorded import SKILL, at_ns, state_after, tell, ticks
 
-SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False))
+WHOLE = RecordingSettings(frames_hz=0)
+SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False), recording=WHOLE)
 
 
 @contextmanager
@@ -63,7 +64,7 @@ def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
 
 
 def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
-    settings = Settings(cell="hall/bench-1", rate_hz=50)
+    settings = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
     with scribe(settings, folder=tmp_path) as one:
         told = tell(one, 200)
         one.note("requests", "via_points add handover", at_ns(20))
@@ -78,7 +79,7 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in told
     ]
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in told]
-    assert [step.tick for step in steps if step.state is not None] == [49, 99, 149, 199]
+    assert [step.tick for step in steps if step.state is not None] == [49]  # the next one is due 10 s later
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
     assert Path(status["rrd"]).stat().st_size > 20_000
 
@@ -290,7 +291,7 @@ def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
 DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
-from service.settings.config import Files, Settings
+from service.settings.config import Files, RecordingSettings, Settings
 from service.scribe.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
 one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))
