@@ -48,7 +48,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "replay", "tune", "bench"),
-    "set up": ("arm", "calibrate", "certificates", "completion"),
+    "set up": ("prepare", "arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -349,6 +349,11 @@ def parser() -> argparse.ArgumentParser:
     )
     c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
     _reach(c, one=False)
+
+    about = "Compiles, once on a machine, what a daemon needs, so that `serve` starts at once."
+    c = command("prepare", about, "thirdhand prepare --config cell.toml")
+    option(c, "--config", "CELL", f"the cell, as its arm's number of joints matters: {ARM_HELP}")
+    option(c, "--skill", "FILE", "the skill of the cell (default: the shipped soldering skill)", type=Path)
 
     c = command(
         "arm",

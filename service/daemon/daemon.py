@@ -103,6 +103,7 @@ class Daemon:
         self._failure = ""  # message of the service's last failure
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
+        start.stage("loop")
         self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
         self._saved_stage = SavedStage(settings)
         if reached := self._saved_stage.read(stored):
@@ -295,7 +296,7 @@ class Daemon:
             if self._frame["tick"] >= 0:
                 self._is_open = True
                 self._start.over()
-                log.info("started in %.0f s", self._start.age_s)
+                log.info("started in %s", self._start.duration)
                 self._queryables.open(self._session)
                 announce(self)
 
@@ -433,7 +434,9 @@ def serve(
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
         with start.counting():
+            start.stage("skill")
             skill = load_skill(skill_path, settings)
+            start.stage("rehearsal")
             daemon = Daemon(settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start)
         for number in STOPPING:
             signal.signal(number, daemon.stop)

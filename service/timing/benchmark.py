@@ -126,7 +126,9 @@ def _whole(
             [step.timing for path in recorded for step in Recording.open(path).steps() if step.timing], TIMING
         )
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
+        began = service.log.read_text().partition("started in ")[2].partition("\n")[0]
     return heard | {
+        "start": began,
         "granted": {"realtime": status.realtime, "memory_locked": status.memory_locked},
         "ticks": int(timing["tick"][-1] - timing["tick"][0]),
         "missed": int(timing["missed"][-1] - timing["missed"][0]),
@@ -188,6 +190,7 @@ def text(report: dict[str, Any]) -> str:
     rows += [
         f"    {'real-time scheduling' if granted['realtime'] else 'ordinary scheduling'}, memory "
         f"{'locked' if granted['memory_locked'] else 'not locked'}",
+        *([f"    started in {whole['start']}"] if whole.get("start") else []),
         "",
         f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and {ratios['lateness_p99.9']:.2f} times "
         "the empty loop's;",
