@@ -228,7 +228,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "files", "FILE", "a recording (.mcap); several are compared", nargs="+")
     option(c, "--html", "FILE", "also write the report with plots as a page to this file")
     option(c, "--csv", "DIR", "also write each table, and every tick, as CSV files to this folder")
-    option(c, "--lerobot", "DIR", "also write joints, hands and commands as a LeRobot 3.0 data set to this new folder")
+    option(c, "--lerobot", "DIR", "also write joints, hands, images, commands as a LeRobot data set to this new folder")
     option(c, "--fps", "N", "the rate of the data set [rows/s]", 50, type=within(int, 1, 1000))
     option(c, "--task", "TEXT", "the task of the data set, in words (default: the name of the skill)")
 

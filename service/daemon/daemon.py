@@ -36,6 +36,7 @@ from service.daemon.clock import (
     ask_for_real_time,
     run_beside_real_time,
 )
+from service.daemon.foreign_streams import ForeignStreams
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.machine import BUSY_WINDOW_S, Machine
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
@@ -120,6 +121,7 @@ class Daemon:
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
+        self._foreign = ForeignStreams(self._session, settings.recording.also, send=scribe.image, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
         self._start, self._is_open = start, False
@@ -327,6 +329,7 @@ class Daemon:
                 self._streams.show(self._frame, self._controller.state)
                 self._scribe.note("status", payload.decode(), time.time_ns())
                 self._objects.poll()
+                self._foreign.poll()
                 try:
                     self._scribe.supervise()
                 except OSError as error:  # a lack of descriptors or memory may be temporary

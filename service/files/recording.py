@@ -24,11 +24,12 @@ from mcap.summary import Summary
 
 from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
-from service.contract.messages import SceneObject
+from service.contract.images import COMPRESSED_IMAGE, CompressedImage, decode_image
+from service.contract.messages import SceneObject, WireError
 from service.core.frame import DType, Outputs, Record, Tick, encode
 from service.core.transforms import Frames
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing, machine
-from service.files.mcap_reader import FileFault, Messages
+from service.files.mcap_reader import FileFault, Messages, full_name
 from service.files.pose_streams import ENDINGS
 from service.files.steps import REPLAYED, Gap, Step, checksum, layout_in, steps
 from service.files.urdf_markers import with_markers
@@ -192,6 +193,14 @@ class Recorder(McapFile):
         self.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
         return None
 
+    def image(self, key: str, data: bytes, time_ns: int) -> None:
+        """Write an image, the CDR bytes of a CompressedImage, under a whole key. A replay ignores
+        it.
+        """
+        if not self._begun:
+            self._begin(time_ns)
+        self.put(f"/{key}", COMPRESSED_IMAGE, data, time_ns, self._sequence)
+
     def flush(self) -> None:
         super().flush()
         self.kept, self.pending = self.kept + self.pending, 0
@@ -309,6 +318,13 @@ class Recording:
         reported = "".join(gap.why for gap in gaps)
         read = "no tick was read" if last is None else f"the last tick read is {last}"
         return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported]
+
+    def images(self) -> Iterator[tuple[str, CompressedImage, int]]:
+        """Key, image and time of arrival [ns] of each image, in order."""
+        for schema, channel, message in Messages(self.path):
+            if full_name(schema) == COMPRESSED_IMAGE:
+                with contextlib.suppress(WireError):  # of a format that is neither JPEG nor PNG
+                    yield channel.topic.lstrip("/"), decode_image(message.data), message.log_time
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
         """Key, text and time [ns] of the notes under these keys, in order; objects as JSON."""

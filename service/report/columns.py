@@ -27,7 +27,7 @@ from service.learning.skill_file import SkillError, decoded
 KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "tool", "joints"),
     *("joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages", "rejected"),
-    *("mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability"),
+    *("mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability", "closure"),
 )
 MOTION = ("setpoint", "setpoint_velocity", "tool", "joints", "joint_velocities", "joint_accelerations")
 BLOCK = 4096  # ticks whose whole frames are held in memory

@@ -234,6 +234,10 @@ class Segments:
         """Write a text under `<cell>/<key>`."""
         self._safely(lambda recorder: recorder.note(key, text, time_ns))
 
+    def image(self, key: str, data: bytes, time_ns: int) -> None:
+        """Write an image, the CDR bytes of a CompressedImage, under a whole key."""
+        self._safely(lambda recorder: recorder.image(key, data, time_ns))
+
     def flush(self) -> None:
         """Pass the written data to the operating system, check that the files are at their paths,
         and delete the oldest recordings every PRUNE_S.

@@ -282,6 +282,7 @@ class Files(Section, frozen=True):
 class RecordingSettings(Section, frozen=True):
     """The content of recordings."""
 
+    also: tuple[CellName, ...] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
     frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0  # whole frames a second; others as checksums; 0: every frame
 
 
