@@ -189,7 +189,7 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     return {
         "success": report["success"],
         "events": report["events"],
-        "ticks": len(timing),
+        "ticks": len(found.columns.frames),
         "missed": found.missed,
         "rate_hz": round(found.rate_hz, 3),
         "latency_ms": report["latency_ms"],

@@ -7,10 +7,11 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import msgspec
 
-from service.cli.status import AHEAD_MS
+from service.cli.status import AHEAD_MS, disk, hours_until_full
 from service.contract.channels import BY_KEY, key
 from service.contract.evidence import Evidence, explained
 from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do
@@ -326,33 +327,23 @@ def _privileges_and_recording(now: Status) -> Iterator[Finding]:
     found, wanted = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
     yield judged(now.memory_locked, "memory", found, wanted, what_to_do(Condition.NOT_LOCKED))
     scribe = now.scribe
-    state, lost, free_mb = scribe.get("state", "off"), scribe.get("lost", 0), scribe.get("free_mb")
+    state, lost = scribe.get("state", "off"), scribe.get("lost", 0)
     if state == "off":
         yield Finding("note", "recording", "off", "", what_to_do(Condition.NOT_RECORDED))
         return
     found = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
     is_fine = state != "interrupted" and not lost
     yield judged(is_fine, "recording", found, "recording, none lost", what_to_do(Condition.TICKS_LOST))
-    if free_mb is not None:
-        yield _disk(free_mb, scribe.get("mb_per_hour"), scribe.get("keep_mb_left"))
+    if scribe.get("free_mb") is not None:
+        yield _disk(scribe)
 
 
-def _disk(free_mb: float, mb_per_hour: float | None, keep_mb_left: float | None) -> Finding:
+def _disk(scribe: Mapping[str, Any]) -> Finding:
     """Free space for recordings, and the time until it is full."""
-    found, lasts = f"{free_mb / 1000:.1f} GB free where it records", True
-    if mb_per_hour:
-        found += f", {mb_per_hour / 1000:.2g} GB an hour written"
-        if keep_mb_left is not None and keep_mb_left < free_mb:
-            found += f": in {_hours(keep_mb_left / mb_per_hour)} the oldest recordings begin to be removed"
-        else:
-            found += f": full in {_hours(free_mb / mb_per_hour)}"
-            lasts = free_mb / mb_per_hour > DISK_LASTS_H
+    free_mb, full_h = scribe["free_mb"], hours_until_full(scribe)
     wanted = f"more than {FREE_MB / 1000:g} GB, and {DISK_LASTS_H:g} h"
-    return judged(free_mb > FREE_MB and lasts, "disk", found, wanted, what_to_do(Condition.DISK_SHORT))
-
-
-def _hours(hours: float) -> str:
-    return f"{hours:.1f} h" if hours < 48 else f"{hours / 24:.0f} days"
+    is_fine = free_mb > FREE_MB and (full_h is None or full_h > DISK_LASTS_H)
+    return judged(is_fine, "disk", disk(scribe), wanted, what_to_do(Condition.DISK_SHORT))
 
 
 def _outside(at: Vector3, box: tuple[Vector3, Vector3]) -> float:

@@ -48,7 +48,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
-    "set up": ("arm", "calibrate", "certificates", "completion"),
+    "set up": ("prepare", "arm", "calibrate", "certificates", "completion"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -234,7 +234,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "files", "FILE", "a recording (.mcap); several are compared", nargs="+")
     option(c, "--html", "FILE", "also write the report with plots as a page to this file")
     option(c, "--csv", "DIR", "also write each table, and every tick, as CSV files to this folder")
-    option(c, "--lerobot", "DIR", "also write joints, hands and commands as a LeRobot 3.0 data set to this new folder")
+    option(c, "--lerobot", "DIR", "also write joints, hands, images, commands as a LeRobot data set to this new folder")
     option(c, "--fps", "N", "the rate of the data set [rows/s]", 50, type=within(int, 1, 1000))
     option(c, "--task", "TEXT", "the task of the data set, in words (default: the name of the skill)")
 
@@ -371,6 +371,11 @@ def parser() -> argparse.ArgumentParser:
     c = command("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
     option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
+
+    about = "Compiles, once on a machine, what a daemon needs, so that `serve` starts at once."
+    c = command("prepare", about, "thirdhand prepare --config cell.toml")
+    option(c, "--config", "CELL", f"the cell, as its arm's number of joints matters: {ARM_HELP}")
+    option(c, "--skill", "FILE", "the skill of the cell (default: the shipped soldering skill)", type=Path)
 
     c = command(
         "arm",

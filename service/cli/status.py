@@ -6,7 +6,8 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
+from typing import Any
 
 import msgspec
 import zenoh
@@ -146,6 +147,7 @@ def rows(now: Status) -> dict[str, str]:
         "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
         or "none",
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
+        "disk": disk(scribe) if scribe.get("free_mb") is not None else "",
         "lost": f"{scribe['lost']} ticks are not recorded" if scribe.get("lost") else "",
         "trouble": "; ".join(scribe.get("errors") or ()),
     }
@@ -161,6 +163,27 @@ def rows(now: Status) -> dict[str, str]:
     if clocks := differing_clocks(now):
         found["latency"] = f"unknown: {clocks}"
     return {name: text for name, text in found.items() if text}
+
+
+def hours_until_full(scribe: Mapping[str, Any]) -> float | None:
+    """Time until the disk of the recordings is full [h]; None if it never is, or is not known."""
+    free_mb, rate, left_mb = (scribe.get(name) for name in ("free_mb", "mb_per_hour", "keep_mb_left"))
+    return free_mb / rate if rate and free_mb is not None and (left_mb is None or left_mb >= free_mb) else None
+
+
+def disk(scribe: Mapping[str, Any]) -> str:
+    """Free space where the scribe records, in words, and how long it lasts if that is known."""
+    rate, found = scribe.get("mb_per_hour"), f"{scribe['free_mb'] / 1000:.1f} GB free where it records"
+    if not rate:
+        return found
+    found += f", {rate / 1000:.2g} GB an hour written"
+    if (full_h := hours_until_full(scribe)) is not None:
+        return f"{found}: full in {_hours(full_h)}"
+    return f"{found}: never full, in {_hours(scribe['keep_mb_left'] / rate)} each new file takes an older one's place"
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:.1f} h" if hours < 48 else f"{hours / 24:.0f} days"
 
 
 def _doubt(now: Status) -> str:

@@ -166,8 +166,8 @@ def convert(
         viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
         if viewer.arm_remark:
             say(viewer.arm_remark)
-        notes = recording.notes("requests", "log", OBJECTS_NOTE)
-        note = next(notes, None)
+        notes, images = recording.notes("requests", "log", OBJECTS_NOTE), recording.images()
+        note, image = next(notes, None), next(images, None)
         count, time_ns, last = 0, 0, None
         gaps: list[Gap] = []
         shown = 0
@@ -184,6 +184,9 @@ def convert(
             while note is not None and note[2] <= time_ns:
                 viewer.note(*note)
                 note = next(notes, None)
+            while image is not None and image[2] <= time_ns:
+                viewer.image(*image)
+                image = next(images, None)
             if step.skill is not None:
                 viewer.learn(step.skill)
             viewer.add(step.frame, time_ns, step.timing, step.events)

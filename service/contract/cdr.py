@@ -194,11 +194,13 @@ def encode_transforms(stamp_ns: int, transforms: Sequence[Transform]) -> bytes:
     return bytes(out)
 
 
-def encode_tick(index: int, events: Sequence[int], lost: int) -> bytes:
+def encode_tick(index: int, events: Sequence[int], lost: int, checksum: int | None = None) -> bytes:
     """CDR bytes of a `thirdhand/msg/Tick`: its index, the number of lost ticks before it, and the
-    numbers of its events' kinds in inbox order.
+    numbers of its events' kinds in inbox order. With the checksum of its frame they are those of a
+    `thirdhand/msg/CheckedTick`.
     """
-    return CDR_HEADER + _TICK.pack(index, lost, len(events)) + bytes(events)
+    tick = CDR_HEADER + _TICK.pack(index, lost, len(events)) + bytes(events)
+    return tick if checksum is None else tick + bytes(-len(events) % 4) + _LENGTH.pack(checksum)
 
 
 def encode_skill(data: bytes) -> bytes:
@@ -410,8 +412,9 @@ def decode_transforms(data: bytes, frames: tuple[str, ...] = ()) -> list[tuple[s
     return found
 
 
-def decode_tick(data: bytes) -> tuple[int, bytes, int]:
-    """Index, numbers of the event kinds and count of lost ticks in the CDR bytes of a Tick.
+def decode_tick(data: bytes) -> tuple[int, bytes, int, int | None]:
+    """Index, numbers of the event kinds, count of lost ticks and checksum of the frame in the CDR
+    bytes of a Tick, which has no checksum (None), or of a CheckedTick.
 
     Raises WireError.
     """
@@ -420,7 +423,9 @@ def decode_tick(data: bytes) -> tuple[int, bytes, int]:
     index, lost, count = _TICK.unpack_from(data, 4)
     if len(data) - 20 < count:
         raise WireError(f"a Tick with {count} events in {len(data)} bytes")
-    return index, data[20 : 20 + count], lost
+    at = 20 + count + -count % 4
+    is_checked = len(data) >= at + _LENGTH.size
+    return index, data[20 : 20 + count], lost, _LENGTH.unpack_from(data, at)[0] if is_checked else None
 
 
 def decode_skill(data: bytes) -> bytes:

@@ -62,6 +62,7 @@ STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_strin
 TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
 OBJECTS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects)
 TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
+CHECKED_TICK = TICK._replace(type="thirdhand/msg/CheckedTick")  # `tick` in recordings that leave out frames
 SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
 FRAME, TIMING, STATE = (
     Codec(f"thirdhand/msg/{name}", "cdr", cdr.encode_record, cdr.decode_record) for name in ("Frame", "Timing", "State")
@@ -146,15 +147,15 @@ CHANNELS = (
             queryable=True, recorded=False),
     Channel("fault", STRING, "recording", "what of the service itself failed", event=EventKind(7, STRING)),
     Channel("way", STRING, "recording", "postures out of a place where it was stuck", event=EventKind(8, STRING)),
-    Channel("tick", TICK, "recording", "index and event kinds", rate="every tick", every=1),
-    Channel("frame", FRAME, "recording", "all that the tick decided", rate="every tick", every=1),
-    Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="every tick", every=1),
-    Channel("state", STATE, "recording", "all that the next frame depends on", rate="every second"),
+    Channel("tick", TICK, "recording", "index, event kinds, and the checksum of the frame", rate="every tick", every=1),
+    Channel("frame", FRAME, "recording", "all that the tick decided", rate="25 Hz, and each decision"),
+    Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="with frames, and late ticks"),
+    Channel("state", STATE, "recording", "all that the next frame depends on", rate="every 10 s"),
     Channel("skill_in_force", SKILL, "recording", "the skill, where it may have changed", rate="after a gap"),
     Channel("requests", STRING, "recording", "each request and how it was answered"),
     Channel("log", STRING, "recording", "what went wrong with the recording"),
     Channel("/tf", TRANSFORMS, "recording", "the arm's links, tool, setpoint, target and hands, for viewers",
-            rate="every 5th tick", every=5),
+            rate="10 Hz", every=5),
     Channel("/robot_description", STRING, "recording", "the arm's URDF", rate="once"),
 )  # fmt: skip
 BY_KEY = {channel.key: channel for channel in CHANNELS}

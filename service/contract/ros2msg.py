@@ -41,6 +41,7 @@ _DEFINITIONS = {
     ),
     "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers\n",
     "thirdhand/Tick": "int64 index\nuint32 lost\nuint8[] events\n",
+    "thirdhand/CheckedTick": "int64 index\nuint32 lost\nuint8[] events\nuint32 checksum\n",
     "thirdhand/Skill": "uint8[] data\n",
 }
 

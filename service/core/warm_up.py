@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,12 +14,13 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.arm.stage import Arm
 from service.core.controller import Controller
-from service.core.frame import Event, Tick, as_array, order
+from service.core.frame import Event, Tick, Vector, as_array, order
 from service.core.intake.arm_samples import still_ticks
 from service.core.intake.hand_estimator import STILL
 from service.core.limiter.stage import Limiter
 from service.core.separation.stage import Separation
 from service.core.skill import ORDER, TURNS
+from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import delayed, moving_features, turning
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
@@ -27,6 +29,7 @@ from service.core.skill.support import LocalErrors
 from service.core.skill.unseen import deviation_m
 from service.settings.config import Settings
 
+FLAT: dict[str, Any] = {"kernel": GaussianKernel(1.0), "lambda_mean": 1.0}
 FOLLOWED_TICKS = 30  # ticks of the rehearsal, once the arm's posture is trusted
 SAMPLE_EVERY = 5  # ticks between two samples of the hands
 
@@ -36,8 +39,8 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
 
     Without this, the first hand that a loop receives would delay it by a fifth of a second, or by
     many seconds on a new machine, where the functions are not compiled yet. A skill that is loaded
-    later may contain an orientation and a gripper. The rehearsal therefore runs with and without
-    them.
+    later may contain an orientation and a gripper, and may be of another kind. The rehearsal
+    therefore runs with and without them, and predicts with a skill without via-points too.
     """
     arm = msgspec.structs.replace(settings.arm, source="state")
     plain = replace(skill, threshold=math.inf)
@@ -49,6 +52,9 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     for one in (plain, skill):
         one.predict(*np.zeros((3, 2, 3)))
     plain.elsewhere(np.zeros((2, 3, 3)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
+    other = replace(plain, model=HandsKMP(KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)))
+    other.predict(*np.zeros((3, 2, 3)))
+    other.model.mean(np.zeros((1, 6)))
     _rarely(settings, urdf)
     for one in (skill, plain):
         _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
@@ -89,6 +95,9 @@ def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
 
 def _flat(skill: Skill, outputs: int) -> KMP:
     """Primitive with the skill's input whose outputs are 0 everywhere."""
-    inputs = skill.model.primitive.inputs[:1]
-    nothing = Gaussians(np.zeros((1, outputs)), np.eye(outputs)[None])
-    return KMP.fit(inputs, nothing, kernel=GaussianKernel(1.0), lambda_mean=1.0)
+    return KMP.fit(*_point(skill.model.primitive.inputs[:1], outputs), **FLAT)
+
+
+def _point(inputs: Vector, outputs: int) -> tuple[Vector, Gaussians]:
+    """A reference of one point whose outputs are 0."""
+    return inputs, Gaussians(np.zeros((1, outputs)), np.eye(outputs)[None])

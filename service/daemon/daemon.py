@@ -37,6 +37,7 @@ from service.daemon.clock import (
     ask_for_real_time,
     run_beside_real_time,
 )
+from service.daemon.foreign_streams import ForeignStreams
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
@@ -106,6 +107,7 @@ class Daemon:
         self._failure = ""  # message of the service's last failure
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
+        start.stage("loop")
         self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
         self._saved_stage = SavedStage(settings)
         if reached := self._saved_stage.read(stored):
@@ -123,6 +125,7 @@ class Daemon:
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
         self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
+        self._foreign = ForeignStreams(self._session, settings.recording.also, send=scribe.image, say=self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
         self._start, self._is_open = start, False
@@ -307,7 +310,7 @@ class Daemon:
             if self._frame["tick"] >= 0:
                 self._is_open = True
                 self._start.over()
-                log.info("started in %.0f s", self._start.age_s)
+                log.info("started in %s", self._start.duration)
                 self._queryables.open(self._session)
                 announce(self)
                 self._start.systemd.notify("READY=1")
@@ -340,6 +343,7 @@ class Daemon:
                 self._streams.show(self._frame, self._controller.state)
                 self._scribe.note("status", payload.decode(), time.time_ns())
                 self._objects.poll()
+                self._foreign.poll()
                 try:
                     self._scribe.supervise()
                 except OSError as error:  # a lack of descriptors or memory may be temporary
@@ -452,7 +456,9 @@ def serve(
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
         with start.counting():
+            start.stage("skill")
             skill = load_skill(skill_path, settings)
+            start.stage("rehearsal")
             daemon = Daemon(
                 settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 import os
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -29,6 +31,7 @@ REPORT_EVERY_S = 1.0  # interval of reports on a terminal
 LOG_EVERY_S = 20.0  # interval of reports in the log
 MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
+START_NICE = -5  # 3 times the weight of an ordinary process, as an arm waits for the start
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 
 
@@ -44,15 +47,22 @@ class Startup:
         self._compiled: list[str] = []  # functions in compilation, callers first; empty for a library's functions
         self._functions: list[Any] = []  # all compiled functions that the loop may call, once they are imported
         self._is_over, self._begun_s = threading.Event(), time.monotonic()
+        self._stages = [("network", time.monotonic() - _process_age_s()), ("imports", self._begun_s)]
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
         self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
         self._reporter = threading.Thread(target=self._report, name="start", daemon=True)
         self._reporter.start()
 
+    def stage(self, name: str) -> None:
+        """Note that the next stage of the start begins."""
+        self._stages.append((name, time.monotonic()))
+
     @property
-    def age_s(self) -> float:
-        """Time since the start [s]."""
-        return time.monotonic() - self._begun_s
+    def duration(self) -> str:
+        """Time since the process began and the time of each stage [s], in words."""
+        stages = itertools.pairwise([*self._stages, ("", time.monotonic())])
+        parts = ", ".join(f"{name} {end_s - begin_s:.2f} s" for (name, begin_s), (_, end_s) in stages)
+        return f"{time.monotonic() - self._stages[0][1]:.2f} s: {parts}"
 
     @property
     def progress(self) -> str:
@@ -121,12 +131,23 @@ class Startup:
             print(CLEAR, end="", file=sys.stderr, flush=True)
 
 
+def _process_age_s() -> float:
+    """Time since this process was started [s]."""
+    begun_ticks = int(Path("/proc/self/stat").read_text(errors="replace").rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - begun_ticks / os.sysconf("SC_CLK_TCK")
+
+
 @contextlib.contextmanager
 def starting(settings: Settings) -> Iterator[Startup]:
     """The start of a cell's daemon, which occupies the cell until the context ends.
 
+    This thread runs ahead of ordinary processes, if granted.
+
     Raises OccupiedError, UnreachableError.
     """
+    if os.getpriority(os.PRIO_PROCESS, 0) == 0:
+        with contextlib.suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, 0, START_NICE)
     network = settings.network
     roles = network.revoked, network.ros2_domain, (*ros2.of_settings(settings.ros2),)
     with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:

@@ -2,8 +2,9 @@
 reads them.
 
 All channels are ROS 2 messages in CDR, so ROS 2 tools, Rerun and Foxglove can read a recording.
-Settings, skill and URDF are attachments. Each tick has the messages `tick`, its events, `frame`,
-`timing` and sometimes `state`. Messages that only other tools need are ignored on reading.
+Settings, skill and URDF are attachments. Each tick has the messages `tick`, its events, `timing`,
+`frame` or its checksum, and sometimes `state`. Messages that only other tools need are ignored on
+reading.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from mcap.summary import Summary
 
 from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
-from service.contract.messages import SceneObject
+from service.contract.images import COMPRESSED_IMAGE, CompressedImage, decode_image
+from service.contract.messages import SceneObject, WireError
 from service.core.frame import DType, Outputs, Record, Tick, encode
 from service.core.transforms import Frames
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing, machine
-from service.files.mcap_reader import FileFault, Messages
+from service.files.mcap_reader import FileFault, Messages, full_name
 from service.files.pose_streams import ENDINGS
-from service.files.steps import REPLAYED, Gap, Step, layout_in, steps
+from service.files.steps import REPLAYED, Gap, Step, checksum, layout_in, steps
 from service.files.urdf_markers import with_markers
 from service.settings.config import Settings, robot_description, without_secrets
 
@@ -37,6 +39,10 @@ OBJECTS_NOTE = "objects"
 # Settings that earlier recordings lack, with the values at which these versions behaved.
 EARLIER_SETTINGS = {"tool": {"engage_speed": 0.0}}
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
+DECISIONS = ("mode", "reason", "flags", "commanded", "stage")  # a frame that changes one of these is kept
+NOTED_US = 1000.0  # the timing of a tick that begins or ends this late is kept
+SHOWN_HZ = 10.0  # rate of what other tools show, in a thin recording; a replay makes it anew
+STATE_EVERY_S = 10.0  # interval of states in a thin recording; each takes 60 kB
 FORMAT = "2"  # a recording with another layout of State or Frame cannot be replayed
 _LATCHED_QOS = (
     "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
@@ -49,6 +55,10 @@ class Recorder(McapFile):
 
     With `checksums` (4 bytes for each tick number) frames may be left out. Such a file is not
     compressed, so that a version control system can store the differences of its versions.
+
+    A `thin` recording holds what a replay needs to compute each frame again, and its checksum. It
+    has `[recording] frames_hz` whole frames a second with their timing, those that change one of
+    DECISIONS, and the timing of late ticks. What only viewers need, it has SHOWN_HZ times a second.
     """
 
     def __init__(
@@ -62,10 +72,20 @@ class Recorder(McapFile):
         metadata: Mapping[str, str] | None = None,
         time_ns: int = 0,
         checksums: bytes = b"",
+        thin: bool = False,
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
         self._settings, self.skill, self._state = settings, skill, state  # `skill` is the file of the skill in force
         self._begun, self._sequence = False, 0
+        self._every = self._shown_every = self._state_every = 1  # [ticks]
+        self._types: dict[str, str] = {}  # of messages whose type differs from the table's
+        self._tf_every = channels.BY_KEY["/tf"].every
+        if thin:
+            self._every, self._state_every = settings.frame_every, round(STATE_EVERY_S * settings.rate_hz)
+            self._shown_every = self._every * max(1, round(settings.recording.frames_hz / SHOWN_HZ))
+            self._types, self._tf_every = {"tick": channels.CHECKED_TICK.type}, self._shown_every
+        self._decided: tuple[int, ...] = ()  # the newest frame's DECISIONS
+        self._state_from = 0  # a state is due from this tick on
         self._frames = Frames(settings, self._urdf)
         self._topics = {
             channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
@@ -95,7 +115,8 @@ class Recorder(McapFile):
 
     def _put(self, key: str, data: bytes, time_ns: int, *, qos: str = "") -> None:
         """Write one message on a channel, in the type in which its events are recorded."""
-        self.put(self._topics[key], channels.BY_KEY[key].kept_as.type, data, time_ns, self._sequence, qos=qos)
+        kind = self._types.get(key) or channels.BY_KEY[key].kept_as.type
+        self.put(self._topics[key], kind, data, time_ns, self._sequence, qos=qos)
 
     def write(
         self,
@@ -108,18 +129,25 @@ class Recorder(McapFile):
         skill: bytes | None = None,
         lost: int = 0,
         outputs: Outputs = (),
+        last: bool = False,
     ) -> None:
         """Write a tick, its frame, and its published messages by key.
 
         After `lost` ticks that could not be recorded, a replay continues from `state` (after this
-        tick) and `skill` (in force). The skill is written only if it differs from the last one.
+        tick) and `skill` (in force). The skill is written only if it differs from the last one. The
+        `last` tick has its state, from which the next recording continues.
         """
         if not self._begun:
             self._begin(time_ns)
         put, self._sequence = self._put, tick.index
         self.pending += 1
         kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
-        put("tick", cdr.encode_tick(tick.index, kinds, lost), time_ns)
+        checked = checksum(frame) if self._types and frame is not None else None
+        if frame is not None and not self._is_kept(frame, lost):
+            frame = None
+            if timing is not None and timing["lateness_us"] + timing["work_us"] < NOTED_US:
+                timing = None
+        put("tick", cdr.encode_tick(tick.index, kinds, lost, checked), time_ns)
         for event in tick.inbox:
             if event.kind == "skill":
                 self.skill = event.payload
@@ -130,17 +158,25 @@ class Recorder(McapFile):
             put("frame", encode(frame), time_ns)
         if timing is not None:
             put("timing", encode(timing), time_ns)
-        if state is not None:
+        if state is not None and (lost or last or tick.index >= self._state_from):
+            self._state_from = tick.index + self._state_every
             put("state", encode(state), time_ns)
         if skill is not None and skill != self.skill:
             self.skill = skill
             put("skill_in_force", cdr.encode_skill(skill), time_ns)
-        for key, payload in outputs:
+        for key, payload in outputs if tick.index % self._shown_every == 0 else ():
             put(key, payload, time_ns)
-        if frame is not None and tick.index % channels.BY_KEY["/tf"].every == 0:
+        if frame is not None and tick.index % self._tf_every == 0:
             frames = [*self._frames.fixed, *self._frames.moving(frame, frame["joints"].tolist())]
             put("/tf", cdr.encode_transforms(time_ns, frames), time_ns)
         self.part_ends()
+
+    def _is_kept(self, frame: Record, lost: int) -> bool:
+        """True if the frame is recorded as a whole."""
+        if self._every == 1:
+            return True
+        before, self._decided = self._decided, tuple(int(frame[name]) for name in DECISIONS)
+        return bool(lost) or self._decided != before or int(frame["tick"]) % self._every == 0
 
     def note(self, key: str, text: str, time_ns: int) -> None:
         """Write a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects in JSON
@@ -156,6 +192,14 @@ class Recorder(McapFile):
         topic = channels.topic(self._settings.cell, key)
         self.put(topic, channels.STRING.type, cdr.encode_string(text), time_ns, self._sequence)
         return None
+
+    def image(self, key: str, data: bytes, time_ns: int) -> None:
+        """Write an image, the CDR bytes of a CompressedImage, under a whole key. A replay ignores
+        it.
+        """
+        if not self._begun:
+            self._begin(time_ns)
+        self.put(f"/{key}", COMPRESSED_IMAGE, data, time_ns, self._sequence)
 
     def flush(self) -> None:
         super().flush()
@@ -226,10 +270,10 @@ class Recording:
 
     def ticks(self) -> int | None:
         """The number of ticks in the file's summary; None if the summary is missing."""
-        topic, contents = channels.key(self.settings.cell, "tick"), self._summary()
+        topics, contents = channels.keys_by_topic(self.settings.cell, ("tick",)), self._summary()
         if contents is None or contents.statistics is None:
             return None
-        numbers = [number for number, channel in contents.channels.items() if channel.topic == topic]
+        numbers = [number for number, channel in contents.channels.items() if channel.topic in topics]
         return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
 
     def _summary(self) -> Summary | None:
@@ -274,6 +318,13 @@ class Recording:
         reported = "".join(gap.why for gap in gaps)
         read = "no tick was read" if last is None else f"the last tick read is {last}"
         return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported]
+
+    def images(self) -> Iterator[tuple[str, CompressedImage, int]]:
+        """Key, image and time of arrival [ns] of each image, in order."""
+        for schema, channel, message in Messages(self.path):
+            if full_name(schema) == COMPRESSED_IMAGE:
+                with contextlib.suppress(WireError):  # of a format that is neither JPEG nor PNG
+                    yield channel.topic.lstrip("/"), decode_image(message.data), message.log_time
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
         """Key, text and time [ns] of the notes under these keys, in order; objects as JSON."""

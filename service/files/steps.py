@@ -48,10 +48,11 @@ REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 class Step(NamedTuple):
     """One recorded tick: its events, its frame, and the state after it if recorded.
 
-    A step without `frame` holds only a state, before the first tick or after damage; or the
-    recording has a checksum of the frame. If ticks were `lost` before this one, a replay continues
-    from its `state` with the skill in force, which is recorded again if it may have changed.
-    `damage` is the reason why messages before this step cannot be read; empty if all were read.
+    A step without `frame` holds only a state, before the first tick or after damage; or its frame
+    was left out, and the step or the recording has its `checksum`.
+    If ticks were `lost` before this one, a replay continues from its `state` with the skill in
+    force, which is recorded again if it may have changed. `damage` is the reason why messages
+    before this step cannot be read; empty if all were read.
     """
 
     tick: int
@@ -63,6 +64,7 @@ class Step(NamedTuple):
     lost: int = 0
     time_ns: int = 0
     damage: str = ""
+    checksum: int | None = None
 
 
 @dataclass
@@ -84,9 +86,9 @@ class Gap:
         return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
 
 
-def checksum(frame: Frame, outputs: Outputs, state: Record | None) -> int:
-    """A checksum (32 bits) of a tick's frame and published messages, and of the state after it if
-    given.
+def checksum(frame: Frame, outputs: Outputs = (), state: Record | None = None) -> int:
+    """A checksum (32 bits) of a tick's frame, and of its published messages and the state after it
+    if given.
     """
     parts = (encode(frame), *(payload for _, payload in outputs), b"" if state is None else encode(state))
     return zlib.crc32(b"".join(parts))
@@ -123,7 +125,7 @@ def steps(
         if step is None:
             return
         numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
-        lacks_frame = outputs and whole and "frame" not in step
+        lacks_frame = outputs and whole and "frame" not in step and step["checksum"] is None
         if len(messages.faults) > seen and (len(came) != len(numbers) or lacks_frame):
             return
         kinds = [_kind(number) for number in numbers]
@@ -150,9 +152,9 @@ def steps(
                     data = encode(converted(decode(data, then), layouts[name]))
             if name == "tick":
                 yield from finished()
-                index, kinds, lost = cdr.decode_tick(data)
+                index, kinds, lost, recorded_sum = cdr.decode_tick(data)
                 step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
-                step["damage"], damage = damage, ""
+                step["damage"], step["checksum"], damage = damage, recorded_sum, ""
             elif step is None:
                 if name == "state":
                     alone = decode(data, layouts["state"])

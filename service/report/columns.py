@@ -20,14 +20,23 @@ from service.contract.printable import printable, printable_values
 from service.contract.requests import Source
 from service.core.frame import TIMING, Record, Records, Vector, frame_layout
 from service.core.skill.skill import Skill
-from service.files.recording import Recording
+from service.files.recording import DECISIONS, Recording
 from service.files.steps import Gap, Step
 from service.learning.skill_file import SkillError, decoded
 
 KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
     *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
-    *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability"),
+    *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability", "closure"),
+)
+MOTION = (
+    "setpoint",
+    "setpoint_velocity",
+    "setpoint_acceleration",
+    "tool",
+    "joints",
+    "joint_velocities",
+    "joint_accelerations",
 )
 BLOCK = 4096  # ticks whose whole frames are held in memory
 
@@ -62,7 +71,8 @@ class Said(msgspec.Struct, frozen=True):
 class Columns:
     """A recording, tick by tick.
 
-    `frames` (T,) has the fields `KEPT`, `timing` (M,) those of a Timing.
+    `frames` (T,) has the fields `KEPT`, `timing` (M,) those of a Timing. Frames that the recording
+    leaves out are interpolated.
     """
 
     recording: Recording
@@ -100,6 +110,7 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
     blocks: list[Records] = []
     block: list[Record] = []
     timing: list[Record] = []
+    ticks: list[int] = []  # of all frames, recorded or left out
 
     def kept() -> Records:
         return repack_fields(np.array(block, layout)[list(KEPT)])
@@ -109,20 +120,24 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
         if step.lost or step.damage:
             gaps.append(Gap(last, step.tick, step.lost, step.damage))
         last = step.tick
-        if step.frame is None:
+        if step.frame is None and step.checksum is None:
             continue
         found.start_ns = found.start_ns or step.time_ns
         _take_events(found, step)
         if step.lost or step.damage:
-            found.breaks.append(BLOCK * len(blocks) + len(block))
-        block.append(step.frame)
+            found.breaks.append(len(ticks))
+        ticks.append(step.tick)
+        if step.frame is not None:
+            block.append(step.frame)
         if step.timing is not None:
             timing.append(step.timing)
         if len(block) == BLOCK:
             blocks.append(kept())
             block.clear()
-            progress(BLOCK * len(blocks))
+        if len(ticks) % BLOCK == 0:
+            progress(len(ticks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
+    _fill(found, np.array(ticks, np.int64))
     for _, text, _ in recording.notes("status"):
         with contextlib.suppress(msgspec.MsgspecError):  # of another version
             found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
@@ -130,6 +145,35 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
     if found.skills and len(found.frames):
         found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
     return found
+
+
+def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
+    """Give `frames` a row for each of the ticks, whose frames may be left out of the recording.
+
+    Such a row has the newest frame's decisions, as frames that change a decision are recorded. The
+    arm's motion is interpolated up to the next frame, and other numbers if that decides the same.
+    """
+    frames, parts = found.frames, np.zeros(len(ticks), np.int64)
+    if len(frames) == len(ticks) or not len(frames):
+        return
+    parts[found.breaks] = 1
+    parts = np.cumsum(parts)
+    part_of = parts[np.searchsorted(ticks, frames["tick"])]
+    row = np.searchsorted(frames["tick"], ticks, side="right") - 1
+    known = (row >= 0) & (part_of[row] == parts)  # after damage, those before the next frame are unknown
+    found.breaks = (np.flatnonzero(np.diff(parts[known])) + 1).tolist()
+    ticks, row = ticks[known], row[known]
+    after = np.minimum(row + 1, len(frames) - 1)
+    begin, end = frames["tick"][row], frames["tick"][after]
+    motion = np.where(part_of[row] == part_of[after], (ticks - begin) / np.maximum(end - begin, 1), 0.0)
+    alike = np.all([frames[name][row] == frames[name][after] for name in DECISIONS], axis=0)
+    found.frames = frames[row]
+    for name in KEPT:
+        if frames.dtype[name].base.kind == "f":
+            values, to = frames[name][row], frames[name][after]
+            share = motion if name in MOTION else motion * alike
+            found.frames[name] += share.reshape(-1, *(1,) * (values.ndim - 1)) * (to - values)
+    found.frames["tick"] = ticks
 
 
 def _take_events(found: Columns, step: Step) -> None:

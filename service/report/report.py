@@ -137,7 +137,12 @@ class Report:
         self.lasts_s = lasts_s
         self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))
-        self.rate_hz = (len(timing) - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0
+        ticks = (
+            int(((frames["tick"] >= timing["tick"][0]) & (frames["tick"] <= timing["tick"][-1])).sum())
+            if len(timing)
+            else 0
+        )
+        self.rate_hz = (ticks - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0
         self.missed = int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0
         self.lateness_us = Percentiles.of(timing["lateness_us"])
         self.work_us = Percentiles.of(timing["work_us"])

@@ -38,7 +38,9 @@ class RecordingPaths:
         self._newest = datetime.min.replace(tzinfo=UTC)
         self._own: dict[str, bool] = {}  # True for this cell's recordings, by stem
         self._cell = settings.cell.replace("/", "-")
-        self.keep_mb_left: float | None = None  # growth before the oldest are deleted; None: no limit, or not known yet
+        self.keep_mb_left: float | None = (
+            None  # growth before each file takes an older one's place; None: without end, or not known yet
+        )
 
     def next(self) -> tuple[Path | None, Path | None]:
         """Paths of the next recording and of its drawing; None for those not written."""
@@ -64,34 +66,42 @@ class RecordingPaths:
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
     def prune(self, writing: Path | None) -> list[Path]:
-        """Delete the oldest recordings beyond the limits, except the one being written, and return
-        their paths.
+        """Delete the oldest recordings and drawings beyond the limits of each, except those being
+        written, and return their paths.
         """
-        keep_bytes, keep_s = self._settings.files.keep_mb * MB, self._settings.files.keep_hours * 3600
-        if self._folder is None or not (keep_bytes or keep_s):
-            return []
+        files = self._settings.files
+        lefts: list[float | None] = []
+        removed: list[Path] = []
+        for suffix, keep_mb, keep_hours in (
+            (".mcap", files.keep_mb, files.keep_hours),
+            (".rrd", files.rerun_keep_mb, files.rerun_keep_hours),
+        ):
+            found = self._found(suffix) if self._folder is not None and (keep_mb or keep_hours) else []
+            total = sum(size for _, size, _ in found)
+            for path, size, changed in found:
+                too_old = keep_hours and time.time() - changed > keep_hours * 3600
+                too_much = keep_mb and total > keep_mb * MB
+                if (too_old or too_much) and (writing is None or path.stem != writing.stem):
+                    with contextlib.suppress(OSError):
+                        path.unlink()
+                        total -= size
+                        removed.append(path)
+            if suffix == ".mcap" or files.rerun:
+                lefts.append(max(0.0, keep_mb - total / MB) if keep_mb and self._folder is not None else None)
+        self.keep_mb_left = sum(left for left in lefts if left is not None) if None not in lefts else None
+        return removed
+
+    def _found(self, suffix: str) -> list[tuple[Path, int, float]]:
+        """This cell's files of a kind in order, with size [bytes] and time of change [s]."""
+        assert self._folder is not None
         own_names = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
-        found: dict[str, list[tuple[Path, int, float]]] = {}
-        for path in self._folder.glob("*Z*.*"):
-            if path.suffix in (".mcap", ".rrd") and own_names.fullmatch(path.stem) and self._is_own(path):
+        found = []
+        for path in sorted(self._folder.glob(f"*Z*{suffix}")):
+            if path.suffix == suffix and own_names.fullmatch(path.stem) and self._is_own(path):
                 with contextlib.suppress(OSError):
                     about = path.stat()
-                    found.setdefault(path.stem, []).append((path, about.st_size, about.st_mtime))
-        total = sum(size for files in found.values() for _, size, _ in files)
-        removed: list[Path] = []
-        for stem in sorted(found):
-            files = found[stem]
-            too_old = keep_s and time.time() - max(changed for *_, changed in files) > keep_s
-            too_much = keep_bytes and total > keep_bytes
-            if (writing is not None and stem == writing.stem) or not (too_old or too_much):
-                continue
-            for path, size, _ in files:
-                with contextlib.suppress(OSError):
-                    path.unlink()
-                    total -= size
-                    removed.append(path)
-        self.keep_mb_left = max(0.0, keep_bytes - total) / MB if keep_bytes else None
-        return removed
+                    found.append((path, about.st_size, about.st_mtime))
+        return found
 
     def _is_own(self, path: Path) -> bool:
         """True if a recording, or the recording of a drawing, is this cell's.

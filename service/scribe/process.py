@@ -24,10 +24,11 @@ import msgspec
 import numpy as np
 
 from service.contract.explain import in_words
+from service.contract.images import decode_image
 from service.core.frame import state_layout
 from service.process import child
 from service.scribe.paths import RecordingPaths
-from service.scribe.protocol import MAX_PACKET_BYTES, Note, ScribeReport, ScribeSetup, unpack
+from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, unpack
 from service.scribe.segments import Segments
 from service.settings.config import urdf_path
 
@@ -191,6 +192,12 @@ class ScribeProcess:
             self._segments.note(key, text, noted_ns)
             if key != "status" and drawing is not None:
                 drawing.put(lambda viewer: viewer.note(key, text, noted_ns))
+            return
+        if isinstance(received, ImageArrival):
+            image = received
+            self._segments.image(image.key, image.data, image.time_ns)
+            if drawing is not None:
+                drawing.put(lambda viewer: viewer.image(image.key, decode_image(image.data), image.time_ns))
             return
         missing, time_ns = self._segments.write(received), int(received.timing["time_ns"])
         if drawing is None:

@@ -22,6 +22,14 @@ class Note(msgspec.Struct, frozen=True, tag=True, array_like=True):
     time_ns: int
 
 
+class ImageArrival(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """An image's key and time of arrival [ns]; its CDR bytes are sent as a memory file."""
+
+    key: str
+    time_ns: int
+    data: bytes = b""
+
+
 class _Tick(msgspec.Struct, frozen=True, tag=True, array_like=True):
     """One tick in bytes. A skill among its events is None, and is sent as a memory file. The last
     of these files is the skill in force if `with_skill`.
@@ -37,7 +45,7 @@ class _Tick(msgspec.Struct, frozen=True, tag=True, array_like=True):
     with_skill: bool
 
 
-_MESSAGES = msgspec.msgpack.Decoder(_Tick | Note)
+_MESSAGES = msgspec.msgpack.Decoder(_Tick | Note | ImageArrival)
 
 
 class TickMessage(NamedTuple):
@@ -69,13 +77,15 @@ def pack(
     return msgspec.msgpack.encode(sent)
 
 
-def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage | Note:
-    """The tick or the note in a message. `joints` is the arm's number of joints; `skills` are the
-    files sent with the message, in order.
+def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage | Note | ImageArrival:
+    """The tick, note or image in a message. `joints` is the arm's number of joints; `skills` are
+    the files sent with the message, in order.
     """
     sent, files = _MESSAGES.decode(message), iter(skills)
     if isinstance(sent, Note):
         return sent
+    if isinstance(sent, ImageArrival):
+        return msgspec.structs.replace(sent, data=next(files))
     inbox = tuple(Event(kind, next(files) if data is None else data, None) for kind, data in sent.events)
     frame: Record = np.frombuffer(sent.frame, frame_layout(joints))[0]
     timing: Record = np.frombuffer(sent.timing, TIMING)[0]
@@ -88,6 +98,11 @@ def pack_note(key: str, text: str, time_ns: int) -> bytes:
     """The message of a text for the recording, cut to MAX_NOTE_LENGTH."""
     readable = text[:MAX_NOTE_LENGTH].encode(errors="replace").decode()
     return msgspec.msgpack.encode(Note(key, readable, time_ns))
+
+
+def pack_image(key: str, time_ns: int) -> bytes:
+    """The message of an image, without its bytes."""
+    return msgspec.msgpack.encode(ImageArrival(key, time_ns))
 
 
 class ScribeSetup(msgspec.Struct, frozen=True):
@@ -123,4 +138,4 @@ class ScribeReport(msgspec.Struct, frozen=True):
     errors: tuple[str, ...] = ()  # new error messages
     free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
     mb_per_hour: float | None = None  # recent growth of recordings and drawings; None: not known yet
-    keep_mb_left: float | None = None  # growth before the oldest recordings are deleted; None: no limit
+    keep_mb_left: float | None = None  # growth until each file takes an older one's place; None: without end

@@ -24,7 +24,7 @@ import msgspec
 
 from service.core.frame import Outputs, Record, Tick
 from service.process import child
-from service.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, pack_note
+from service.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, pack_image, pack_note
 from service.settings.config import Settings
 
 BUFFER_BYTES = 4 * 1024 * 1024  # the socket holds some seconds of ticks
@@ -41,8 +41,8 @@ MAX_SENDS_PER_TICK = 8  # waiting ticks are sent faster than new ones arrive
 class Scribe:
     """The owner of the scribe process, which sends it ticks and notes.
 
-    `send` and `skip` are for the loop, `start`, `supervise`, `status` and `close` for one other
-    thread, `note` and `keep` for any thread.
+    `send` and `skip` are for the loop, `start`, `supervise`, `image`, `status` and `close` for one
+    other thread, `note` and `keep` for any thread.
 
     In `folder` the process writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another;
     `recording` and `rrd` are explicit paths. Without any of these and without `live_port` no
@@ -186,6 +186,17 @@ class Scribe:
         if target is not None:
             with contextlib.suppress(OSError):
                 target.send(pack_note(key, text, time_ns))
+
+    def image(self, key: str, data: bytes, time_ns: int) -> None:
+        """Send an image, the CDR bytes of a CompressedImage, for recording and viewer. Never waits;
+        an image that does not fit is left out.
+        """
+        target = self._socket
+        if target is not None:
+            fd = child.in_memory(data)
+            with contextlib.suppress(OSError):
+                socket.send_fds(target, [pack_image(key, time_ns)], [fd], socket.MSG_DONTWAIT)
+            os.close(fd)
 
     def supervise(self) -> None:
         """Read the process's reports, and replace a process that is dead or hangs. Call it ten

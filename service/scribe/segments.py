@@ -114,7 +114,8 @@ class Segments:
         try:
             if self._full and shutil.disk_usage(existing_folder(path.parent)).free < MIN_FREE_BYTES:
                 return None
-            return Recorder(path, settings=self._settings, skill=self._skill, state=state, time_ns=time.time_ns())
+            settings, skill, now_ns = self._settings, self._skill, time.time_ns()
+            return Recorder(path, settings=settings, skill=skill, state=state, time_ns=now_ns, thin=True)
         except OSError as error:
             self._failed(path, error)
             _discard(path)
@@ -137,7 +138,7 @@ class Segments:
 
     @property
     def keep_mb_left(self) -> float | None:
-        """Growth before the oldest recordings are deleted [MB]; None without a limit."""
+        """Growth until each file takes an older one's place [MB]; None without a limit."""
         left = self._paths.keep_mb_left
         return None if left is None else round(left)
 
@@ -173,10 +174,11 @@ class Segments:
         self._marked += missing
         self._marked_pending += missing
         self._unmarked = 0
-        self._safely(lambda recorder: _write_tick(recorder, received, missing))
+        is_last = received.state is not None and self._due(now)
+        self._safely(lambda recorder: _write_tick(recorder, received, missing, is_last))
         if self._recorder is not None and not self._recorder.pending:
             self._marked_pending = 0
-        if self._recorder is not None and received.state is not None and self._due(now):
+        if self._recorder is not None and received.state is not None and is_last:
             self._next(received.state)
         return missing
 
@@ -232,6 +234,10 @@ class Segments:
         """Write a text under `<cell>/<key>`."""
         self._safely(lambda recorder: recorder.note(key, text, time_ns))
 
+    def image(self, key: str, data: bytes, time_ns: int) -> None:
+        """Write an image, the CDR bytes of a CompressedImage, under a whole key."""
+        self._safely(lambda recorder: recorder.image(key, data, time_ns))
+
     def flush(self) -> None:
         """Pass the written data to the operating system, check that the files are at their paths,
         and delete the oldest recordings every PRUNE_S.
@@ -271,7 +277,7 @@ class Segments:
         self._complete = path if self._failure is None else None
 
 
-def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None:
+def _write_tick(recorder: Recorder, received: TickMessage, missing: int, is_last: bool) -> None:
     time_ns = int(received.timing["time_ns"])
     recorder.write(
         received.tick,
@@ -282,6 +288,7 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int) -> None
         skill=received.skill,
         lost=missing,
         outputs=received.outputs,
+        last=is_last,
     )
     if missing:
         recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)

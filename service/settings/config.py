@@ -271,8 +271,19 @@ class Files(Section, frozen=True):
     rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
     segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
     segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
-    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's recordings; 0: no limit
-    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # recordings older than this are deleted; 0: no limit
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's .mcap files; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .mcap files older than this are deleted; 0: no limit
+    rerun_keep_mb: Annotated[float, msgspec.Meta(ge=0)] = (
+        10_000.0  # largest size of this cell's .rrd files; 0: no limit
+    )
+    rerun_keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .rrd files older than this are deleted; 0: no limit
+
+
+class RecordingSettings(Section, frozen=True):
+    """The content of recordings."""
+
+    also: tuple[CellName, ...] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
+    frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0  # whole frames a second; others as checksums; 0: every frame
 
 
 class Settings(Section, frozen=True):
@@ -292,6 +303,7 @@ class Settings(Section, frozen=True):
     network: Network = msgspec.field(default_factory=Network)
     ros2: Ros2 = msgspec.field(default_factory=Ros2)
     files: Files = msgspec.field(default_factory=Files)
+    recording: RecordingSettings = msgspec.field(default_factory=RecordingSettings)
     skill: SkillSettings = msgspec.field(default_factory=SkillSettings)
 
     def __post_init__(self) -> None:
@@ -407,6 +419,11 @@ class Settings(Section, frozen=True):
     def period_s(self) -> float:
         """Duration of one tick [s]."""
         return 1.0 / self.rate_hz
+
+    @property
+    def frame_every(self) -> int:
+        """Ticks from one whole frame of a recording to the next."""
+        return max(1, round(self.rate_hz / self.recording.frames_hz)) if self.recording.frames_hz else 1
 
 
 def without_secrets(settings: Settings) -> Settings:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from service.client import Client, open_session
@@ -20,6 +21,7 @@ from service.daemon.launch import launched
 from service.files.recording import Recording
 from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
 from service.process.progress import say
+from service.settings.config import RecordingSettings
 from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import ProbeError, echo, family, probe
@@ -103,7 +105,9 @@ def _whole(
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:
         folder = keep or Path(name)
         arguments, before = ("--joints", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
-        cell: dict[str, Any] = {"settings": cell_of(arm), "record": folder, "program": program}
+        # the timing of each tick is recorded with its frame
+        settings = msgspec.structs.replace(cell_of(arm), recording=RecordingSettings(frames_hz=0))
+        cell: dict[str, Any] = {"settings": settings, "record": folder, "program": program}
         with launched(Path(name), *arguments, **cell, say=say) as service:
             heard = probe("tracker", skill, service.endpoint, echo_at, seconds)
             with open_session(connect=[service.endpoint]) as session:
@@ -122,7 +126,9 @@ def _whole(
             [step.timing for path in recorded for step in Recording.open(path).steps() if step.timing], TIMING
         )
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
+        began = service.log.read_text().partition("started in ")[2].partition("\n")[0]
     return heard | {
+        "start": began,
         "granted": {"realtime": status.realtime, "memory_locked": status.memory_locked},
         "ticks": int(timing["tick"][-1] - timing["tick"][0]),
         "missed": int(timing["missed"][-1] - timing["missed"][0]),
@@ -184,6 +190,7 @@ def text(report: dict[str, Any]) -> str:
     rows += [
         f"    {'real-time scheduling' if granted['realtime'] else 'ordinary scheduling'}, memory "
         f"{'locked' if granted['memory_locked'] else 'not locked'}",
+        *([f"    started in {whole['start']}"] if whole.get("start") else []),
         "",
         f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and {ratios['lateness_p99.9']:.2f} times "
         "the empty loop's;",

@@ -130,6 +130,9 @@ def blueprint(
         _log(),
         row_shares=[4, 1],
     )
+    if cameras := settings.recording.also:
+        views_of = [rrb.Spatial2DView(origin=f"/cameras/{key}", name=key) for key in cameras]
+        bench = rrb.Vertical(bench, rrb.Horizontal(*views_of), row_shares=[3, 2])
     curves = rrb.Vertical(
         rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/stage"), active_tab=0),
         rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from service.contract import cdr
 from service.contract.explain import ExplainedError, in_words
+from service.contract.images import CompressedImage
 from service.contract.joint_states import measured
 from service.contract.messages import SceneObject, WireError
 from service.contract.printable import printable
@@ -44,6 +45,7 @@ from service.viewer.thinning import Thinning
 
 FILE_BATCH_S, LIVE_BATCH_S = 1.0, 0.2
 THIN_BATCH_S = 10.0  # batch of a file with a budget, because each batch takes 50 kB beside its frames
+IMAGE_EVERY_S = 2.0  # interval of images in a file with a budget
 LIVE_MB = 24  # memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
 LIVE_WAITING = 5  # batches that wait for a slow viewer; beyond it, the oldest are left out
 FLUSH_TIMEOUT_S = 5.0
@@ -83,6 +85,7 @@ class _Destination:
             self._dynamic.set_gate(skill[0].threshold)
         self._objects: tuple[SceneObject, ...] = ()
         self._moved: list[tuple[int, tuple[SceneObject, ...]]] = []  # times [ns], objects: to be sent with the frames
+        self._image_ns: dict[str, int] = {}  # time [ns] of the newest image by key
         self._repeated_ns = 0
         self._open = False
         self.redirect(name, sink, path)
@@ -157,6 +160,14 @@ class _Destination:
         places = () if self._skill is None else (point.name for point in self._skill[0].via_points)
         known = (one.name for one in before)
         self.put(list(scene_objects.object_chunks(self._objects, known, places, self._at(time_ns))))
+
+    def show_image(self, key: str, image: CompressedImage, time_ns: int) -> None:
+        """Add one image; with a budget, one of each camera in IMAGE_EVERY_S."""
+        every_ns = 0 if self._thinning is None else IMAGE_EVERY_S * 1e9
+        if self._repeated_ns and not 0 <= time_ns - self._image_ns.get(key, 0) < every_ns:
+            self._image_ns[key] = time_ns
+            column = rr.EncodedImage.columns(blob=[image.data], media_type=[f"image/{image.format}"])
+            self.put([self._at(time_ns)(f"/cameras/{key}", *column)])
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Add one line to the log."""
@@ -400,6 +411,10 @@ class Viewer:
             self._each(lambda destination: destination.show_objects(found, time_ns))
         else:
             self.log(sentence(text), "WARN" if key == "log" else "INFO", time_ns)
+
+    def image(self, key: str, image: CompressedImage, time_ns: int) -> None:
+        """Show an image under `cameras/<key>`."""
+        self._each(lambda destination: destination.show_image(key, image, time_ns))
 
     def log(self, text: str, level: str, time_ns: int) -> None:
         """Show a line in the log; level is INFO, WARN or ERROR."""

@@ -12,6 +12,7 @@ import numpy as np
 from service.contract.records import Mode
 from service.files.recording import Recording
 from service.files.shipped import shipped_skill
+from service.report.columns import read
 from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.load.live import live_run
@@ -117,8 +118,8 @@ def is_evidence(skipped: int) -> bool:
 
 
 def _recorded(path: Path) -> Traces:
-    frames = [step.frame for step in Recording.open(path).steps() if step.frame is not None]
-    following = np.array([frame for frame in frames if frame["mode"] == Mode.FOLLOW])
+    frames = read(Recording.open(path)).frames
+    following = frames[frames["mode"] == Mode.FOLLOW]
     moving = np.linalg.norm(following["hand_velocities"], axis=2).max(axis=1) > MOVING_M_S
     kept = following[int(np.argmax(moving)) :: SERVICE_HZ // SHOWN_HZ]
     return Traces(kept["hands"][:, 0], kept["hands"][:, 1], kept["tool"])

@@ -355,13 +355,19 @@ def test_every_channel_has_a_key_of_its_own_and_a_schema_or_json() -> None:
     assert channels.topic("hall/bench", "/tf") == "/tf"
 
 
-@given(st.binary(max_size=64), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1))
-def test_what_only_recordings_hold_comes_back_too(data: bytes, index: int, lost: int) -> None:
+@given(
+    st.binary(max_size=64),
+    st.integers(-(2**63), 2**63 - 1),
+    st.integers(0, 2**32 - 1),
+    st.none() | st.integers(0, 2**32 - 1),
+)
+def test_what_only_recordings_hold_comes_back_too(data: bytes, index: int, lost: int, checksum: int | None) -> None:
     kinds = bytes(value % len(EVENT_NUMBERS) for value in data)
-    assert cdr.decode_tick(cdr.encode_tick(index, kinds, lost)) == (index, kinds, lost)
+    tick = cdr.encode_tick(index, kinds, lost, checksum)
+    assert cdr.decode_tick(tick) == (index, kinds, lost, checksum)
     assert cdr.decode_skill(cdr.encode_skill(data)) == data
     with pytest.raises(messages.WireError, match="a Tick"):
-        cdr.decode_tick(cdr.encode_tick(index, b"\0", lost)[:-1])
+        cdr.decode_tick(cdr.encode_tick(index, b"\0", lost)[:20])
     with pytest.raises(messages.WireError, match="a Skill"):
         cdr.decode_skill(cdr.encode_skill(data)[:7])
 

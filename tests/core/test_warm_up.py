@@ -72,6 +72,17 @@ for skill in (loaded.for_loop(), adapted.for_loop()):
     played(HandScript(Scene(), seed=1), lambda bench: skill, rate_hz=100)
 assert since(before) == {}, since(before)
 """
+OF_ANOTHER_KIND = """
+from service.contract.requests import ViaPoint
+from service.daemon.skill_worker import skill_of
+
+place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
+before = compiled_by(skill_of(Path(sys.argv[1])))
+for more in ((), (place,)):
+    other = skill_of(skill_of(Path(sys.argv[2])).file, more, 0.05)
+    warm_up(Settings(), other.for_loop(), urdf=robot_description(Settings()))
+assert since(before) == {}, since(before)
+"""
 
 
 def done_in_a_process(script: str, *arguments: str) -> str:
@@ -89,3 +100,9 @@ def test_a_rehearsal_leaves_nothing_to_compile() -> None:
 @pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
 def test_neither_does_a_skill_that_another_process_gave_back(file: str) -> None:
     done_in_a_process(FROM_THE_SKILL_WORKER, str(RECORDINGS / file))
+
+
+def test_a_skill_of_another_kind_than_the_shipped_one_compiles_nothing_anew() -> None:
+    done_in_a_process(
+        OF_ANOTHER_KIND, *(str(RECORDINGS / name) for name in ("soldering.npz", "experiments/as-paper.npz"))
+    )

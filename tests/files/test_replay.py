@@ -20,7 +20,7 @@ from service.core.frame import STATE, Event, Frame, Tick, converted, definitions
 from service.core.skill.skill import Skill
 from service.files import mcap_file
 from service.files.mcap_file import RecordingError
-from service.files.recording import EARLIER_SETTINGS, Recorder, Recording
+from service.files.recording import DECISIONS, EARLIER_SETTINGS, Recorder, Recording
 from service.files.replay import replay, ticks
 from service.files.steps import LATER_FIELDS, checksum
 from service.learning.via_points import adapted
@@ -31,6 +31,7 @@ from sim.script import HandScript
 from support.cell import told
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS
+from support.recorded import thin
 from support.wam import URDF
 
 GOLDEN = RECORDINGS / "golden.mcap"
@@ -56,6 +57,28 @@ def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
     native = command(str(GOLDEN), "--exact")
     assert done.stdout.splitlines()[-1] == native.stdout.splitlines()[-1]
+
+
+def test_a_thin_recording_is_small_and_replays_bit_for_bit(golden: Path, tmp_path: Path) -> None:
+    old = Recording.open(golden)
+    path = thin(golden, tmp_path / "thin.mcap")
+    assert replay(path).exact
+    fixed = len(old.skill) * 6  # five skills are loaded in this session
+    assert 5 * (path.stat().st_size - fixed) < golden.stat().st_size - fixed
+    steps = list(Recording.open(path).steps())
+    whole = {step.tick: step.frame for step in steps if step.frame is not None}
+    before: tuple[int, ...] = ()
+    for step in old.steps():
+        if step.frame is not None:
+            decided = tuple(int(step.frame[name]) for name in DECISIONS)
+            assert (step.tick in whole) == (step.tick % 20 == 0 or decided != before), step.tick
+            before = decided
+    assert [step.tick for step in steps if step.state is not None] == [-1, 500, 5500]
+    spoilt = replay(thin(golden, tmp_path / "spoilt.mcap", spoilt=4321))
+    assert (spoilt.ticks - spoilt.identical, spoilt.first_difference) == (
+        1,
+        "first difference at tick 4321: its checksum",
+    )
 
 
 def test_the_golden_session_replays_from_a_state_in_its_middle(golden: Path) -> None:

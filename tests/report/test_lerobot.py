@@ -12,6 +12,7 @@ from pyarrow import parquet
 
 from service.cli.main import main
 from service.contract import cdr
+from service.contract.images import CompressedImage, encode_image
 from service.core.controller import Controller, run
 from service.core.frame import Tick
 from service.files.recording import Recorder, Recording
@@ -20,6 +21,7 @@ from service.learning.skill_file import StoredSkill
 from sim.scene import Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, resting, ticks_of
+from support.pictures import grey
 from support.wam import JOINT_NAMES, URDF
 
 FIRST = "chunk-000/file-000.parquet"
@@ -105,6 +107,57 @@ def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
     tasks = parquet.read_table(data_set / "meta" / "tasks.parquet")
     assert tasks.to_pylist() == [{"task_index": 0, "task": "Hold the board."}]
     assert tasks.schema.pandas_metadata["index_columns"] == ["task"]
+
+
+@pytest.fixture(scope="module")
+def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of twice the first six seconds of the golden session, with a camera at 10 Hz whose
+    pictures brighten with time.
+    """
+    pytest.importorskip("av", reason="videos need the extra `video`")
+    path, old = tmp_path_factory.mktemp("filmed") / "filmed.mcap", Recording.open(golden)
+    start, *steps = old.steps()
+    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
+        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 3000):
+            recorder.write(tick, step.frame, time_ns=step.time_ns)
+            if tick.index % 50 == 0:
+                image = encode_image(CompressedImage(step.time_ns, "lens", "jpeg", grey(tick.index // 20)))
+                recorder.image("camera/front", image, step.time_ns)
+    assert main(["report", str(path), str(path), "--lerobot", str(path.parent / "data"), "--task", "Hold."]) == 0
+    return path.parent / "data"
+
+
+def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
+    av = pytest.importorskip("av")
+    name = "observation.images.camera_front"
+    info = json.loads((filmed / "meta" / "info.json").read_text())
+    feature, fps = info["features"][name], info["fps"]
+    assert (feature["dtype"], feature["shape"], feature["names"]) == (
+        "video",
+        [48, 64, 3],
+        ["height", "width", "channels"],
+    )
+    rows = parquet.read_table(filmed / "data" / FIRST).to_pydict()
+    assert name not in rows
+    first, second = parquet.read_table(filmed / "meta" / "episodes" / FIRST).to_pylist()
+    assert first[f"videos/{name}/from_timestamp"] == 0.0
+    assert first[f"videos/{name}/to_timestamp"] == second[f"videos/{name}/from_timestamp"] == first["length"] / fps
+    path = filmed / info["video_path"].format(video_key=name, chunk_index=0, file_index=0)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.average_rate) == (feature["info"]["video.codec"], fps)
+        found = [
+            (float(one.pts * stream.time_base), one.to_ndarray(format="rgb24").mean())
+            for one in container.decode(stream)
+        ]
+    assert len(found) == info["total_frames"] == len(rows["index"])
+    np.testing.assert_allclose([time_s for time_s, _ in found], np.arange(len(found)) / fps, atol=1e-4)
+    began = 3000 - 1 - round((first["length"] - 1) / fps * 500)  # the tick of the first row, up to half a row
+    expected = [(began + row / fps * 500) // 50 * 2.5 for row in rows["frame_index"]]
+    assert np.abs(np.array([level for _, level in found]) - expected).max() < 5.0
+    stats = json.loads((filmed / "meta" / "stats.json").read_text())[name]
+    assert np.shape(stats["mean"]) == (3, 1, 1)
+    assert stats["mean"][0][0][0] == pytest.approx(np.mean(expected) / 255, abs=0.02)
 
 
 def test_lerobot_itself_loads_it(data_set: Path) -> None:

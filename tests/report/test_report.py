@@ -33,6 +33,7 @@ from service.report.tables import tables, verdict
 from service.settings.config import Settings
 from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
+from support.recorded import thin
 from support.wam import URDF
 from support.wicked import wicked_skill
 
@@ -401,3 +402,19 @@ def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page
     assert r"skill a\nb\x1b[31mred" in shown
     assert "<b>" not in page
     assert r"$\frac$ &lt;b&gt;\x1b[31m" in page
+
+
+def test_a_thin_recording_is_reported_as_one_with_all_frames_is(golden: Path, tmp_path: Path) -> None:
+    whole, found = (reported(path) for path in (golden, thin(golden, tmp_path / "thin.mcap")))
+    frames, others = whole.columns.frames, found.columns.frames
+    for name in ("tick", "mode", "reason", "flags", "commanded", "stage"):
+        np.testing.assert_array_equal(others[name], frames[name])
+    assert [span[:4] for span in found.spans] == [span[:4] for span in whole.spans]
+    assert found.limits == whole.limits
+    for name, most in (("tool", 5e-3), ("joints", 0.02), ("joint_velocities", 0.5)):
+        assert np.abs(others[name] - frames[name])[:-20].max() < most, name
+    assert np.abs(others["hands"] - frames["hands"])[frames["tick"] % 20 == 0].max() == 0.0
+    compared = {one.name: one.value for one in found.figures()}
+    for one in whole.figures():
+        if one.value is not None:
+            assert compared[one.name] == pytest.approx(one.value, rel=0.05, abs=0.11), one.name

@@ -20,16 +20,19 @@ from typing import Any
 import psutil
 import pytest
 
+from service.contract.images import CompressedImage, encode_image
 from service.core.frame import Event, Tick, encode
 from service.files.recording import Recording
 from service.process import child
 from service.process.child import Child, Progress
 from service.scribe.protocol import pack, unpack
 from service.scribe.scribe import Scribe
-from service.settings.config import Files, Settings
-from support.recorded import SKILL, at_ns, state_after, tell, ticks
+from service.settings.config import Files, RecordingSettings, Settings
+from support.pictures import grey
+from support.recorded import SKILL, at_ns, drawn, state_after, tell, ticks, values
 
-SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False))
+WHOLE = RecordingSettings(frames_hz=0)
+SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False), recording=WHOLE)
 
 
 @contextmanager
@@ -63,7 +66,7 @@ def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
 
 
 def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
-    settings = Settings(cell="hall/bench-1", rate_hz=50)
+    settings = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
     with scribe(settings, folder=tmp_path) as one:
         told = tell(one, 200)
         one.note("requests", "via_points add handover", at_ns(20))
@@ -78,9 +81,28 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in told
     ]
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in told]
-    assert [step.tick for step in steps if step.state is not None] == [49, 99, 149, 199]
+    assert [step.tick for step in steps if step.state is not None] == [49]  # the next one is due 10 s later
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
     assert Path(status["rrd"]).stat().st_size > 20_000
+
+
+def test_images_of_a_camera_are_recorded_and_drawn_beside_the_ticks(tmp_path: Path) -> None:
+    with_camera = RecordingSettings(also=("camera/front",))
+    settings = Settings(cell="hall/bench-1", rate_hz=50, recording=with_camera)
+    images = [CompressedImage(at_ns(i), "lens", "jpeg", grey(40 + i)) for i in range(0, 60, 20)]
+    with scribe(settings, folder=tmp_path) as one:
+        tell(one, 40)
+        for i, image in enumerate(images):
+            one.image("camera/front", encode_image(image), at_ns(40 + i))
+        tell(one, 160, first=40)
+        status = one.status()
+        assert status["lost"] == 0
+    recording = Recording.open(status["recording"])
+    assert [*recording.images()] == [("camera/front", image, at_ns(40 + i)) for i, image in enumerate(images)]
+    assert len(list(recording.steps())) == 201
+    blobs = values(drawn(Path(status["rrd"]))["/cameras/camera/front"], "EncodedImage:blob")
+    assert len(blobs) == 1  # one in two seconds
+    assert bytes(blobs[0][0]) == images[0].data
 
 
 def test_a_cell_may_record_without_a_drawing(tmp_path: Path) -> None:
@@ -290,7 +312,7 @@ def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
 DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
-from service.settings.config import Files, Settings
+from service.settings.config import Files, RecordingSettings, Settings
 from service.scribe.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
 one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))

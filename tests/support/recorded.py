@@ -12,7 +12,8 @@ import rerun as rr
 from service.contract import cdr, messages
 from service.core.controller import outgoing
 from service.core.frame import TIMING, Event, Record, Tick, blank
-from service.files.recording import Recorder
+from service.files.recording import Recorder, Recording
+from service.files.replay import ticks as ticks_in
 from service.scribe.scribe import Scribe
 from service.settings.config import Settings
 from support.wam import FRAME, JOINT_NAMES, STATE
@@ -131,3 +132,17 @@ def views(container: Any) -> Iterator[Any]:
             yield part
         else:
             yield from views(part)
+
+
+def thin(whole: Path, path: Path, *, spoilt: int | None = None) -> Path:
+    """A thin copy of a whole recording, in which the target of one tick may be another."""
+    old = Recording.open(whole)
+    start, *steps = old.steps()
+    more: dict[str, Any] = {"settings": old.settings, "skill": old.skill, "urdf": old.urdf, "thin": True}
+    with Recorder(path, state=start.state, **more) as recorder:
+        for tick, step in zip(ticks_in(old), steps, strict=True):
+            assert step.frame is not None
+            frame = step.frame.copy()
+            frame["target"] += 1e-12 * (tick.index == spoilt)
+            recorder.write(tick, frame, time_ns=step.time_ns, state=step.state, timing=step.timing)
+    return path

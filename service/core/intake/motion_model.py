@@ -53,18 +53,18 @@ def models(period_s: float, count: int) -> Records:
     """
     kinds = [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")]
     out = structured(count, [*kinds, ("onward", np.float64, (MODES, 3, 3))])
-    for ticks, one in enumerate(out):
-        one["transition"], one["noise"] = model(ticks * period_s)
-        kept_on_s = min(ticks * period_s, VELOCITY_KEPT_S)
-        reverted = model(ticks * period_s - kept_on_s)[0][:, :3, :3]
-        for mode, fades in enumerate(MODE_ACCELERATION_REVERSIONS_PER_S):
-            one["onward"][mode] = reverted[mode] @ _over(_motion(0.0, fades), kept_on_s)[0]
-        one["onward"][REST] = one["transition"][REST, :3, :3]
+    times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
+    kept_on_s: Vector = np.minimum(times_s, VELOCITY_KEPT_S)
+    out["transition"], out["noise"] = model(times_s)
+    out["onward"] = model(times_s - kept_on_s)[0][:, :, :3, :3]
+    for mode, fades in enumerate(MODE_ACCELERATION_REVERSIONS_PER_S):
+        out["onward"][:, mode] = out["onward"][:, mode] @ _over(_motion(0.0, fades), kept_on_s)[0]
+    out["onward"][:, REST] = out["transition"][:, REST, :3, :3]
     return out
 
 
-def model(interval_s: float) -> tuple[Vector, Vector]:
-    """Transition F and process noise Q, both (MODES, STATES, STATES), over an interval t.
+def model(interval_s: float | Vector) -> tuple[Vector, Vector]:
+    """Transition F and process noise Q, both (..., MODES, STATES, STATES), over intervals t (...).
 
     Both are block-diagonal, with a motion block (3, 3) and a tremor block (2, 2):
 
@@ -73,16 +73,20 @@ def model(interval_s: float) -> tuple[Vector, Vector]:
 
     where e is the unit vector of the block's last state (acceleration or tremor velocity).
     """
-    transition, noise, motion, tremor = *np.zeros((2, MODES, STATES, STATES)), slice(0, 3), slice(3, STATES)
+    interval_s = np.asarray(interval_s, np.float64)
+    transition, noise = np.zeros((2, *interval_s.shape, MODES, STATES, STATES))
+    motion, tremor = slice(0, 3), slice(3, STATES)
     dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE_PER_S**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S]])
     trembles, driven = _over(dynamics, interval_s)
     for mode in range(MODES):
         moves, driving = _over(
             _motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], MODE_ACCELERATION_REVERSIONS_PER_S[mode]), interval_s
         )
-        transition[mode, motion, motion], noise[mode, motion, motion] = moves, MODE_INTENSITIES_M2PS5[mode] * driving
-        transition[mode, tremor, tremor] = trembles
-        noise[mode, tremor, tremor] = 4.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S**3 * TREMOR_STDS_M[mode] ** 2 * driven
+        transition[..., mode, motion, motion] = moves
+        noise[..., mode, motion, motion] = MODE_INTENSITIES_M2PS5[mode] * driving
+        transition[..., mode, tremor, tremor] = trembles
+        unit = 4.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S**3 * TREMOR_STDS_M[mode] ** 2
+        noise[..., mode, tremor, tremor] = unit * driven
     return transition, noise
 
 
@@ -93,9 +97,9 @@ def _motion(revert_v: float, revert_a: float) -> Vector:
     return np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -revert_v, -revert_a]])
 
 
-def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:
-    """Transition F (N, N) over an interval, and the covariance Q (N, N) of white noise of unit
-    intensity that drives the last state.
+def _over(dynamics: Vector, interval_s: Vector) -> tuple[Vector, Vector]:
+    """Transition F (..., N, N) over intervals (...), and the covariance Q (..., N, N) of white
+    noise of unit intensity that drives the last state.
 
     One matrix exponential gives both (Van Loan, IEEE TAC 23(3), 1978), with E = e eᵀ:
 
@@ -104,11 +108,11 @@ def _over(dynamics: Vector, interval_s: float) -> tuple[Vector, Vector]:
     n = len(dynamics)
     whole = np.zeros((2 * n, 2 * n))
     whole[:n, :n], whole[n - 1, 2 * n - 1], whole[n:, n:] = -dynamics, 1.0, dynamics.T
-    grown = expm(whole * interval_s)
-    transition = grown[n:, n:].T
-    return _to_digits(transition), _to_digits(transition @ grown[:n, n:])
+    grown = expm(whole * interval_s[..., None, None])
+    transition = np.swapaxes(grown[..., n:, n:], -1, -2)
+    return _to_digits(transition), _to_digits(transition @ grown[..., :n, n:])
 
 
-def _to_digits(matrix: Vector) -> Vector:
+def _to_digits(values: Vector) -> Vector:
     """Round to 12 significant digits, because the last ones of LAPACK differ between CPUs."""
-    return np.array([[float(f"{value:.11e}") for value in row] for row in matrix])
+    return np.array([float(f"{value:.11e}") for value in values.ravel().tolist()]).reshape(values.shape)

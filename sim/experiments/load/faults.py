@@ -29,6 +29,7 @@ from service.contract.records import Mode, Reason
 from service.core.arm.stage import Arm
 from service.files.recording import Recording
 from service.files.shipped import cell_of
+from service.report.columns import read
 from service.settings.config import Settings, robot_description
 from sim.experiments.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
 from sim.faulty_cell import Command, Fault, FaultTimes, FaultyCell, Network
@@ -140,14 +141,11 @@ class Recorded:
     """Mode and reason of each tick in the recordings of a folder."""
 
     def __init__(self, folder: Path) -> None:
-        ticks, modes, reasons = [], [], []
-        for path in sorted(folder.glob("*.mcap")):
-            for step in Recording.open(path).steps():
-                if step.frame is not None:
-                    ticks.append(step.tick)
-                    modes.append(int(step.frame["mode"]))
-                    reasons.append(int(step.frame["reason"]))
-        self.ticks, self.modes, self.reasons = (np.array(values, np.int64) for values in (ticks, modes, reasons))
+        recorded = [read(Recording.open(path)).frames for path in sorted(folder.glob("*.mcap"))]
+        self.ticks, self.modes, self.reasons = (
+            np.concatenate([np.empty(0, np.int64), *(frames[name] for frames in recorded)]).astype(np.int64)
+            for name in ("tick", "mode", "reason")
+        )
 
     def first_stop(self, after: int) -> tuple[int, str] | None:
         """The first tick after a given one that did not follow, and its reason."""

@@ -1,0 +1,35 @@
+"""Foreign images come to the scribe beside the loop; what is no image is told once."""
+
+from __future__ import annotations
+
+import time
+
+import zenoh
+
+from service.contract.images import decode_image
+from service.daemon.foreign_streams import ForeignStreams
+from support.pictures import grey
+
+
+def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+    near, far = sessions
+    came: list[tuple[str, bytes]] = []
+    said: list[str] = []
+    streams = ForeignStreams(
+        near, ("camera/front", "camera/side"), send=lambda key, data, _: came.append((key, data)), say=said.append
+    )
+    sent = [("camera/front", grey(10)), ("camera/front", b"nonsense"), ("camera/front", b"nonsense")]
+    sent += [("camera/front", grey(20)), ("camera/side", grey(30, kind="PNG")), ("camera/other", grey(40))]
+    deadline = time.monotonic() + 20.0
+    while len(came) < 3:
+        assert time.monotonic() < deadline
+        if not came:
+            for key, payload in sent:
+                far.put(key, payload)
+            time.sleep(0.3)
+        streams.poll()
+    assert [(key, decode_image(data).data) for key, data in came[:3]] == [
+        (key, payload) for key, payload in sent[:-1] if payload != b"nonsense"
+    ]
+    assert said == ["a message on camera/front is not recorded: an image that begins with 6e 6f 6e 73 65 6e 73 65; "
+                    "JPEG or PNG needed"]  # fmt: skip
