@@ -161,7 +161,7 @@ class Daemon:
             self._say(text)
 
     def _note_beside(self, text: str) -> None:
-        """Note what work beside the loop tells, unless the daemon ends, which ends this work too."""
+        """Note what work beside the loop tells, unless the daemon, and thus this work, ends."""
         if not self._stop.is_set():
             self.note(text)
 
