@@ -353,7 +353,10 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
-    c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
+    c.add_argument(
+        "--json", action="store_true", help="print names and statuses as a JSON list; with --watch, each second"
+    )
+    c.add_argument("--watch", action="store_true", help="show all cells in a table, each second, until Ctrl-C")
     _reach(c, one=False)
 
     c = command(
@@ -378,8 +381,8 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "certificates",
         "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
-        "more certificate by the authority in the folder.",
-        "thirdhand certificates secrets --host bench.local",
+        "more certificate by the authority in the folder, with --renew it renews all.",
+        "thirdhand certificates secrets --host bench.local\n  thirdhand certificates secrets --renew",
     )
     option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
     option(
@@ -391,6 +394,8 @@ def parser() -> argparse.ArgumentParser:
     )
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
+    renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
+    c.add_argument("--renew", action="store_true", help=renew)
     option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)
 
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.

@@ -97,7 +97,7 @@ WORKERS_HELP = (
     "share several files out to this number of processes, or to the Dask cluster whose scheduler is at dask:ADDRESS; "
     "the output is the same (default: one after the other)"
 )
-ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml)"
+ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
 
 FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # the functions with which a shell completes a value

@@ -79,7 +79,7 @@ def open_session(
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
         "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
         "plugins_loading/enabled": False,
@@ -209,14 +209,23 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     return {"transport/link/tls": settings}  # replaces any other TLS settings
 
 
-def check_dates(path: Path) -> None:
-    """Raise UnreachableError for a certificate that is not valid now, as Zenoh gives no reason.
-    Without the package cryptography, which the client alone does not need, nothing is checked.
+def valid_until(folder: str | Path) -> datetime.datetime | None:
+    """The end of the certificate in a folder, or of its authority if that is earlier. Raises as
+    `check_dates`, and gives None without its package.
+    """
+    own, authority = (check_dates(Path(folder).expanduser() / name) for name in (CERTIFICATE, AUTHORITY))
+    return own and authority and min(own, authority)
+
+
+def check_dates(path: Path) -> datetime.datetime | None:
+    """The end of a certificate's validity. Raises UnreachableError if it is not valid now, as Zenoh
+    gives no reason. Without the package cryptography, which the client alone does not need, nothing
+    is checked.
     """
     try:
         from cryptography import x509  # most sessions need no certificate
     except ModuleNotFoundError:
-        return
+        return None
 
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
@@ -233,6 +242,7 @@ def check_dates(path: Path) -> None:
             f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, but the clock here shows {now:%Y-%m-%d %H:%M}: "
             "is it right?"
         )
+    return end
 
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:

@@ -293,6 +293,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     residual_risk: str = ""  # of the skill, and who accepted it; empty: none
     guided: bool = False  # True while the arm's driver reports that it is led by hand
     offer: str = ""  # what to learn from corrections that were repeated; empty: nothing
+    certificate_days: float | None = None  # time until the daemon's certificate ends; None: it has none
 
     @property
     def needed(self) -> tuple[str, ...]:
