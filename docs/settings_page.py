@@ -28,6 +28,8 @@ the settings that you want to change into a TOML file, and start the daemon with
 serve --config cell.toml`. Each heading below is a table of that file. Settings that the file does
 not name keep their defaults. Options of `thirdhand serve` override the file.
 
+Several cells may share [one file](network.md#one-file-for-many-cells).
+
 ```toml
 cell = "hall/bench-1"
 rate_hz = 500

@@ -12,6 +12,7 @@ import socket
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -23,6 +24,7 @@ from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"
+KEPT_EXTENSIONS = (x509.ExtendedKeyUsage, x509.AuthorityKeyIdentifier, x509.SubjectAlternativeName)  # of a renewed one
 GIVEN = "given.txt"  # a file with the names of all certificates that were made
 CLOCKS_DIFFER = datetime.timedelta(days=1)  # certificates are valid this long before now, for clocks that are behind
 
@@ -40,6 +42,10 @@ def certificates(args: argparse.Namespace) -> int:
             _host(host or " ")
         except ValueError:
             raise UsageError(f"--host {host!r}: a name in plain letters, or an address, needed") from None
+    if args.renew:
+        if args.role or args.host:
+            raise UsageError("--renew keeps names, roles and hosts: without --role and --host")
+        return _renew(folder, args.days)
     if args.role:
         authority, key = _authority_in(folder)
         made = [_free_name(folder, args.role, args.name)]
@@ -64,13 +70,44 @@ def _new_authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.Ellipt
     """A new authority, whose key is written to the folder."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("thirdhand authority")
-    authority = _builder(name, name, key, _days_from_now(days), signs=True).sign(key, hashes.SHA256())
+    authority = _builder(name, name, key.public_key(), _days_from_now(days), signs=True).sign(key, hashes.SHA256())
     _save(folder / AUTHORITY_KEY, _pem(key))
     return authority, key
 
 
-def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """The authority that this command made in a folder before. Raises ExplainedError."""
+def _renew(folder: Path, days: int) -> int:
+    """Renew the authority and every certificate in its folder, with their names, hosts and keys;
+    return exit code 0.
+    """
+    authority, key = _authority_in(folder, expired=True)
+    until, own = _days_from_now(days), authority.subject
+    renewed = _builder(own, own, key.public_key(), until, signs=True).sign(key, hashes.SHA256())
+    paths = sorted(folder.glob(f"*/{CERTIFICATE}"))
+    known = {path: x509.load_pem_x509_certificate(path.read_bytes()) for path in paths}
+    for path, one in known.items():
+        try:
+            one.verify_directly_issued_by(authority)
+        except (InvalidSignature, ValueError, TypeError):
+            raise ExplainedError(f"{path} is not by the authority in {folder}: nothing was renewed") from None
+    for path, one in known.items():
+        builder = _builder(one.subject, own, one.public_key(), until, signs=False)  # type: ignore[arg-type]
+        for extension in one.extensions:
+            if isinstance(extension.value, KEPT_EXTENSIONS):
+                builder = builder.add_extension(extension.value, critical=extension.critical)
+        _replace(path, _public(builder.sign(key, hashes.SHA256())))
+        _replace(path.with_name(AUTHORITY), _public(renewed))
+        print(f"{path.parent}: renewed; valid until {until:%Y-%m-%d}")
+    print(
+        f"Copy {CERTIFICATE} and {AUTHORITY} to the machine of each role, beside its {KEY}, which is unchanged, and "
+        f"start its program again. To renew one whose folder is elsewhere, copy its {CERTIFICATE} back first."
+    )
+    return 0
+
+
+def _authority_in(folder: Path, *, expired: bool = False) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """The authority that this command made in a folder before; also an `expired` one, or else it is
+    an error. Raises ExplainedError.
+    """
     try:
         key = serialization.load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
         beside = next(iter(sorted(folder.glob(f"*/{AUTHORITY}"))), folder / DAEMON / AUTHORITY)
@@ -82,9 +119,9 @@ def _authority_in(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePriva
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
         raise ExplainedError(f"{folder / AUTHORITY_KEY} is not the key of {beside}")
-    if authority.not_valid_after_utc <= now():
+    if authority.not_valid_after_utc <= now() and not expired:
         raise ExplainedError(
-            f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: make all of them again"
+            f"the authority in {folder} expired on {authority.not_valid_after_utc:%Y-%m-%d}: renew all by --renew"
         )
     return authority, key
 
@@ -120,7 +157,7 @@ def _write(
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * serves
     until = min(_days_from_now(days), authority.not_valid_after_utc)
     builder = (
-        _builder(_name(folder.name), authority.subject, own, until, signs=False)
+        _builder(_name(folder.name), authority.subject, own.public_key(), until, signs=False)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key()), critical=False)
     )
@@ -153,7 +190,7 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime.datetime, *, signs: bool
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, until: datetime.datetime, *, signs: bool
 ) -> x509.CertificateBuilder:
     """The common content of certificates; `signs` for the holder that signs others."""
     usage = x509.KeyUsage(
@@ -171,11 +208,11 @@ def _builder(
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
-        .public_key(key.public_key())
+        .public_key(key)
         .serial_number(x509.random_serial_number())
         .not_valid_before(now() - CLOCKS_DIFFER)
         .not_valid_after(until)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
         .add_extension(usage, critical=True)
     )
@@ -195,3 +232,11 @@ def _save(path: Path, data: bytes) -> None:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
         file.write(data)
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Replace a file at once, so that a program which starts now reads the old or the new one."""
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)
+    _save(new, data)
+    new.replace(path)

@@ -18,6 +18,8 @@ from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_t
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
 from service.contract.requests import Source, Status
+from service.contract.roles import RENEW_DAYS
+from service.contract.ros2 import NO_TYPE_HASH
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
 LATE_MS = 100.0  # a stamp older than this at its arrival shows that clocks differ, or a slow network
@@ -102,12 +104,19 @@ def _in_order_of_cause(
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
     yield judged(now.version == own_version, "daemon", found, wanted, what_to_do(Condition.VERSIONS_DIFFER))
+    if now.certificate_days is not None:
+        level = "ok" if now.certificate_days > RENEW_DAYS else "note" if now.certificate_days > 0 else "wrong"
+        found, wanted = f"ends in {now.certificate_days:.0f} days", f"more than {RENEW_DAYS} days"
+        yield Finding(level, "certificate", found, wanted, what_to_do(Condition.CERTIFICATE_ENDS))
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
         return
     yield from _machine(before, now)
     for name in now.sources:
         yield from _source(before, now, name, published)
+    if of_humble := [one for one in published if one.endswith(f"/{NO_TYPE_HASH}")][:MOST_OTHER_KEYS]:
+        found, advice = f"Humble publishes {', '.join(of_humble)}", what_to_do(Condition.HUMBLE)
+        yield Finding("note", "ROS 2", found, "keys with the hash of their type, as of Iron and later", advice)
     yield _driver(before, now)
     yield from _drives(travels)
     if "arm" in now.sources and now.command_heard:
@@ -196,6 +205,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
         found = "nothing arrives" if source.age_ms is None else f"nothing arrived for {source.age_ms / 1000:.1f} s"
         group = KEYS[name].rpartition("/")[0]
         ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
+        ours |= {one for one in published if one.endswith(NO_TYPE_HASH)}
         others = [one for one in published if f"/{group}/" in one and one not in ours][:MOST_OTHER_KEYS]
         found += f", but on {', '.join(others)}" if others else ""
         advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)

@@ -27,10 +27,11 @@ from service.contract.explain import in_words
 from service.contract.incidents import Condition, what_to_do
 from service.contract.messages import WireError
 from service.contract.printable import printable_lines
+from service.contract.ros2 import NO_TYPE_HASH
 
 PROBE_S = 1.0
 MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
-PUBLISHED = ("**/hands/*", "**/joints/state")  # in any cell, because a name may be wrong
+PUBLISHED = ("**/hands/*", "**/joints/state", f"**/{NO_TYPE_HASH}")  # in any cell, because a name may be wrong
 
 Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad] of a joint
 

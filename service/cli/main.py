@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import calibrate_options, record_options
-from service.cli.usage import ARM_HELP, Parser, UsageError, add_end_with, option, reaching, within
+from service.cli.usage import ARM_HELP, WORKERS_HELP, Parser, UsageError, add_end_with, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
@@ -197,7 +197,8 @@ def parser() -> argparse.ArgumentParser:
         "replay",
         "Runs the core on a recording, or on several that follow each other, and compares every frame. Missing and "
         "damaged parts are listed; only with --exact they are failures.",
-        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay yesterday.mcap --config calmer.toml",
+        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay yesterday.mcap --config calmer.toml\n"
+        "  thirdhand replay archive/*.mcap --each --workers 8",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
     exact = "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
@@ -206,19 +207,23 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
     compared = "instead, compare the recording's settings with these, for the same hands"
     option(c, "--config", "CELL", f"{compared}: {ARM_HELP}")
+    c.add_argument("--each", action="store_true", help="replay each recording by itself; no failure stops the others")
+    option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
     c = command(
         "tune",
         "Tries about a dozen settings on the hands of a recording or a take: error, lag, jerk, overshoot and "
-        "rejections of each, and the noise and tremor of the hands. Prints the lines to write for the best trade-off.",
-        "thirdhand tune recordings/golden.mcap --plot tune.png",
+        "rejections of each, and the noise and tremor of the hands. Prints the lines to write for the best trade-off, "
+        "of several files for all of them.",
+        "thirdhand tune recordings/golden.mcap --plot tune.png\n  thirdhand tune archive/*.mcap --workers 8",
     )
-    option(c, "file", "FILE", "a recording of the daemon, or a take (.mcap)")
+    option(c, "files", "FILE", "a recording of the daemon, or a take (.mcap); several are judged together", nargs="+")
     option(c, "--config", "CELL", f"the cell (default: the settings in the file): {ARM_HELP}")
     option(c, "--skill", "FILE", "the skill (default: that in the file; for a take the shipped soldering skill)")
     part = "use this part only, in seconds from the start; the default is all of it"
     c.add_argument("--part", nargs=2, type=within(float, 0, 1e6, " s"), metavar=("FROM", "TO"), help=part)
-    option(c, "--plot", "PNG", "draw the variants and the hands to this file")
+    option(c, "--plot", "PNG", "draw the variants and the hands of a single file to this file")
+    option(c, "--workers", "WORKERS", WORKERS_HELP)
     c.add_argument("--json", action="store_true", help="print the figures as one JSON object")
 
     c = command("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
@@ -237,6 +242,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--lerobot", "DIR", "also write joints, hands, images, commands as a LeRobot data set to this new folder")
     option(c, "--fps", "N", "the rate of the data set [rows/s]", 50, type=within(int, 1, 1000))
     option(c, "--task", "TEXT", "the task of the data set, in words (default: the name of the skill)")
+    option(c, "--workers", "WORKERS", WORKERS_HELP)
 
     c = command(
         "learn",
@@ -355,7 +361,10 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
-    c.add_argument("--json", action="store_true", help="print their names and statuses as one JSON list")
+    c.add_argument(
+        "--json", action="store_true", help="print names and statuses as a JSON list; with --watch, each second"
+    )
+    c.add_argument("--watch", action="store_true", help="show all cells in a table, each second, until Ctrl-C")
     _reach(c, one=False)
 
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
@@ -399,8 +408,8 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "certificates",
         "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
-        "more certificate by the authority in the folder.",
-        "thirdhand certificates secrets --host bench.local",
+        "more certificate by the authority in the folder, with --renew it renews all.",
+        "thirdhand certificates secrets --host bench.local\n  thirdhand certificates secrets --renew",
     )
     option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
     option(
@@ -412,6 +421,8 @@ def parser() -> argparse.ArgumentParser:
     )
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
+    renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
+    c.add_argument("--renew", action="store_true", help=renew)
     option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)
 
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.

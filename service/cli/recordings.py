@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 import time
 from collections import Counter
@@ -12,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from kmp import AffineMean
+from service.cli.many_files import of_each
 from service.cli.usage import UsageError, check_writable, places_in, reached
 from service.client import Client, Tracker
 from service.contract import cdr
@@ -91,6 +93,10 @@ def replay(args: argparse.Namespace) -> int:
     """
     if args.config is not None:
         return _replay_with(args)
+    if args.each:
+        return _replay_each(args)
+    if args.workers:
+        raise UsageError("--workers: --each needed with it, since recordings that follow each other are one replay")
     if args.output:
         check_writable(args.output, ".mcap")
     counts = [Recording.open(path).ticks() for path in args.files]
@@ -98,7 +104,19 @@ def replay(args: argparse.Namespace) -> int:
     with progress("replaying", total=total) as done:
         result = replayed(*args.files, after=args.after, progress=done, output=args.output)
     print(result.text())
-    return 0 if result.exact or (result.within_tolerance and not args.exact) else 1
+    return 0 if result.passes(exact=args.exact) else 1
+
+
+def _replay_each(args: argparse.Namespace) -> int:
+    """Replay recordings that do not follow each other; exit code 0 if each passes."""
+    if args.output:
+        raise UsageError("--output writes the frames of one recording: without --each")
+    results = of_each(args, "replaying", functools.partial(replayed, after=args.after))
+    for path, result in results:
+        print(printable_lines(f"{path}: " + result.text().replace("\n", "\n  ")))
+    passing = sum(result.passes(exact=args.exact) for _, result in results)
+    print(f"{passing} of {len(args.files)} recordings replay {'exactly' if args.exact else 'within tolerance'}")
+    return 0 if passing == len(args.files) else 1
 
 
 def _replay_with(args: argparse.Namespace) -> int:
@@ -106,8 +124,10 @@ def _replay_with(args: argparse.Namespace) -> int:
     from service.cli.report_command import plain_console, print_table
     from service.report.variants import compared  # its import is slow
 
-    if len(args.files) > 1 or args.exact or args.after is not None or args.output:
-        raise UsageError("--config compares the settings of one recording: without --exact, --after and --output")
+    if len(args.files) > 1 or args.exact or args.each or args.after is not None or args.output:
+        raise UsageError(
+            "--config compares the settings of one recording: without --exact, --each, --after and --output"
+        )
     other = cell_of(args.config)
     hands = recorded_hands(args.files[0])
     with steps("replaying") as doing:

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from service.cli.many_files import of_each
 from service.cli.usage import UsageError, check_writable
 from service.contract.printable import printable
 from service.contract.records import Mode
@@ -31,40 +32,42 @@ PLAIN_WIDTH = 120  # [characters] width of tables that are not printed on a term
 
 
 def report(args: argparse.Namespace) -> int:
-    """Report on recordings; exit code 0 for any content."""
+    """Report on recordings; exit code 0 for any content, 1 if a file cannot be read."""
     if args.html:
         check_writable(args.html)
     if args.csv and args.csv.exists() and not args.csv.is_dir():
         raise UsageError(f"--csv {args.csv} is a file; a folder needed")
     if args.lerobot and args.lerobot.exists():
         raise UsageError(f"--lerobot {args.lerobot} exists already; a new folder needed")
-    reports = []
-    for path in args.files:
-        with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
-            reports.append(reported(path, progress=done))
+    reports = [one for _, one in of_each(args, "reading", reported, alone=_reported)]
     console = plain_console()
     for one in reports:
         _print(console, one)
     if len(reports) > 1:
         for table in comparison(reports):
             print_table(console, table)
-    if args.csv:
+    if args.csv and reports:
         write_csv(reports, args.csv)
         console.print(Text(printable(f"tables in {args.csv}")))
-    if args.lerobot:
+    if args.lerobot and reports:
         from service.report import lerobot
 
         columns = [one.columns for one in reports]
         task = args.task or ", ".join({one.skill.name: one.tick for found in columns for one in found.skills})
         parts, rows = lerobot.write(columns, args.lerobot, fps=args.fps, task=task)
         console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
-    if args.html:
+    if args.html and reports:
         from service.report.page import page  # its import is slow
 
         with progress("drawing", unit="recordings", total=len(reports)) as done:
             args.html.write_text(page(reports, progress=done), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
-    return 0
+    return 0 if len(reports) == len(args.files) else 1
+
+
+def _reported(path: Path) -> Report:
+    with progress(f"reading {path.name}", total=Recording.open(path).ticks()) as done:
+        return reported(path, progress=done)
 
 
 def plain_console() -> Console:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli.serve import settings_of, skill_path
-from service.client.session import CERTIFICATE, check_dates, check_files
+from service.client.session import check_files, valid_until
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
 from service.daemon.single_instance import holder_of, state_folder
@@ -92,7 +92,7 @@ def _disk(files: Files) -> str:
 
 def _certificates(network: Network) -> str:
     check_files(network.certificate, network.zenoh_config)
-    end = check_dates(Path(network.certificate).expanduser() / CERTIFICATE) if network.certificate else None
+    end = valid_until(network.certificate) if network.certificate else None
     return f"{network.certificate or network.zenoh_config} can be read" + (
         "" if end is None else f", valid until {end:%Y-%m-%d}"
     )

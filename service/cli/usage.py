@@ -19,6 +19,7 @@ from service.client import ClientSettings, UnreachableError, client_settings, op
 from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from service.contract.explain import in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
+from service.process.parallel import DASK
 from service.settings.config import RATES_HZ
 from service.settings.file_content import UnusableError, content
 
@@ -76,15 +77,27 @@ def endpoint(given: str) -> str:
     return given
 
 
+def workers(given: str) -> str:
+    """Read workers from the command line, as `spread` takes them."""
+    if re.fullmatch(rf"[1-9]\d{{0,3}}|{DASK}\S+", given):
+        return given
+    raise argparse.ArgumentTypeError(f"{given} given; a number of processes, or {DASK}tcp://HOST:8786 needed")
+
+
 TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
     "HZ": within(int, *RATES_HZ, " Hz"),
     "EP": endpoint,
+    "WORKERS": workers,
 }
 
-ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml)"
+WORKERS_HELP = (
+    "share several files out to this number of processes, or to the Dask cluster whose scheduler is at dask:ADDRESS; "
+    "the output is the same (default: one after the other)"
+)
+ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
 
 FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # the functions with which a shell completes a value

@@ -79,7 +79,7 @@ def open_session(
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
         "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
         "listen/exit_on_failure": True,
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
         "plugins_loading/enabled": False,
@@ -215,10 +215,18 @@ def check_files(certificate: str | Path, zenoh_config: str | Path) -> None:
     _tls(certificate)
 
 
+def valid_until(folder: str | Path) -> datetime.datetime | None:
+    """The end of the certificate in a folder, or of its authority if that is earlier. Raises as
+    `check_dates`, and gives None without its package.
+    """
+    own, authority = (check_dates(Path(folder).expanduser() / name) for name in (CERTIFICATE, AUTHORITY))
+    return own and authority and min(own, authority)
+
+
 def check_dates(path: Path) -> datetime.datetime | None:
-    """Return the time until which a certificate is valid. Raise UnreachableError for one that is
-    not valid now, as Zenoh gives no reason. Without the package cryptography, which the client
-    alone does not need, nothing is checked, and None returned.
+    """The end of a certificate's validity. Raises UnreachableError if it is not valid now, as Zenoh
+    gives no reason. Without the package cryptography, which the client alone does not need, nothing
+    is checked.
     """
     try:
         from cryptography import x509  # most sessions need no certificate

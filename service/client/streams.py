@@ -9,6 +9,7 @@ import math
 import operator
 import reprlib
 import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -22,6 +23,7 @@ from service.client.replies import decoded
 from service.client.session import UnreachableError, check_open, tried
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
+from service.contract.printable import printable
 from service.contract.records import SIDES
 from service.contract.requests import Status
 
@@ -158,10 +160,13 @@ class Tracker(AbstractContextManager["Tracker"]):
 
 
 class _Received(AbstractContextManager[Any]):
-    """A queue of the newest messages on one channel."""
+    """A queue of the newest messages on one channel. `lost` counts the messages that the network
+    dropped, by the numbers that a daemon gives them, and those that a slow loop did not take.
+    """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
-        self.rejected, self.reason = 0, ""
+        self.rejected, self.reason, self.lost = 0, "", 0
+        self._newest = "", 0  # publisher and number of the newest message
         self._session, self._came, self._is_closed = session, threading.Condition(), False
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
@@ -178,7 +183,19 @@ class _Received(AbstractContextManager[Any]):
         """The value of a message. Raises ValueError."""
         raise NotImplementedError
 
+    def _count_lost(self, sample: zenoh.Sample) -> None:
+        before, lost = self.lost, int(len(self._queue) == MAX_QUEUED)
+        if (info := sample.source_info) is not None:
+            (last_publisher, last), self._newest = self._newest, (str(info.source_id), info.source_sn)
+            if last_publisher == self._newest[0]:
+                lost += (info.source_sn - last - 1) % channels.MESSAGE_NUMBERS
+        self.lost += lost
+        if self.lost and not before:
+            key = printable(str(sample.key_expr))
+            print(f"messages on {key} are lost: this program or its network is too slow", file=sys.stderr, flush=True)
+
     def _take(self, sample: zenoh.Sample) -> None:
+        self._count_lost(sample)
         try:
             value = self._decoded(sample)
         except ValueError as error:
@@ -201,8 +218,10 @@ class Watch(_Received, Iterator[Any]):
 
     It waits for the next message. It yields None after `timeout_s` [s] without one; if `timeout_s`
     is None, it waits on. It ends once it, or its connection, is closed. A slow loop gets the newest
-    256 messages. Messages that cannot be decoded are skipped: `rejected` counts them, and `reason`
-    is the cause of the last one. Raises ValueError for a channel that carries no messages.
+    256 messages; `lost` counts the others, and those that the network dropped, and one message on
+    standard error reports the first of them. Messages that cannot be decoded are skipped:
+    `rejected` counts them, and `reason` is the cause of the last one. Raises ValueError for a
+    channel that carries no messages.
     """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None) -> None:
@@ -248,7 +267,8 @@ class Follower(_Received):
     """A receiver of a cell's joint commands and publisher of its joint states; a context manager.
 
     `names` are the arm's joints, in the order of all values here. Commands for other joints are
-    ignored: `rejected` counts them, and `reason` is the cause of the last one.
+    ignored: `rejected` counts them, and `reason` is the cause of the last one; `lost` counts those
+    that did not arrive.
     """
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:

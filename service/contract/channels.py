@@ -163,6 +163,7 @@ EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if ch
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
+MESSAGE_NUMBERS = 2**32  # a daemon numbers a channel's messages by Zenoh's source information, modulo this
 LAST_PORT = 65535  # of IP
 
 

@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS",
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS",
 )
 
 
@@ -89,6 +89,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "no messages of the arm arrive", "start the driver, connected to the daemon"),
         Incident(Condition.KEY_MISSPELT, None, "another key",
             "messages arrive under a key that is not the cell's", "let it publish under the cell's key"),
+        Incident(Condition.HUMBLE, None, "ROS 2 Humble",
+            "a node of ROS 2 Humble publishes under keys without the hash of the type, which no cell hears",
+            "run the node with ROS 2 Iron or later, or connect it by zenoh-bridge-ros2dds"),
         Incident(Condition.NO_DRIVER, None, "no driver",
             "nobody subscribes to `joints/command`", "let the arm's driver subscribe to `joints/command`"),
         Incident(Condition.DRIVES_OFF, None, "drives off",
@@ -282,6 +285,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "ask again; if it still does not answer, read the log of `thirdhand serve`"),
         Incident(Condition.OTHER_CELL, None, "another cell",
             "only daemons of other cells are running", "give the name of the cell by `--cell`"),
+        Incident(Condition.CERTIFICATE_ENDS, None, "certificate ends",
+            "the daemon's certificate, or its authority's, ends within 30 days; then nobody is connected any more",
+            "`thirdhand certificates DIR --renew`, copy it to the daemon's machine and start the daemon again"),
         Incident(Condition.NO_ENDPOINT, None, "no endpoint",
             "`--connect` is not an endpoint", "give one like tcp/127.0.0.1:7447"),
         Incident(Condition.PORT_CLOSED, None, "port closed",

@@ -16,6 +16,7 @@ WISHES = ("clutch", "gripper/wish")
 ARM = ("joints/state", "joints/guided", "gripper/state")
 TOOL, OBJECTS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
+RENEW_DAYS = 30  # a certificate that ends within this time [days] is to be renewed
 MOST_OF_A_ROLE = 99  # certificates of a role; access control compares whole names, so all are listed
 
 

@@ -25,6 +25,7 @@ TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
+NO_TYPE_HASH = "TypeHashNotSupported"  # stands for the hash in the keys of Humble, whose subscribers match no hash
 OWN_FRAMES = ("left_hand", "right_hand", "setpoint", "target", "tool")  # of a cell, beside the arm's links
 FRAMES = ("hands/left", "hands/right", "tool/pose")  # channels whose messages may be frames of TFMessages
 HEARD = tuple(channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event)

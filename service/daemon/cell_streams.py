@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -121,6 +121,7 @@ class CellStreams:
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
+        self._sent = Counter[str]()  # messages by channel
         self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
@@ -176,7 +177,9 @@ class CellStreams:
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""
-        self._publishers[suffix].put(payload, attachment=attachment)
+        one, number = self._publishers[suffix], self._sent[suffix]
+        self._sent[suffix] += 1
+        one.put(payload, attachment=attachment, source_info=zenoh.SourceInfo(one.id, number % channels.MESSAGE_NUMBERS))
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
 

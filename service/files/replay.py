@@ -65,6 +65,10 @@ class Replay:
         """True if all recorded positions are within 10 µm and 10 µrad."""
         return self.ticks > 0 and all(self.largest.get(name, 0.0) <= REPLAY_TOLERANCE for name in POSITION_FIELDS)
 
+    def passes(self, *, exact: bool) -> bool:
+        """True if the replay is exact, or within tolerance where that suffices."""
+        return self.exact or (self.within_tolerance and not exact)
+
     def text(self) -> str:
         """The result for people to read."""
         lines = [f"{self.ticks} ticks, {self.identical} frames identical"]

@@ -38,7 +38,8 @@ def shipped_skill() -> StoredSkill:
 
 
 def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
-    """The settings of the shipped cell of an arm, or those in a file, with the given rate.
+    """The settings of the shipped cell of an arm, or those in a file, with the given rate. A file
+    with several cells is given as FILE.toml:NAME.
 
     Raises SettingsError.
     """
@@ -49,6 +50,9 @@ def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
         return Settings()
     if arm in ARMS:
         return load(WAM.with_name(f"{arm}.toml"))
+    path, colon, cell = arm.rpartition(":")
+    if colon and path.endswith(".toml"):
+        return load(Path(path), cell)
     if not Path(arm).suffix and not Path(arm).exists():
         raise UnreadableError(f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed")
     return load(Path(arm))

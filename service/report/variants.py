@@ -8,6 +8,7 @@ hands move on.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -46,6 +47,7 @@ CHANGES: tuple[Change, ...] = (
     {"hands": {"jump": 0.08, "jump_speed": 3.0}},
     {"hands": {"stale_ms": 200.0, "unseen_ms": 1000.0}},
 )
+TOTALS = ("held_s", "limits_s", "rejected")  # of VariantFigures
 LIMITS_OF_MOTION = ("max_speed", "max_acceleration", "max_jerk")  # a proposal never raises these
 LEAST_JUDGED_S = 2.0
 SAME_SHARE = 0.05  # a smaller change of error or jerk is not worth a setting
@@ -198,15 +200,41 @@ def tried(
     return found
 
 
-def best(variants: list[VariantFigures], settings: Settings) -> tuple[VariantFigures, str]:
+def pooled(files: Sequence[tuple[float, list[VariantFigures]]]) -> list[VariantFigures]:
+    """The figures over several files, each given with its judged time [s], of the variants that all
+    of them have: means weighted by these times, the largest overshoot, sums of times and counts.
+    """
+    if len(files) == 1:
+        return files[0][1]
+    found = []
+    for first in files[0][1]:
+        same = [(weight, one) for weight, variants in files for one in variants if one.name == first.name]
+        if len(same) < len(files):
+            continue
+        tracking = TrackingFigures(*(_mean(same, name) for name in TrackingFigures._fields))._replace(
+            overshoot_mm=max((one.tracking.overshoot_mm for _, one in same if one.tracking.stops), default=math.nan),
+            stops=sum(one.tracking.stops for _, one in same),
+        )
+        totals = [sum((Counter(getattr(one, name)) for _, one in same), Counter()) for name in TOTALS]
+        found.append(VariantFigures(first.name, first.change, tracking, *totals))
+    return found
+
+
+def _mean(weighted: list[tuple[float, VariantFigures]], name: str) -> Any:
+    """The weighted mean of the known values of a tracking figure; NaN without any."""
+    known = [(weight, v) for weight, one in weighted if not math.isnan(v := getattr(one.tracking, name))]
+    return sum(weight * v for weight, v in known) / sum(weight for weight, _ in known) if known else math.nan
+
+
+def best(variants: list[VariantFigures], *settings: Settings) -> tuple[VariantFigures, str]:
     """The variant with the best trade-off beside the settings that are in force, which stand first,
-    and the reason.
+    and the reason. Files may have several settings.
 
     First choice: the least error of those without more jerk, overshoot and holding. Second choice:
     the least jerk of those without more error, overshoot and holding. No limit of motion is raised.
     """
     own = variants[0]
-    fair = [one for one in variants[1:] if _is_fair(one, own, settings)]
+    fair = [one for one in variants[1:] if all(_is_fair(one, own, each) for each in settings)]
     closer = min(fair, key=lambda one: one.tracking.error_mm, default=own)
     if closer.tracking.error_mm < (1.0 - SAME_SHARE) * own.tracking.error_mm:
         return closer, (

@@ -545,14 +545,40 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
     return msgspec.structs.replace(settings, reach=reach)
 
 
-def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
-    """Settings from TOML text; see `converted`. Raises SettingsError."""
+def _of_cell(given: dict[str, Any], cell: str, origin: str) -> dict[str, Any]:
+    """The content of a file for one of its cells: all tables outside `[cells]`, with the values of
+    `[cells.NAME]` in place of theirs. Raises SettingsError.
+    """
+    cells = given.pop("cells", {})
+    if not isinstance(cells, dict) or not all(isinstance(one, dict) for one in cells.values()):
+        raise SettingsError(f"{origin}: [cells]: tables by the cells' names needed, like [cells.bench1.tool]")
+    if not cells and not cell:
+        return given
+    if cell not in cells:
+        found = f"cell {cell!r} given" if cell else "no cell given"
+        raise SettingsError(f"{origin}: {found}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} needed")
+    return _merged(given | {"cell": cell}, cells[cell])
+
+
+def _merged(given: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    both = {name: (given.get(name), value) for name, value in changes.items()}
+    return given | {
+        name: _merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
+        for name, (before, value) in both.items()
+    }
+
+
+def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "") -> Settings:
+    """Settings from TOML text, of one of its cells if it has `[cells]`; see `converted`. Raises
+    SettingsError.
+    """
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{origin}: {error}") from None
     except RecursionError:
         raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None
+    given = _of_cell(given, cell, origin)
     for (table, name), advice in RETIRED.items():
         if isinstance(given.get(table), dict) and given[table].pop(name, None) is not None:
             text = f"{origin}: [{table}] {name} is retired and has no effect; {advice}"
@@ -560,10 +586,10 @@ def parse(text: str, *, origin: str, folder: Path | None = None) -> Settings:
     return converted(given, origin=origin, folder=folder)
 
 
-def load(path: Path) -> Settings:
-    """Settings from a TOML file. Raises SettingsError, UnreadableError."""
+def load(path: Path, cell: str = "") -> Settings:
+    """Settings from a TOML file, of one of its cells. Raises SettingsError, UnreadableError."""
     try:
         text = content(path, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
     except (OSError, UnusableError, UnicodeDecodeError) as error:
         raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
-    return parse(text, origin=str(path), folder=path.parent)
+    return parse(text, origin=str(path), folder=path.parent, cell=cell)

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+from service.cli.usage import workers as workers_of
 from service.contract.explain import ExplainedError, in_words
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.evidence import RESULTS, commit, origin, result_of, staleness, tree
@@ -60,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
         p.add_argument(f"--{name}", metavar="DIR", type=Path, help=text)
     people = "the people of `people`: those on whom parameters are chosen, or the others (default: %(default)s)"
     p.add_argument("--set", choices=["tuning", "test"], default="test", help=people)
-    workers = "processes, where that helps (default: %(default)s)"
-    p.add_argument("--workers", metavar="N", type=int, default=min(2, os.cpu_count() or 1), help=workers)
+    workers = "processes, or the Dask cluster at dask:ADDRESS, where that helps (default: %(default)s)"
+    p.add_argument("--workers", type=workers_of, default=str(min(2, os.cpu_count() or 1)), help=workers)
     share = "of the full size, for a quick look: above 0, up to 1"
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
@@ -116,8 +117,6 @@ def main(arguments: list[str] | None = None) -> int:
     args = p.parse_args(arguments)
     if not 0 < args.share <= 1:
         p.error(f"--share {args.share}: above 0, up to 1 accepted")
-    if args.workers < 1:
-        p.error(f"--workers {args.workers}: 1 or more accepted")
     if args.name.endswith(OF_OTHERS) and args.hands is None and not args.redraw:
         p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
     if args.name != "stale" and args.output is None:

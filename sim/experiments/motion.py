@@ -275,7 +275,7 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
 def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Figures]:
     """The figures of all tasks, shared out over processes."""
     begin = functools.partial(prepare, options.share, options.arm)
-    return list(shared_out(measure, tasks, options.workers, prepare=begin, chunk=8))
+    return list(shared_out(measure, tasks, options.workers, prepare=begin))
 
 
 def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
@@ -290,7 +290,7 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
         for number in numbers
     ]
     begin = functools.partial(prepare, options.share, options.arm)
-    found = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin, chunk=4)))
+    found = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin)))
     found = found.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
     means = np.sqrt(np.mean(found**2, axis=3))
     out: dict[str, Any] = {"hz": rates}

@@ -49,7 +49,7 @@ class Options:
     hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
     group: Literal["tuning", "test"] = "test"  # the people of `people`
-    workers: int = 1  # processes
+    workers: str = "1"  # as `service.process.parallel.spread` takes them
     share: float = 1.0  # share of the full size; less for a quick look
     arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
     numbers: str = ""  # for `sensitivity`: stages of the core or numbers, with commas; empty: those without a result

@@ -850,6 +850,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     if not wanted:
         return out
     done = list(out["tuned"].get("figures", ())) if named and all(key in rows for key in wanted) else []
+    if not options.workers.isdecimal():
+        raise ExperimentError(f"--workers {options.workers}: sensitivity forks its own processes; 1 or 2 needed")
     command = [sys.executable, "-m", "sim.experiments.sensitivity", f"--workers={options.workers}"]
     command += [f"--done={','.join(done)}", *wanted]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as server:

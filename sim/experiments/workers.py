@@ -1,30 +1,37 @@
-"""Tasks of an experiment, distributed over processes."""
+"""Tasks of an experiment, distributed over workers of joblib."""
 
 from __future__ import annotations
 
-import multiprocessing
+import functools
+import pickle
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
+
+from service.process.parallel import spread
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
+_prepared: list[bytes] = []  # the preparation of this process, by its pickle
 
 
 def shared_out(
     work: Callable[[Task], Outcome],
     tasks: Sequence[Task],
-    workers: int,
+    workers: str,
     *,
     prepare: Callable[[], None] | None = None,
-    chunk: int = 1,
 ) -> Iterator[Outcome]:
     """The outcome of each task, in order: in this process if there is one worker, which is prepared
-    then; else in new ones, which run `prepare` first.
+    then; else by the workers that `spread` takes, which run `prepare` before their first task.
     """
-    if workers == 1:
+    if workers == "1":
         yield from map(work, tasks)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare) as pool:
-        yield from pool.map(work, tasks, chunksize=chunk)
+    yield from spread(functools.partial(_prepared_work, work, prepare), tasks, workers)
+
+
+def _prepared_work(work: Callable[[Task], Outcome], prepare: Callable[[], None] | None, task: Task) -> Outcome:
+    if prepare is not None and _prepared != [key := pickle.dumps(prepare)]:
+        prepare()
+        _prepared[:] = [key]
+    return work(task)

@@ -64,6 +64,18 @@ def diagnosed(travels: dict[str, tuple[float, float]] | None = None, **changed: 
     return findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0", travels=travels)
 
 
+def test_keys_of_ros_2_humble_are_named_as_such() -> None:
+    key = "0/lab/hands/left/geometry_msgs::msg::dds_::PoseStamped_/TypeHashNotSupported"
+    silent = HEALTHY.sources | {"left": Source()}
+    found = findings(HEALTHY, msgspec.structs.replace(HEALTHY, tick=2000, sources=silent, time_ns=10**18 + 2 * 10**9),
+                     own_ns=10**18, own_version="0.1.0", published=[key, "lab/hands/Left"])  # fmt: skip
+    by_name = {one.what: one for one in found}
+    assert by_name["ROS 2"].found == f"Humble publishes {key}"
+    assert "Iron or later" in by_name["ROS 2"].remedy
+    assert "lab/hands/Left" in by_name["left hand"].found
+    assert "TypeHash" not in by_name["left hand"].found
+
+
 def wrongs(found: list[Finding]) -> list[str]:
     return [finding.text() for finding in found if finding.level == "wrong"]
 

@@ -79,7 +79,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("skill.npz", 1, ("tune", GOLDEN, "--skill", "skill.npz")),
     ("a name that ends in .png needed", 2, ("tune", GOLDEN, "--plot", "tune.jpg")),
     ("is of another arm than", 1, ("replay", GOLDEN, "--config", "franka")),
-    ("without --exact, --after and --output", 2, ("replay", GOLDEN, "--config", "wam", "--exact")),
+    ("without --exact, --each, --after and --output", 2, ("replay", GOLDEN, "--config", "wam", "--exact")),
     ("no arm 'nobody'", 1, ("replay", GOLDEN, "--config", "nobody")),
 ])  # fmt: skip
 def test_a_mistake_is_explained(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +18,7 @@ import zenoh
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
 from zenoh_ros2_sdk.session import ZenohSession
 
+from service.cli.cells import HEADS
 from service.cli.main import main
 from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
 from service.contract import cdr, channels, requests, ros2, ros2msg
@@ -90,11 +93,33 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
     }
     assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}
     assert main(["cells", "--connect", lab.endpoint]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    heads, *lines = capsys.readouterr().out.splitlines()
+    assert re.split("  +", heads.strip()) == list(filter(None, HEADS))
     assert [line.split()[0] for line in lines] == sorted(NAMES)
-    assert all("  hold (no_hands) " in line for line in lines[1:])
+    assert all("  hold (no_hands)  " in line for line in lines[1:])
     assert main(["cells", "--json", "--connect", lab.endpoint]) == 0
     assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
+
+
+def test_cells_are_watched_as_lines_and_one_that_ends_is_gone() -> None:
+    """The daemon of one is a publisher of a token, which then disappears."""
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as router,
+        open_session(connect=endpoints(router)) as daemon,
+    ):
+        token = daemon.liveliness().declare_token(channels.presence("lab/a", str(daemon.zid())))
+        command = [sys.executable, "-m", "service", "cells", "--watch", "--connect", endpoints(router)[0]]
+        watching = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        try:
+            assert watching.stdout is not None
+            assert watching.stdout.readline() == "lab/a  no status  it is starting, is busy, or denies access\n"
+            token.undeclare()
+            assert watching.stdout.readline() == "lab/a  gone\n"
+            watching.send_signal(signal.SIGINT)
+            assert "interrupted" in watching.communicate(timeout=20)[1]
+        finally:
+            watching.kill()
+            watching.communicate()
 
 
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import contextlib
 import datetime
 import itertools
 import os
+import re
 import shutil
 import stat
 import time
@@ -20,6 +21,7 @@ from cryptography import x509
 
 from service.cli.main import main
 from service.client import Client, UnreachableError, endpoints, living, open_session
+from service.client.session import valid_until
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
@@ -281,6 +283,57 @@ def test_a_certificate_out_of_its_time_is_told_in_words(
     (tmp_path / "own" / "tracker" / "certificate.pem").write_text("nothing")
     with pytest.raises(UnreachableError, match="does not hold a certificate"):
         open_session(connect=[guarded.endpoint], certificate=tmp_path / "own" / "tracker", timeout_s=1.0)
+
+
+def test_certificates_are_renewed_with_their_names_and_keys_and_old_and_new_ones_meet(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where some machines have the old ones, and where only a certificate came back."""
+    old, own = tmp_path / "old", tmp_path / "own"
+    assert told("certificates", str(own), "--host", "bench.local", "--days", "20").returncode == 0
+    shutil.copytree(own, old)
+    (own / "tracker" / "key.pem").unlink()
+    done = told("certificates", str(own), "--renew", "--days", "400")
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall("renewed; valid until", done.stdout)) == len(list(own.glob("*/certificate.pem")))
+    assert f"{datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=400):%Y-%m-%d}" in done.stdout
+    before, after = (
+        x509.load_pem_x509_certificate((folder / "daemon" / "certificate.pem").read_bytes()) for folder in (old, own)
+    )
+    assert (before.subject, before.public_key()) == (after.subject, after.public_key())
+    hosts = after.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "bench.local" in hosts.get_values_for_type(x509.DNSName)
+    assert (valid_until(own / "daemon") - valid_until(old / "daemon")).days == 380
+    shutil.copy(old / "tracker" / "key.pem", own / "tracker")
+    for daemons, clients in ((own, old), (old, own), (own, own)):
+        with (
+            open_session(listen=["tls/127.0.0.1:0"], certificate=daemons / "daemon") as daemon,
+            open_session(connect=endpoints(daemon), certificate=clients / "tracker"),
+        ):
+            pass
+    assert not list(own.rglob("*.new"))
+    for path in own.rglob("*.pem"):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    shutil.copytree(secrets / "operator", own / "operator-7")
+    refused = told("certificates", str(own), "--renew")
+    assert (refused.returncode, "operator-7/certificate.pem is not by the authority" in refused.stderr) == (1, True)
+    assert told("certificates", str(own), "--renew", "--role", "arm").returncode == 2
+    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=500)  # the authority has expired
+    monkeypatch.setattr("service.cli.certificates.now", lambda: later)
+    shutil.rmtree(own / "operator-7")
+    assert told("certificates", str(own), "--role", "arm").returncode == 1
+    assert told("certificates", str(own), "--renew").returncode == 0
+
+
+def test_a_certificate_that_ends_soon_is_reported_by_daemon_doctor_and_cells(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    assert told("certificates", str(own), "--days", "20").returncode == 0
+    config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{own}/daemon"\n'
+    with launched(tmp_path, "--arm", "assumed", network=config) as service:
+        at = ("--connect", service.endpoint, "--certificate", str(own / "operator"))
+        assert "certificate ends in 20 days" in told("cells", *at).stdout
+        assert re.search(r"note +certificate +ends in 20 days\n.*\n.*--renew", told("doctor", *at).stdout)
+        until(lambda: "the certificate ends on" in service.log.read_text())
 
 
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:

@@ -342,3 +342,49 @@ def test_a_retired_setting_has_no_effect_in_a_file_and_is_kept_by_recordings() -
         assert parse("[tool]\njerk_weight = 'x'", origin="cell.toml") == Settings()
     recorded = msgspec.json.encode({"tool": {"jerk_weight": 1e-8}})  # a recording replays with what was in effect
     assert validated(msgspec.json.decode(recorded), Settings).tool.jerk_weight == 1e-8
+
+
+LAB = """
+rate_hz = 250
+[tool]
+max_speed = 0.5
+max_jerk = 200
+[network]
+listen = ["tcp/127.0.0.1:0"]
+[cells.bench1]
+[cells."lab/bench2"]
+rate_hz = 500
+tool = { max_speed = 0.3 }
+[cells.bench3]
+cell = "hall/bench3"
+network.listen = ["tcp/127.0.0.1:7448"]
+"""
+
+
+def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(LAB, encoding="utf-8")
+    first, second, third = (cell_of(f"{path}:{name}") for name in ("bench1", "lab/bench2", "bench3"))
+    assert [one.cell for one in (first, second, third)] == ["bench1", "lab/bench2", "hall/bench3"]
+    assert [one.rate_hz for one in (first, second, third)] == [250, 500, 250]
+    assert [(one.tool.max_speed, one.tool.max_jerk) for one in (first, second)] == [(0.5, 200.0), (0.3, 200.0)]
+    assert third.network.listen == ("tcp/127.0.0.1:7448",)
+    assert first.network.listen == second.network.listen == ("tcp/127.0.0.1:0",)
+
+
+@pytest.mark.parametrize(
+    ("text", "cell", "words"),
+    [
+        (LAB, "", "no cell given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
+        (LAB, "bench4", "cell 'bench4' given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
+        ("", "bench1", "cell 'bench1' given; FILE.toml:NAME with one of no cells needed"),
+        ("cells = 3", "a", "tables by the cells' names needed, like [cells.bench1.tool]"),
+        ("[cells]\nrate_hz = 3", "a", "tables by the cells' names needed"),
+        ("[cells.a.tool]\nmax_sped = 1", "a", "max_sped"),
+        ("[cells.a]\ntool = 3", "a", "tool: 3 given"),
+    ],
+)
+def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text: str, cell: str, words: str) -> None:
+    with pytest.raises(SettingsError) as raised:
+        parse(text, origin="lab.toml", cell=cell)
+    assert words in str(raised.value)

@@ -1,0 +1,123 @@
+"""`replay --each`, `report` and `tune` over several files: by one process, two, or a cluster."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.cli import tune
+from service.core.controller import Controller, run
+from service.core.frame import Frame, Tick
+from service.core.skill.skill import Skill
+from service.files.recording import Recorder
+from service.report.tracking import TrackingFigures
+from service.report.variants import CHANGES, VariantFigures, pooled
+from sim.scene import Scene
+from sim.script import HandScript
+from support.cell import told
+from support.in_process import ASSUMED, ticks_of
+from support.paths import RECORDINGS, ROOT
+from support.wam import URDF
+
+NAMES = ("a.mcap", "b.mcap", "broken.mcap", "c.mcap")
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+from service.cli.main import main
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        code = main([*sys.argv[1:], "--workers", f"dask:{cluster.scheduler_address}"])
+    sys.exit(code)
+"""
+
+
+@pytest.fixture(scope="module")
+def files(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Three short recordings, and among them one that is cut."""
+    folder = tmp_path_factory.mktemp("many")
+    controller = Controller(ASSUMED, skill, urdf=URDF)
+    with Recorder(folder / "a.mcap", settings=ASSUMED, skill=skill.file, state=controller.state) as recorder:
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
+
+        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:200], [keep])
+    for name in NAMES[1:]:
+        shutil.copy(folder / "a.mcap", folder / name)
+    (folder / "broken.mcap").write_bytes((folder / "a.mcap").read_bytes()[:30_000])
+    return [str(folder / name) for name in NAMES]
+
+
+def named_failures(errors: str) -> list[str]:
+    return [line for line in errors.splitlines() if line.startswith("thirdhand ")]
+
+
+@pytest.mark.parametrize("command", [("replay", "--each", "--exact"), ("report",)], ids=["replay", "report"])
+def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neither(
+    command: tuple[str, ...], files: list[str]
+) -> None:
+    alone = told(*command, *files)
+    assert alone.returncode == 1
+    assert [name for name in NAMES if f"{name}: 200 ticks" in alone.stdout or f"{name}\n" in alone.stdout] == [
+        name for name in NAMES if name != "broken.mcap"
+    ]
+    first, last = named_failures(alone.stderr)
+    assert "broken.mcap is cut" in first
+    assert last == f"thirdhand {command[0]}: 1 of 4 files cannot be used"
+    shared = told(*command, *files, "--workers", "2")
+    assert (shared.returncode, shared.stdout) == (1, alone.stdout)
+    assert named_failures(shared.stderr) == [first, last]
+
+
+def test_a_dask_cluster_of_two_workers_prints_the_same(files: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    script = tmp_path / "with_a_cluster.py"
+    script.write_text(CLUSTER, encoding="utf-8")
+    command = ["replay", "--each", *files]
+    done = subprocess.run(
+        [sys.executable, str(script), *command], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
+    )
+    alone = told(*command)
+    assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr
+    assert named_failures(done.stderr) == named_failures(alone.stderr)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("replay", "--workers", "2"), "--workers: --each needed"),
+        (("replay", "--each", "--output", "new.mcap"), "--output writes the frames of one recording"),
+        (("report", "--workers", "many"), "many given; a number of processes, or dask:tcp://HOST:8786 needed"),
+        (("tune", "--plot", "tune.png"), "the picture is of one file; 4 given"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(arguments: tuple[str, ...], message: str, files: list[str]) -> None:
+    done = told(arguments[0], *files, *arguments[1:])
+    assert (done.returncode, message in done.stderr) == (2, True), done.stderr
+
+
+def test_the_figures_of_several_files_are_weighted_by_their_judged_time() -> None:
+    def figures(error_mm: float, lag_ms: float, overshoot_mm: float, stops: int, cause: str) -> VariantFigures:
+        seen = TrackingFigures(error_mm, 2 * error_mm, lag_ms, 10.0, overshoot_mm, stops)
+        return VariantFigures("as recorded", {}, seen, {"hold: stale_hand": 0.5}, {}, {cause: 1})
+
+    nan = float("nan")
+    (one,) = pooled([(1.0, [figures(2.0, 50.0, 1.5, 2, "older")]), (3.0, [figures(4.0, nan, nan, 0, "jumped")])])
+    assert one.tracking == TrackingFigures(3.5, 7.0, 50.0, 10.0, 1.5, 2)
+    assert (one.held_s, one.rejected) == ({"hold: stale_hand": 1.0}, {"older": 1, "jumped": 1})
+
+
+@pytest.mark.timeout(300)
+def test_several_takes_are_tuned_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune, "CHANGES", CHANGES[:5:4])
+    takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
+    done = told("tune", *takes, "--part", "3", "7")
+    assert done.returncode == 0, done.stderr
+    for words in ("how the tool follows, over 2 files", "max_jerk = 100"):
+        assert words in done.stdout
+    assert len(re.findall(r"Noise and tremor of the hands", done.stdout)) == 2

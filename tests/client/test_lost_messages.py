@@ -1,0 +1,67 @@
+"""Messages that a subscriber did not get: the client counts them, and reports the first."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+import zenoh
+
+from service.client import Watch, endpoints, open_session
+from service.contract import channels
+from service.daemon.cell_streams import Arrivals, CellStreams
+from service.settings.config import Settings
+from support.cell import until
+
+COUNT, BYTES = 2000, 50_000  # 100 MB, more than sockets and queues hold
+
+
+class Starved(Watch):
+    """A watch whose program does not come to take messages until `free`."""
+
+    def __init__(self, *arguments: Any, free: threading.Event) -> None:
+        self.free, self.taken = free, 0
+        super().__init__(*arguments)
+
+    def _decoded(self, sample: zenoh.Sample) -> Any:
+        self.free.wait(60)
+        self.taken += 1
+        raise ValueError("its content is of no interest")
+
+
+def test_a_starved_subscriber_knows_how_many_messages_it_lost(capsys: pytest.CaptureFixture[str]) -> None:
+    free = threading.Event()
+    with open_session(listen=["tcp/127.0.0.1:0"]) as daemon:
+        streams = CellStreams(daemon, Settings(), arrivals={c: Arrivals() for c in channels.BY_KEY}, failed=print)
+        with open_session(connect=endpoints(daemon)) as session, Starved(
+            session, "thirdhand", "joints/command", free=free
+        ) as watch:  # fmt: skip
+            until(lambda: streams.is_followed)
+            for _ in range(COUNT):
+                streams.publish("joints/command", bytes(BYTES))
+            free.set()
+
+            def all_counted() -> bool:
+                streams.publish("joints/command", b"")
+                sent.append(1)
+                return watch.taken > 1 and watch.lost > 0 and watch.taken + watch.lost == COUNT + len(sent)
+
+            sent: list[int] = []
+            until(all_counted)
+    assert watch.lost > COUNT / 10
+    told = "messages on thirdhand/joints/command are lost: this program or its network is too slow"
+    assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [told]
+
+
+def test_a_slow_loop_knows_what_its_queue_dropped_and_message_numbers_may_wrap_around() -> None:
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        publisher = session.declare_publisher("thirdhand/clutch")
+        true = channels.BY_KEY["clutch"].codec.encode(True)
+        with Watch(session, "thirdhand", "clutch") as watch:
+            for number in (2**32 - 2, 2**32 - 1, 0, 3):
+                publisher.put(true, source_info=zenoh.SourceInfo(publisher.id, number))
+            until(lambda: watch.lost == 2)
+            for number in range(4, 260):
+                publisher.put(true, source_info=zenoh.SourceInfo(publisher.id, number))
+            until(lambda: watch.lost == 6)  # the queue holds 256 of 260
