@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.files.recording import Recording
 
 CODEC, PIXELS = "h264", "yuv420p"
@@ -51,7 +51,7 @@ def _opened(file: bytes) -> Image.Image:
     try:
         return Image.open(io.BytesIO(file)).convert("RGB")
     except OSError as error:
-        raise ExplainedError(f"an image of the recording cannot be decoded: {error}") from None
+        raise ExplainedError(f"an image of the recording cannot be decoded: {in_words(error)}") from None
 
 
 def write_video(path: Path, episodes: Sequence[CameraRows], key: str, *, fps: int) -> tuple[dict[str, Any], list[Any]]:
