@@ -23,7 +23,6 @@ from service.core.frame import Records, Vector
 from service.core.skill.skill import Skill
 from service.settings.config import Settings
 
-BINDING_SHARE = float(PLANNED_LIMIT_SHARES[1]) ** 2  # a setpoint plans with less than this share of the accelerations
 PATH_STEP_S, PATH_SPEED_SHARE = 0.02, 0.3  # duration of a step along a path, and its speed / max_speed
 PATH_END_STEPS = 300  # steps in which the arm reaches the first point of a path
 ON_PATH_M = 0.03  # a posture whose tool is farther from the path is left out
@@ -104,9 +103,11 @@ def _along(arm: Arm, settings: Settings, positions: Vector, orientation: Vector)
 def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Each limit that a frame of the T `frames` meets, and a mask (T,) of the frames that do.
 
-    A frame that follows meets the one limit of which it uses the largest share, if this is at least
-    BINDING_SHARE: speed or acceleration of a joint, or of the tool's setpoint.
+    A frame that follows meets the one limit of which it uses the largest share: speed or
+    acceleration of a joint, or of the tool's setpoint. It has to be more than what a setpoint plans
+    with, the planned share of the tool's acceleration, of which the joints get that share again.
     """
+    least = float(PLANNED_LIMIT_SHARES[1]) ** 2
     joints, tool = settings.joints, settings.tool
     engages = frames["flags"] & int(Flag.ENGAGING) > 0
     speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
@@ -122,7 +123,7 @@ def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[
         for joint, name in enumerate(joints.names):
             shares[f"{kind} of {name}"] = np.abs(frames[field][:, joint]) / limits[joint]
     used = np.array([*shares.values()])
-    largest = np.where((used.max(axis=0) >= BINDING_SHARE) & (frames["mode"] == Mode.FOLLOW), used.argmax(axis=0), -1)
+    largest = np.where((used.max(axis=0) >= least) & (frames["mode"] == Mode.FOLLOW), used.argmax(axis=0), -1)
     for number, name in enumerate(shares):
         if (met := largest == number).any():
             yield name, met

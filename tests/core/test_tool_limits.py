@@ -12,7 +12,7 @@ from service.core.arm.stage import Arm
 from service.core.arm.tuning import PLANNED_LIMIT_SHARES
 from service.core.frame import blank, frame_layout
 from service.core.skill.skill import Skill
-from service.core.tool_limits import BINDING_SHARE, binding, limits_of_task, path_of, tool_limits
+from service.core.tool_limits import binding, limits_of_task, path_of, tool_limits
 from service.files.shipped import ARMS, cell_of
 from service.settings.config import Settings, robot_description
 
@@ -81,7 +81,7 @@ def test_a_frame_meets_the_one_limit_of_which_it_uses_most() -> None:
     frames["setpoint_acceleration"][2] = (-settings.tool.acceleration, 0.0, 0.0)
     frames["setpoint_velocity"][3] = (settings.tool.engaging_speed, 0.0, 0.0)
     frames["flags"][3] = Flag.ENGAGING
-    frames["joint_velocities"][4, 2] = 0.99 * BINDING_SHARE * settings.joints.velocity[2]
+    frames["joint_velocities"][4, 2] = 0.99 * PLANNED_LIMIT_SHARES[1] ** 2 * settings.joints.velocity[2]
     frames["joint_velocities"][5, 2], frames["mode"][5] = settings.joints.velocity[2], Mode.HOLD
     assert {name: np.flatnonzero(met).tolist() for name, met in binding(settings, frames)} == {
         "speed of wam/shoulder_yaw_joint": [0],

@@ -254,7 +254,10 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
             assert set(names.values()) >= {"scribe", "skill worker"}
             return next(pid for pid, name in names.items() if name == "skill worker")
 
-        taught, first = teach(daemon, 3), skill_worker()
+        taught, tick = teach(daemon, 3), daemon.client.status().tick
+        # It also computes the limits of the tool, and is killed while it does nothing else.
+        daemon.until(lambda status: status["tick"] > tick and status["tool_limits"])
+        first = skill_worker()
         os.kill(first, signal.SIGSTOP)
         killing = threading.Timer(0.3, os.kill, [first, signal.SIGKILL])
         killing.start()
