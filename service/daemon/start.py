@@ -31,7 +31,6 @@ REPORT_EVERY_S = 1.0  # interval of reports on a terminal
 LOG_EVERY_S = 20.0  # interval of reports in the log
 MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
 NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
-START_NICE = -5  # 3 times the weight of an ordinary process, as an arm waits for the start
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 
 
@@ -141,13 +140,8 @@ def _process_age_s() -> float:
 def starting(settings: Settings) -> Iterator[Startup]:
     """The start of a cell's daemon, which occupies the cell until the context ends.
 
-    This thread runs ahead of ordinary processes, if granted.
-
     Raises OccupiedError, UnreachableError.
     """
-    if os.getpriority(os.PRIO_PROCESS, 0) == 0:
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, 0, START_NICE)
     network = settings.network
     roles = network.revoked, network.ros2_domain, (*ros2.of_settings(settings.ros2),)
     with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:

@@ -243,7 +243,7 @@ def _serve(control: socket.socket) -> None:
     _set_name("fork server")
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.setpriority(os.PRIO_PROCESS, 0, max(CHILD_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+        os.nice(CHILD_NICE)
     while True:
         request, descriptors, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 1)
         if not request:

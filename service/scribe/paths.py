@@ -38,9 +38,8 @@ class RecordingPaths:
         self._newest = datetime.min.replace(tzinfo=UTC)
         self._own: dict[str, bool] = {}  # True for this cell's recordings, by stem
         self._cell = settings.cell.replace("/", "-")
-        self.keep_mb_left: float | None = (
-            None  # growth before each file takes an older one's place; None: without end, or not known yet
-        )
+        # Growth before each file takes an older one's place; None: without end, or not known yet.
+        self.keep_mb_left: float | None = None
 
     def next(self) -> tuple[Path | None, Path | None]:
         """Paths of the next recording and of its drawing; None for those not written."""
