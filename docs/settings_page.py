@@ -154,7 +154,7 @@ def _accepted(kind: Any) -> str:
     if isinstance(kind, types.TupleType):
         return f"{len(kind.item_types)} numbers{_each(kind.item_types[0])}"
     if isinstance(kind, types.VarTupleType):
-        inner = kind.item_type
+        inner = kind.item_type.type if isinstance(kind.item_type, types.Metadata) else kind.item_type
         if isinstance(inner, types.StructType):
             fields = "; ".join(f"`{field.name}`: {_accepted(field.type)}" for field in inner.fields)
             return f"tables with {fields}"
