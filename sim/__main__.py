@@ -96,6 +96,8 @@ def main(arguments: list[str] | None = None) -> int:
     if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
         p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
     try:
+        if args.end_with is not None:
+            end_with(args.end_with)
         settings = cell_of(args.arm)
         scene, _ = (Scene.load(args.scene) if args.scene else Scene()).in_reach(settings.reach)
         if args.via_points:
@@ -107,8 +109,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (SceneError, LaunchError, UnreadableError) as error:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
-        if args.end_with is not None:
-            end_with(args.end_with)
     except (SettingsError, UsageError) as error:
         p.error(str(error))
     from sim.bench import Bench, BenchHands

@@ -162,6 +162,22 @@ def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: s
     assert "Traceback" not in said.read_text()
 
 
+def test_a_bench_that_says_nothing_ends_with_the_process_that_runs_it(tmp_path: Path) -> None:
+    """A bench that prints would end with the pipe that nobody reads any more."""
+    said = tmp_path / "said"
+    with subprocess.Popen(["sleep", "600"]) as runs_it:
+        bench = begun(["sim", "--listen", "tcp/127.0.0.1:0", "--end-with", str(runs_it.pid)], said)
+        try:
+            wait_for(lambda: "listening on" in said.read_text(), 100)
+            assert bench.poll() is None
+            runs_it.kill()
+            runs_it.wait()
+            assert bench.wait(30) == 0
+        finally:
+            bench.kill()
+            runs_it.kill()
+
+
 def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", CLEAN_UP_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
