@@ -48,7 +48,7 @@ REAL_CELL = "real"  # name of the real daemon's cell
 
 
 class Observer:
-    """What arrives from each cell: statuses, lost ones by their numbers, and times of arrival."""
+    """The statuses of each cell: how many arrived, how many were lost by number, and when."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.received, self.lost = defaultdict[str, int](int), defaultdict[str, int](int)

@@ -560,7 +560,7 @@ def sessions() -> dict[str, Session]:
         }
 
     def pulled(seed: int) -> dict[str, float]:
-        """How far another via-point moves the target of hands at some distances from it."""
+        """Effect of one more via-point on the target, for hands at several distances from it."""
         random, scene = np.random.default_rng([streams["resting"].seed, seed]), Scene()
         skill = reached.taught(shipped_skill(), scene.via_points())
         hands = skill.hands[seed % len(skill.hands)] + random.uniform(-0.1, 0.1, 6)

@@ -92,12 +92,12 @@ class SkillStage:
         frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
         off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
         doubt = self._doubt_of_start(state) if self._doubts else 0.0
-        told = conclude(as_array(state), as_array(frame), self._rules, found[:6], found.closure, off, doubt)
-        target = Target(*found[:3], clamped=bool(told & IS_OUTSIDE))
-        if target.clamped:
+        outcome = conclude(as_array(state), as_array(frame), self._rules, found[:6], found.closure, off, doubt)
+        target = Target(*found[:3], clamped=False)
+        if outcome & IS_OUTSIDE:
             target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
             frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
-        is_ambiguous = bool(told & IS_AMBIGUOUS)
+        is_ambiguous = bool(outcome & IS_AMBIGUOUS)
         return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
 
     def _count(self, state: Record) -> None:
