@@ -32,6 +32,7 @@ from service.core.codes import (
 )
 from service.core.decision.stage import Decision
 from service.core.frame import (
+    RECORDS,
     Event,
     Frame,
     Lap,
@@ -90,7 +91,7 @@ class Controller:
     def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
         self._state = copied(start_state(settings, skill) if state is None else state)
         self._memory = as_array(self._state)
-        self._blank = as_array(blank(frame_layout(len(settings.joints.names))))
+        self._bytes, self._layout = self._memory.view(np.uint8), frame_layout(len(settings.joints.names))
         self.intake = Intake(settings)
         self._skill = SkillStage(settings, skill)
         self.decision = Decision(settings)
@@ -121,14 +122,14 @@ class Controller:
         """Take over state and skill of another controller with the same settings."""
         if self.skill is not other.skill:
             self._adopt(other.skill)
-        self._memory[:], self._here = other._memory, other._here
+        self._bytes[:], self._here = other._bytes, other._here
 
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
         """Frame of one tick, whose index must be higher than that of the tick before.
 
         Over omitted indices, the hands' motion is extrapolated; the arm moves by one period only.
         """
-        state, frame = self._state, self._blank.copy()[0]
+        state, frame = self._state, RECORDS(1, self._layout, bytearray(self._layout.itemsize))[0]
         conditions = self._take_in(tick, frame)
         lap("intake")
         conditions |= self._alone(frame)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step
+from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step, stand
 from service.core.arm.tuning import (
     CLOSING_BRAKE_SHARE,
     CLOSING_SPEED_MPS,
@@ -25,11 +25,10 @@ from service.core.arm.tuning import (
     TURN_HORIZON_S,
     TURN_LEVER_M,
 )
-from service.core.frame import Record, Vector, as_array, parameters, structured
+from service.core.frame import RECORDS, Record, Vector, as_array, parameters
 from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
-from service.core.numerics import MAX_JOINT_RAD
 from service.core.separation.stage import Separation
 from service.settings.config import Reach, Settings
 from service.settings.urdf import Urdf
@@ -132,7 +131,6 @@ class Arm:
                 ("jacobian", np.float64, (6, joints)),
             ]
         )
-        self._blank = structured(1, self._kinematics)
         self._goal = parameters(
             position=np.zeros(3),
             velocity=np.zeros(3),
@@ -146,12 +144,12 @@ class Arm:
 
     def at(self, q: Vector) -> Kinematics:
         """Kinematics of the arm at joints q (J,) [rad, m]."""
-        q = np.minimum(np.maximum(q, -MAX_JOINT_RAD), MAX_JOINT_RAD)
+        here = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
+        stand(here, q)
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian = pin.computeFrameJacobian(self._model, self._data, q, self._tool, axes)
+        jacobian = pin.computeFrameJacobian(self._model, self._data, here["joints"][0], self._tool, axes)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        here = self._blank.copy()
-        here["joints"][0], here["position"][0] = q, placement.translation
+        here["position"][0] = placement.translation
         describe(self.parameters, here, np.ascontiguousarray(jacobian), placement.rotation.copy())
         return Kinematics(here)
 

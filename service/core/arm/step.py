@@ -20,12 +20,20 @@ from service.core.arm.tuning import (
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
-from service.core.numerics import MAX_ERROR_M, ROUNDING
+from service.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
 from service.core.vectors import dot, norm, square
 
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
 SEPARATED = 4  # flag of a step: separation changed the velocities
+
+
+@compiled
+def stand(heres: Records, q: Vector) -> None:
+    """Write joints q (J,) [rad, m], limited to ± MAX_JOINT_RAD."""
+    here = heres[0]
+    for joint in range(len(q)):
+        here.joints[joint] = min(max(q[joint], -MAX_JOINT_RAD), MAX_JOINT_RAD)
 
 
 @compiled
