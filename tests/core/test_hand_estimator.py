@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
+from service.core.frame import Vector, parameters
 from service.core.intake import MODES, STATES, mode_filter
 from service.core.intake.hand_estimator import stillness_of
 from service.core.intake.motion_model import REST, model
@@ -188,16 +188,18 @@ def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None
 
 
 def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
-    once, noise = model(0.002)
-    transition, total = np.eye(STATES), np.zeros((STATES, STATES))
-    for _ in range(25):
-        transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
-    found, found_noise = model(0.05)
-    np.testing.assert_allclose(found, transition, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found_noise, total, rtol=1e-9, atol=1e-15)
+    short, long = model(0.002), model(0.05)
+    for name, of_noise in (("transition", "noise"), ("tremor", "tremor_noise")):
+        once, noise = short[name], short[of_noise]
+        transition, total = np.broadcast_to(np.eye(once.shape[-1]), once.shape), np.zeros(once.shape)
+        for _ in range(25):
+            transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
+        np.testing.assert_allclose(long[name], transition, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(long[of_noise], total, rtol=1e-9, atol=1e-15)
 
 
-def test_compiled_and_plain_functions_agree() -> None:
+@pytest.mark.parametrize("change_m", [0.0, 0.002])
+def test_compiled_and_plain_functions_agree(change_m: float) -> None:
     random = np.random.default_rng(4)
     root = random.normal(size=(MODES, STATES, STATES))
     means, covariances = random.normal(size=(MODES, STATES, 3)), root @ root.transpose(0, 2, 1)
@@ -205,11 +207,11 @@ def test_compiled_and_plain_functions_agree() -> None:
         if mode != REST:
             means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
     modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
-    transition, noise = model(0.002)
+    overs, tremor = parameters(**model(0.002)), np.array([40.0, 2e-7, 1e-7, change_m**2])
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
-        for name, more in (("advance", (transition, noise)), ("update", (0.01, position, 0.03))):
+        for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
             function = getattr(mode_filter, name)
             arrays = parts[:2] if name == "advance" else parts
             (function.py_func if plain else function)(*arrays, *more)
