@@ -221,8 +221,8 @@ class People(Section, frozen=True):
     A hand is a capsule from its tracked point toward the elbow. A part of the arm may approach a
     hand at the speed from which it can stop `clearance` away from the hand, while the hand
     continues at its present speed and the stop begins `hands.stale_ms` + `reaction_ms` late: a
-    hand may move unseen for `hands.stale_ms`. A hand out of sight for longer is assumed to
-    accelerate toward the arm at 5 m/s² up to `unknown_speed`.
+    hand may move unseen for `hands.stale_ms`, or for `hands.stale_max_ms` if that is longer. A hand
+    out of sight for longer is assumed to accelerate toward the arm at 5 m/s² up to `unknown_speed`.
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm

@@ -233,14 +233,14 @@ def take_hand(
             passed_s = abs(made - state.kept_ticks[side, at]) * period_s
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
+            if jumped and not another and cause < 0 and order == 0:
+                wrong = wrong_samples(states, models, side, made, in_base)
             if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
                 # a higher share would only decay later
                 another = _turns_hard(states, side, at, in_base, passed_s, period_s)
                 another = another and is_to_and_fro(states, side, order, in_base)
             note(states, side, another, stale_ticks * period_s, period_s)
-            if jumped and not another and cause < 0 and order == 0:
-                wrong = wrong_samples(states, models, side, made, in_base)
-                jumped = wrong == 0
+            jumped = jumped and wrong == 0
         elif cause != REPEATED:
             note(states, side, False, stale_ticks * period_s, period_s)
         if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
