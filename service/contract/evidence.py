@@ -252,7 +252,7 @@ def _rate_too_low(seen: Evidence, name: str) -> str:
     source = seen.sources.get(name)
     if seen.settings is None or source is None or source.age_ms is None or _is_rejected(source):
         return ""
-    accepted_ms = seen.settings.arm.silent_ms if name == "arm" else seen.settings.hands.stale_ms
+    accepted_ms = seen.settings.arm.silent_ms if name == "arm" else seen.settings.hands.longest_stale_ms
     continues = source.age_ms * source.rate_hz < 2000.0  # the next sample is not overdue by a whole interval
     if not continues or not 0.0 < source.rate_hz * accepted_ms < 1000.0:
         return ""

@@ -181,7 +181,7 @@ class Controller:
         side, ages = self.skill.conductor, frame["hand_ages"]
         if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
             return 0
-        return ONE_HAND | (HANDS_KNOWN if ages[side] < self.intake.stale_ticks else 0)
+        return ONE_HAND | (HANDS_KNOWN if ages[side] < frame["stale_ticks"][side] else 0)
 
     def _adopt(self, skill: Skill) -> None:
         """Replace the skill in force."""

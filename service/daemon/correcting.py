@@ -92,8 +92,8 @@ class Corrections:
                 )
             hands, stage = np.array(state["held_hands"]), int(state["held_stage"])
         else:
-            ages = frame["hand_ages"][list(sides)] * self._settings.period_s
-            if (ages < 0).any() or (1000 * ages >= self._settings.hands.stale_ms).any():
+            ages, stale = (frame[name][list(sides)] for name in ("hand_ages", "stale_ticks"))
+            if (ages < 0).any() or (ages >= stale).any():
                 raise RequestError("$.hands: 'now' given, but the hands are not seen now")
             hands, belief = np.array(frame["hands"]), np.array(state["stage_belief"])
             stage = int(belief.argmax()) if belief.max() > 0.5 else -1

@@ -80,7 +80,8 @@ class InputMonitor:
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
-        silent_ms = settings.arm.silent_ms if source == "arm" else settings.hands.stale_ms
+        stale_ms = 0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
+        silent_ms = settings.arm.silent_ms if source == "arm" else stale_ms
         late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
         return Source(
             rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,

@@ -36,9 +36,10 @@ def _by_frame(columns: Columns, row: int) -> Explanation:
     frame = columns.frames[row]
     tick, settings = int(frame["tick"]), columns.recording.settings
     ages_ms = [None if age < 0 else age * columns.period_s * 1e3 for age in frame["hand_ages"].tolist()]
+    stale_ms = (columns.stale_ticks[row] * columns.period_s * 1e3).tolist()
     sources = {
-        side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < settings.hands.stale_ms)
-        for side, age_ms in zip(SIDES, ages_ms, strict=True)
+        side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < limit_ms)
+        for side, age_ms, limit_ms in zip(SIDES, ages_ms, stale_ms, strict=True)
     }
     skill = next((one.skill for one in reversed(columns.skills) if one.tick <= tick), None)
     seen = Evidence(

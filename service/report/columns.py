@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from service.learning.skill_file import SkillError, decoded
 KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
     *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
+    "stale_ticks",
     *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability", "closure"),
 )
 MOTION = (
@@ -95,6 +97,13 @@ class Columns:
     def seconds(self, tick: int) -> float:
         """Time of a tick since the first recorded one [s]."""
         return (tick - int(self.frames["tick"][0])) * self.period_s if len(self.frames) else 0.0
+
+    @property
+    def stale_ticks(self) -> Records:
+        """Age from which each hand is stale (T, 2); `stale_ms` where it was not recorded."""
+        least = math.ceil(round(self.recording.settings.hands.stale_ms / 1000 / self.period_s, 6))
+        found: Records = np.maximum(self.frames["stale_ticks"], least)
+        return found
 
     @property
     def times(self) -> Vector:

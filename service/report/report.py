@@ -161,8 +161,7 @@ class Report:
         self.tool_limits = _tool_limits(columns, following)
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
-        stale_ticks = recording.settings.hands.stale_ms / 1000 / columns.period_s
-        seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] <= stale_ticks)
+        seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] < columns.stale_ticks)
         seen_s = np.maximum(seen.sum(axis=0), 1) * columns.period_s  # time in which each hand was seen
         self.hands_hz = {side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)}
 
@@ -242,8 +241,8 @@ def _ended(columns: Columns, fault: Span) -> str:
 def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
     """The closest approach of a hand that was seen; None without any."""
     frames = columns.frames
-    newest = frames["hand_ages"].min(axis=1, where=frames["hand_ages"] >= 0, initial=2**31 - 1)
-    known = np.flatnonzero(newest * 1000 * columns.period_s <= columns.recording.settings.hands.stale_ms)
+    ages = frames["hand_ages"]
+    known = np.flatnonzero(((ages >= 0) & (ages < columns.stale_ticks)).any(axis=1))
     if not len(known):
         return None
     row = int(known[frames["hand_distance"][known].argmin()])

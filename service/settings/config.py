@@ -66,6 +66,7 @@ class HandSettings(Section, frozen=True):
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after unit and axes
     noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
+    stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0  # delays raise `stale_ms` up to this; 0: never
     unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
     still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is in motion
     still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # a slow hand counts as still after this time
@@ -75,6 +76,11 @@ class HandSettings(Section, frozen=True):
     clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
     clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
     gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
+
+    @property
+    def longest_stale_ms(self) -> float:
+        """Longest time without a sample [ms] after which a hand is stale, with any delays."""
+        return max(self.stale_ms, self.stale_max_ms)
 
 
 class TrackerSettings(Section, frozen=True):
@@ -215,8 +221,8 @@ class People(Section, frozen=True):
     A hand is a capsule from its tracked point toward the elbow. A part of the arm may approach a
     hand at the speed from which it can stop `clearance` away from the hand, while the hand
     continues at its present speed and the stop begins `hands.stale_ms` + `reaction_ms` late: a
-    hand may move unseen for `hands.stale_ms`. A hand out of sight for longer is assumed to
-    accelerate toward the arm at 5 m/s² up to `unknown_speed`.
+    hand may move unseen for `hands.stale_ms`, or for `hands.stale_max_ms` if that is longer. A hand
+    out of sight for longer is assumed to accelerate toward the arm at 5 m/s² up to `unknown_speed`.
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm

@@ -71,7 +71,9 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/timing/lateness", "Lateness of a tick [µs]", 0, period_us / 2),
             PlotView("/timing/work", "Work of a tick [µs]", 0, period_us),
             PlotView("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
-            PlotView("/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.stale_ms, True),
+            PlotView(
+                "/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.longest_stale_ms, True
+            ),
         )
     }
 

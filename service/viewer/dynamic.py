@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -56,7 +57,7 @@ class DynamicScene:
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
-        self._stale_ticks = settings.hands.stale_ms / self._period_ms
+        self._stale_ticks = math.ceil(round(settings.hands.stale_ms / self._period_ms, 6))
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
             name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
         }
@@ -294,12 +295,16 @@ class DynamicScene:
 
     def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
         """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
-        tracks = [(name, frames["hands"][:, side], frames["hand_ages"][:, side]) for side, name in enumerate(SIDES)]
-        tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1)))
-        for name, positions, ages in tracks:
+        stale = np.maximum(frames["stale_ticks"], self._stale_ticks)  # older recordings have no limits of their own
+        tracks = [
+            (name, frames["hands"][:, side], frames["hand_ages"][:, side], stale[:, side])
+            for side, name in enumerate(SIDES)
+        ]
+        tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1), stale[:, 0]))
+        for name, positions, ages, limits in tracks:
             trail, shown, strips = self._trails[name], [], []
             for i in rows:
-                fresh = 0 <= ages[i] <= self._stale_ticks
+                fresh = 0 <= ages[i] < limits[i]
                 if not fresh or (trail and np.linalg.norm(trail[-1] - positions[i]) > TRAIL_BREAK_M):
                     trail.clear()
                 if fresh:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
+from service.core.frame import Vector, parameters
 from service.core.intake import MODES, STATES, mode_filter
 from service.core.intake.hand_estimator import stillness_of
 from service.core.intake.motion_model import REST, model
@@ -136,6 +136,55 @@ def test_a_tremor_is_little_of_the_motion_of_a_hand_on_its_way(size_m: float) ->
     assert np.sqrt(np.mean(np.sum((found[:, 1] - [0.2, 0.0, 0.0]) ** 2, axis=1))) < 0.055
 
 
+def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
+    """Deviation of position [m] and velocity [m/s], (T, 3) each, of the estimate from a hand that
+    moves evenly along y and shakes along x at a frequency, in the last 3 s of 6.
+    """
+    noise = np.random.default_rng(11).normal(0.0, 0.0005, (601, 3))
+    x = np.array([1.0, 0.0, 0.0])
+    motion = np.array([0.0, speed, 0.0])
+    found = follow(Hands(), lambda t: motion * t + size_m * np.sin(2 * np.pi * hz * t) * x, until_s=6.0, noise=noise)[
+        1500:
+    ]
+    times = PERIOD_S * np.arange(1500, 1500 + len(found))
+    return found[:, 0] - times[:, None] * motion, found[:, 1] - motion
+
+
+def part_at(hz: float, deviation: Vector) -> float:
+    """Amplitude of the part of a deviation (T, 3) that has a frequency."""
+    waves = np.exp(2j * np.pi * hz * PERIOD_S * np.arange(len(deviation)))
+    return float(np.linalg.norm(2.0 * (deviation - deviation.mean(axis=0)).T @ waves / len(deviation)))
+
+
+@pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 8.0, 10.0, 12.0])
+def test_a_slow_tremor_is_no_part_of_the_motion_of_a_hand_at_rest(hz: float) -> None:
+    position, velocity = shaking(hz, 0.002, 0.0)
+    assert part_at(hz, position) < 0.0002
+    assert np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < 0.003
+
+
+@pytest.mark.parametrize(("size_m", "speed"), [(0.003, 0.1), (0.002, 0.25)])
+@pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 9.1, 13.0])
+def test_a_tremor_hardly_ripples_the_velocity_of_a_hand_on_its_way(hz: float, size_m: float, speed: float) -> None:
+    _, velocity = shaking(hz, size_m, speed)
+    assert part_at(hz, velocity) < 0.15 * 2 * np.pi * hz * size_m
+
+
+def test_a_hand_that_trembled_and_reaches_again_has_no_tremor_left() -> None:
+    """Covariances stay positive, although the tremor of the mode CHANGE begins and ends."""
+    hands = Hands()
+    follow(
+        hands,
+        lambda t: reach(t - 3.0) + (0.003 * np.sin(10 * np.pi * t) if t < 3.0 else 0.0) * np.ones(3),
+        until_s=7.0,
+        noise=np.random.default_rng(12).normal(0.0, 0.0005, (701, 3)),
+    )
+    assert hands.state["trembles"][LEFT] == 0
+    assert np.linalg.norm(hands.state["hands"][LEFT, 0] - reach(5.0)) < 0.002
+    for covariance in hands.state["mode_covariances"][LEFT, :, :3, :3]:
+        assert np.linalg.eigvalsh(covariance).min() > 0
+
+
 @pytest.mark.parametrize(("rate_hz", "noise_m"), [(30, 0.002), (100, 0.0005)])
 @pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
 def test_a_hand_at_rest_that_is_not_seen_for_a_moment_does_not_dart(
@@ -188,16 +237,18 @@ def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None
 
 
 def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
-    once, noise = model(0.002)
-    transition, total = np.eye(STATES), np.zeros((STATES, STATES))
-    for _ in range(25):
-        transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
-    found, found_noise = model(0.05)
-    np.testing.assert_allclose(found, transition, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found_noise, total, rtol=1e-9, atol=1e-15)
+    short, long = model(0.002), model(0.05)
+    for name, of_noise in (("transition", "noise"), ("tremor", "tremor_noise")):
+        once, noise = short[name], short[of_noise]
+        transition, total = np.broadcast_to(np.eye(once.shape[-1]), once.shape), np.zeros(once.shape)
+        for _ in range(25):
+            transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
+        np.testing.assert_allclose(long[name], transition, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(long[of_noise], total, rtol=1e-7, atol=1e-15)
 
 
-def test_compiled_and_plain_functions_agree() -> None:
+@pytest.mark.parametrize("change_m", [0.0, 0.002])
+def test_compiled_and_plain_functions_agree(change_m: float) -> None:
     random = np.random.default_rng(4)
     root = random.normal(size=(MODES, STATES, STATES))
     means, covariances = random.normal(size=(MODES, STATES, 3)), root @ root.transpose(0, 2, 1)
@@ -205,11 +256,11 @@ def test_compiled_and_plain_functions_agree() -> None:
         if mode != REST:
             means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
     modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
-    transition, noise = model(0.002)
+    overs, tremor = parameters(**model(0.002)), np.array([40.0, 2e-7, 1e-7, change_m**2])
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
-        for name, more in (("advance", (transition, noise)), ("update", (0.01, position, 0.03))):
+        for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
             function = getattr(mode_filter, name)
             arrays = parts[:2] if name == "advance" else parts
             (function.py_func if plain else function)(*arrays, *more)

@@ -205,6 +205,27 @@ def test_a_hand_is_stale_after_exactly_the_configured_time(rate_hz: int, stale_m
     assert not hands.fresh()
 
 
+@pytest.mark.parametrize(("stale_max_ms", "most"), [(0.0, 50), (200.0, 100)])
+def test_a_hand_becomes_stale_later_while_its_samples_come_in_bursts(stale_max_ms: float, most: int) -> None:
+    """The link is blocked again and again, for 0 to 150 ms."""
+    hands, random = Hands(HandSettings(stale_max_ms=stale_max_ms)), np.random.default_rng(8)
+    arrivals: dict[int, list[int]] = {}
+    blocked_until, limits, stale = 0, [], 0
+    for k in range(0, 3000, 5):
+        while blocked_until < k:
+            blocked_until += 1 + int(random.uniform(0.0, 75.0))
+        arrivals.setdefault(blocked_until if k > 250 else k, []).append(k)
+    for tick in range(3000):
+        for k in arrivals.get(tick, []):
+            hands.hand(1_000_000_000 + k * 2_000_000)
+        limits.append(int(hands.state["stale_ticks"][LEFT]))
+        stale += tick > 1500 and hands.state["tick"] - hands.state["hand_ticks"][LEFT] >= limits[-1]
+        hands.advance()
+    assert limits[0] == 50
+    assert 50 <= min(limits) <= max(limits) <= most
+    assert (stale == 0) == (stale_max_ms > 0.0)
+
+
 def test_a_repeated_sample_does_not_keep_a_hand_fresh() -> None:
     hands = Hands()
     for _ in range(51):

@@ -26,7 +26,7 @@ from sim.people import person
 from sim.sessions import session
 from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, frames, led
 from support.tracked import LEFT as LEFT_SIDE
-from support.tracked import STRAIGHT, Hands
+from support.tracked import PERIOD_S, STRAIGHT, Hands
 from support.wam import URDF
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
@@ -87,6 +87,38 @@ def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, 
     assert told.rejected() == {Cause.JUMPED: length}
     for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "even_samples", "mode_probabilities"):
         assert told.state[name].tobytes() == missing.state[name].tobytes(), name
+
+
+@pytest.mark.parametrize("rate_hz", [30, 60])
+def test_wrong_samples_that_did_not_jump_are_dropped_by_the_next_right_one(rate_hz: int) -> None:
+    """They are 68 and 80 mm off, and make the hand seem to move at 2 m/s."""
+    hands, random, place = Hands(), np.random.default_rng(5), np.array([0.5, 0.1, 0.2])
+    off = {2 * rate_hz: 0.068, 2 * rate_hz + 1: 0.08}
+    for k in range(3 * rate_hz):
+        at = place + random.normal(0.0, 0.0005, 3) + off.get(k, 0.0) * np.array([0.0, 0.6, 0.8])
+        found = hands.hand(round(1e9 * (1 + k / rate_hz)), tuple(at.tolist()))
+        if k == 2 * rate_hz + 2:
+            assert np.linalg.norm(found - place) < 0.005  # it would run off otherwise
+            assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 1]) < 0.1
+            assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05  # separation counts with both places
+        hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
+    assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
+    assert not hands.contested()
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100])
+def test_a_hand_that_moves_quickly_is_not_taken_for_wrong_samples(rate_hz: int) -> None:
+    """It starts within 50 ms to 1.2 m/s; none of its samples is dropped."""
+    hands, random, kept = Hands(), np.random.default_rng(6), []
+    for k in range(2 * rate_hz):
+        t = k / rate_hz
+        moved = 1.2 * max(0.0, t - 1.0 - 0.025 * min(1.0, max(0.0, t - 1.0) / 0.05))
+        at = np.array([0.5, 0.1 + min(moved, 0.4), 0.2]) + random.normal(0.0, 0.0005, 3)
+        hands.hand(round(1e9 * (1 + t)), tuple(at.tolist()))
+        kept.append(int(hands.state["kept"][LEFT_SIDE]))
+        hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
+    assert (np.diff(kept) >= 0).all()
+    assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
 
 
 def test_samples_that_jump_and_disagree_are_never_believed() -> None:

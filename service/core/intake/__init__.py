@@ -6,6 +6,11 @@ from service.contract.records import PER_JOINT, SOURCES, Cause, Field
 
 MODES = 3  # modes of the hand filter: rest, reach, change
 STATES = 5  # states of each mode and axis: position, velocity, acceleration, tremor and its velocity
+TREMOR_RATES, USUAL_RATE = 7, 5  # rates of tremor that are told apart, from slow to fast, and the usual one
+NO_TREMOR = 2  # filters without tremor in the bank of tremor filters
+BANK = NO_TREMOR + TREMOR_RATES  # filters of that bank
+SETTLED_SAMPLES = 4  # a sample is settled when this number of newer ones is retained
+CONFIRMED_SAMPLES = 3  # successive samples confirm a jump: as many as show position, velocity and acceleration
 KEPT = 49  # retained samples of each hand, among which late ones are inserted: 0.1 s of the fastest tracker
 STATE = (
     Field("hand_stamps_ns", "int64", (2,)),  # stamp of the newest sample
@@ -28,15 +33,28 @@ STATE = (
     Field("kept_ticks", "int64", (2, KEPT)),  # ticks in which the samples were made
     Field("other_tick", "int64", (2,)),  # tick of the newest sample that jumped, accepted or not
     Field("other_after_ns", "int64", (2,)),  # stamp of the newest accepted sample at that time
+    Field("tremor_rate", "int64", (2,)),  # index of the rate of a hand's tremor
+    Field("bank_stamps_ns", "int64", (2,)),  # stamp of the newest sample in the bank of tremor filters
+    Field("bank_ticks", "int64", (2,)),  # tick in which that sample was made
+    Field("stale_ticks", "int64", (2,)),  # age from which each hand is stale
+    Field("longest_delay_ticks", "int64", (2, 2)),  # delay above the minimum, longest of: this window, the last one
+    Field("corrected_tick", "int64", (2,)),  # tick in which wrong samples were dropped
+    Field("doubted_samples", "int64", (2,)),  # number of samples after which a corrected hand is no longer doubted
     Field("even_samples", "int64", (2,)),  # number of `past_samples` that are evenly spaced
     Field("noise_samples", "int64", (2,)),  # number of samples averaged in the noise variance
     Field("hands", "float64", (2, 3, 3)),  # estimated position, velocity, acceleration; by axis
     Field("hand_turns", "float64", (2, 9)),  # rotation matrices of the newest samples, frame base, row by row
     Field("hand_velocity_lowpass", "float64", (2, 3)),  # velocity without tremor [m/s]
+    Field("hand_doubt_m", "float64", (2,)),  # distance of a corrected hand from the place that the dropped samples gave
     Field("hand_stillness", "float64", (2,)),  # 0: the hand is on its way; 1: it is still
     Field("mode_means", "float64", (2, MODES, STATES, 3)),
     Field("mode_covariances", "float64", (2, MODES, STATES, STATES)),
     Field("mode_probabilities", "float64", (2, MODES)),
+    Field("tremors", "float64", (2, 1 + MODES)),  # tremor of each hand: rate ω [1/s], and variance σ² [m²] of each mode
+    Field("bank_means", "float64", (2, BANK, STATES, 3)),  # of the bank of tremor filters
+    Field("bank_covariances", "float64", (2, BANK, STATES, STATES)),
+    Field("bank_evidence", "float64", (2, BANK)),  # log likelihood of recent samples
+    Field("bank_variances", "float64", (2, TREMOR_RATES)),  # mean squared amplitude of the tremor, by rate [m²]
     Field("noise_variance", "float64", (2,)),  # variance of the samples on each axis [m²]
     Field("sample_interval_s", "float64", (2,)),  # interval between the two newest samples
     Field("gripper_wish", "float64"),  # newest closure that a tracker wished, 0 to 1; -1: none yet
@@ -56,6 +74,7 @@ STATE = (
     Field("measured_velocities", "float64", (PER_JOINT,)),
     Field("kept_late", "int32", (2, KEPT)),  # ticks between making and arrival of each sample
     Field("rejected", "uint32", (len(Cause),)),  # rejected samples by cause, since start
+    Field("trembles", "uint8", (2,)),  # 1: the hand's tremor is evident
     Field("clock", "uint8", (2,)),  # `codes.ClockTrust`: trust in a tracker's clock
     Field("kept_restarts", "uint8", (2, KEPT)),  # 1: the filter started anew with this sample
     Field("other_returns", "uint8", (2,)),  # 1: the newest sample that jumped is of a second source
@@ -66,5 +85,6 @@ FRAME = (
     Field("hands", "float64", (2, 3)),  # estimated positions, left and right, at this tick [m]
     Field("hand_velocities", "float64", (2, 3)),  # estimated velocities [m/s]
     Field("hand_ages", "int32", (2,)),  # ticks since the newest sample; -1: none yet
+    Field("stale_ticks", "int32", (2,)),  # age from which each hand is stale
     Field("rejected", "uint32", (len(Cause),)),
 )

@@ -21,11 +21,13 @@ from kmp.compiled import compiled
 from service.core.codes import DOUBTED, LEARNING, TRUSTED
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
-from service.core.intake import KEPT, MODES
+from service.core.intake import KEPT, MODES, SETTLED_SAMPLES
 from service.core.intake.mode_filter import advance, start, update
 from service.core.intake.motion_model import CHANGE, model
+from service.core.intake.tremor import no_tremor, note_tremor
 from service.core.intake.tuning import (
     DELAY_TOLERANCE_S,
+    END_SHARE,
     LEAST_NOISE_M,
     MAX_LATE_S,
     MODE_INTENSITIES_M2PS5,
@@ -90,19 +92,20 @@ class HandEstimator:
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
-        """Transition, process noise and the gains of `smoothing` over an interval of some ticks,
-        and the speed of a still hand, as one record (1,).
+        """The motion model and the gains of `smoothing` over an interval of some ticks, and the
+        speed of a still hand, as one record (1,).
         """
-        transition, noise = model(ticks * self._period_s)
-        changed = smoothing(ticks * self._period_s, self._hands.still_s)
-        return parameters(
-            transition=transition, noise=noise, smoothing=changed, still_speed=float(self._hands.still_speed)
-        )
+        interval_s = ticks * self._period_s
+        changed = smoothing(interval_s, self._hands.still_s)
+        return parameters(**model(interval_s), smoothing=changed, still_speed=float(self._hands.still_speed))
 
     def begin(self, state: Record) -> None:
-        """Set the estimates that hold before the first sample: noise variance and stillness."""
+        """Set what holds before the first sample: noise variance, stillness and tremor."""
         state["noise_variance"] = self._hands.noise_std_m**2
         state["hand_stillness"] = STILL
+        for side in (0, 1):
+            no_tremor(as_array(state), side)
+        state["bank_ticks"] = -len(self._models)
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
         """Advance both hands by some ticks. A hand without a sample for `stale_ticks` is assumed to
@@ -157,7 +160,7 @@ def _advance_both(states: Records, stale_ticks: int, one: Records, models: Recor
     for side in range(2):
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
-            advance(state.mode_means[side], state.mode_covariances[side], over.transition, over.noise)
+            advance_hand(states, side, one)
             look_ahead(states, models, side)
         else:
             state.mode_means[side, :, 1:] = 0.0
@@ -266,32 +269,36 @@ def _later_s(states: Records, side: int, quickest: int, stamp_ns: int, period_s:
 
 
 @compiled
-def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float) -> int:
+def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float, max_late_s: float) -> int:
     """Whole ticks by which a sample's delay exceeds the smaller minimum delay of the last two
-    windows, at most MAX_LATE_S; 0 while the tracker's clock is not trusted.
+    windows, at most `max_late_s`; 0 while the tracker's clock is not trusted.
     """
     if states[0].clock[side] != TRUSTED:
         return 0
     late_s = max(_later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s))
-    return int(min(max(late_s, 0.0), MAX_LATE_S) / period_s + TICK_ROUNDING)
+    return int(min(max(late_s, 0.0), max_late_s) / period_s + TICK_ROUNDING)
 
 
 @compiled
-def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh: bool) -> None:
+def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, fresh: bool) -> None:
     """Update the minimum delays of one tracker by a sample that arrives now, and the trust in its
     clock.
 
     Every TRACKER_MEMORY_S, the clock is trusted if the minimum delays of two consecutive windows
     agree within DELAY_TOLERANCE_S. Learning restarts with the first sample, and with one that
-    arrives after a silence (not `fresh`) more than MAX_LATE_S above the minimum delay: the clock
+    arrives after a silence (not `fresh`) more than `max_late_s` above the minimum delay: the clock
     was set back.
+
+    The longest delay d above the minimum in these two windows determines from which age on the hand
+    is stale, between the settings `stale_ms` and `stale_max_ms`: d / END_SHARE.
     """
-    state = states[0]
+    state, period_s, max_late_s = states[0], parameters[0].period_s, parameters[0].max_late_s
     stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
     known = state.clock_tick[side] >= 0
-    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > MAX_LATE_S):
+    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > max_late_s):
         stamps[:], ticks[:] = stamp_ns, state.tick
         state.clock[side], state.clock_tick[side] = LEARNING, state.tick
+        state.longest_delay_ticks[side] = 0
     elif (state.tick - state.clock_tick[side]) * period_s >= TRACKER_MEMORY_S:
         apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
         steady = abs(apart_s) <= DELAY_TOLERANCE_S and state.clock[side] != LEARNING
@@ -299,8 +306,13 @@ def note_clock(states: Records, side: int, stamp_ns: int, period_s: float, fresh
         stamps[1], ticks[1] = stamps[0], ticks[0]
         stamps[0], ticks[0] = stamp_ns, state.tick
         state.clock_tick[side] = state.tick
+        state.longest_delay_ticks[side, 1], state.longest_delay_ticks[side, 0] = state.longest_delay_ticks[side, 0], 0
     elif _later_s(states, side, 0, stamp_ns, period_s) < 0.0:
         stamps[0], ticks[0] = stamp_ns, state.tick
+    late = ticks_late(states, side, stamp_ns, period_s, max_late_s)
+    state.longest_delay_ticks[side, 0] = max(state.longest_delay_ticks[side, 0], late)
+    stale = math.ceil(state.longest_delay_ticks[side].max() / END_SHARE)
+    state.stale_ticks[side] = min(max(stale, parameters[0].stale_ticks), parameters[0].stale_max_ticks)
 
 
 @compiled
@@ -338,7 +350,7 @@ def take(
     retained. `fresh` is false after a silence; see `note_clock`.
     """
     state, period_s = states[0], parameters[0].period_s
-    note_clock(states, side, stamp_ns, period_s, fresh)
+    note_clock(states, parameters, side, stamp_ns, fresh)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
@@ -347,7 +359,23 @@ def take(
     state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
     state.kept_positions[side, at] = position
     filter_in(states, side, at, TRACKER_MEMORY_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
+    settle(states, models, side, period_s)
     look_ahead(states, models, side)
+
+
+@compiled
+def settle(states: Records, models: Records, side: int, period_s: float) -> None:
+    """Update the tremor of one hand by its newest settled sample."""
+    if states[0].kept[side] > SETTLED_SAMPLES:
+        note_tremor(states, models, side, slot(states, side, SETTLED_SAMPLES), period_s)
+
+
+@compiled
+def advance_hand(states: Records, side: int, overs: Records) -> None:
+    """Advance all modes of one hand over the interval of the record `overs` (1,)."""
+    state = states[0]
+    rate, tremor = state.tremor_rate[side], state.tremors[side]
+    advance(state.mode_means[side], state.mode_covariances[side], overs, rate, tremor)
 
 
 @compiled
@@ -364,9 +392,9 @@ def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool
     _update_noise(states, side, position, interval_s)
     variance, modes = state.noise_variance[side], state.mode_probabilities[side]
     if anew:
-        start(means, covariances, modes, variance, position)
+        start(means, covariances, modes, variance, position, state.tremors[side])
     else:
-        update(means, covariances, modes, variance, position, interval_s)
+        update(means, covariances, modes, variance, position, interval_s, state.tremors[side])
     _remember(states, side, at)
 
 

@@ -19,11 +19,20 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.codes import TRUSTED
 from service.core.frame import Record, Records, Vector
-from service.core.intake import KEPT
-from service.core.intake.hand_estimator import filter_in, look_ahead, order_of, seconds_after, slot
-from service.core.intake.mode_filter import advance
-from service.core.intake.tuning import TRACKER_MEMORY_S
+from service.core.intake import KEPT, SETTLED_SAMPLES
+from service.core.intake.hand_estimator import (
+    advance_hand,
+    filter_in,
+    look_ahead,
+    order_of,
+    seconds_after,
+    settle,
+    slot,
+)
+from service.core.intake.motion_model import CHANGE
+from service.core.intake.tuning import REAPPEARED_VARIANCE_SHARE, TRACKER_MEMORY_S
 from service.core.numerics import TICK_ROUNDING
+from service.core.vectors import squared_distance
 
 
 @compiled
@@ -74,6 +83,61 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
 
 
 @compiled
+def _fits(states: Records, models: Records, side: int, order: int, tick: int, position: Vector) -> bool:
+    """True if a sample x (3,) [m] made at a tick fits a hand's filter as it was after the retained
+    sample of this `order`:
+
+        |x - p|² < REAPPEARED_VARIANCE_SHARE (P + r)
+
+    p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
+    """
+    state, at, there, variance = states[0], slot(states, side, order), np.empty(3), 0.0
+    before = state.kept_covariances[side, at, CHANGE]
+    over = models[min(tick - state.kept_ticks[side, at], len(models) - 1)]
+    expected(states, models, side, order, tick, there)
+    for row in range(3):
+        for column in range(3):
+            variance += over.transition[CHANGE, 0, row] * before[row, column] * over.transition[CHANGE, 0, column]
+    variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, at, 0]
+    return bool(squared_distance(position, there) < REAPPEARED_VARIANCE_SHARE * variance)
+
+
+@compiled
+def wrong_samples(states: Records, models: Records, side: int, tick: int, position: Vector) -> int:
+    """Number of the newest retained samples that a sample (3,) [m], which jumped and was made at
+    `tick`, shows to be wrong; 0 if none are.
+
+    It is the least number n, at most SETTLED_SAMPLES, for which the filter as it was before these n
+    samples fits the new sample, and none of the n. Samples since a confirmed jump are not wrong.
+    """
+    state = states[0]
+    for order in range(1, min(SETTLED_SAMPLES + 1, state.kept[side])):
+        newest = slot(states, side, order - 1)
+        if state.kept_restarts[side, newest] > 0:
+            return 0
+        wrong = _fits(states, models, side, order, tick, position)
+        for newer in range(order):
+            at = slot(states, side, newer)
+            made, sample = state.kept_ticks[side, at], state.kept_positions[side, at]
+            wrong = wrong and not _fits(states, models, side, order, made, sample)
+        if wrong:
+            return order
+    return 0
+
+
+@compiled
+def drop(states: Records, side: int, count: int) -> None:
+    """Drop the newest retained samples of a hand; `take_late` then restores the filter as it was
+    before them. They remain among the `past_samples`, as evidence of a second source, but no noise
+    variance is computed from them.
+    """
+    state = states[0]
+    state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
+    at = slot(states, side, 0)
+    state.kept_past[side, at], state.kept_noise[side, at, 2] = state.past_samples[side], 0.0
+
+
+@compiled
 def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, position: Vector, restarts: bool) -> None:
     """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
     filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
@@ -114,7 +178,6 @@ def take_late(
     """
     state, config = states[0], parameters[0]
     order, kept = order_of(states, side, stamp_ns), state.kept[side]
-    means, covariances = state.mode_means[side], state.mode_covariances[side]
     if kept > 0:
         _recall(states, side, slot(states, side, min(order, kept - 1)))
     first = order == kept
@@ -125,19 +188,20 @@ def take_late(
         ticks = 0 if first else state.kept_ticks[side, at] - state.kept_ticks[side, slot(states, side, newer + 1)]
         anew = first or state.kept_restarts[side, at] > 0
         if not anew:
-            _move_on(means, covariances, models, ticks)
+            _advance_by(states, models, side, ticks)
         filter_in(states, side, at, TRACKER_MEMORY_S if first else ticks * config.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
-    _move_on(means, covariances, models, ticks)
+    _advance_by(states, models, side, ticks)
+    settle(states, models, side, config.period_s)
     look_ahead(states, models, side)
 
 
 @compiled
-def _move_on(means: Vector, covariances: Vector, models: Records, ticks: int) -> None:
-    """Advance all modes by some ticks; 0 ticks change nothing."""
+def _advance_by(states: Records, models: Records, side: int, ticks: int) -> None:
+    """Advance all modes of one hand by some ticks; 0 ticks change nothing."""
     if ticks > 0:
-        over = models[min(ticks, len(models) - 1)]
-        advance(means, covariances, over.transition, over.noise)
+        at = min(ticks, len(models) - 1)
+        advance_hand(states, side, models[at : at + 1])
 
 
 @compiled

@@ -7,8 +7,8 @@ measures p + y; tremor is seen by the tracker but is no part of the hand's motio
 Modes are mixed at the time of a sample, after the prediction. Three rules are added to the
 published filter:
 
-* The mode CHANGE has no tremor (σ = 0), because the beginning of a change would otherwise be
-  explained as tremor.
+* The mode CHANGE has no tremor (σ = 0) until one is evident (`tremor`), because the beginning of a
+  change would otherwise be explained as tremor. An evident tremor is the same in all modes.
 * A resting hand is slow and its tremor is bounded (`_beyond_rest`). No mode explains the fastest
   motions; without the bound, the mode that allows the largest change between two samples wins.
 * A hand enters REST only when it is slow (`_switched`), conditioned on being slow
@@ -26,9 +26,9 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Vector
+from service.core.frame import Records, Vector
 from service.core.intake import MODES, STATES
-from service.core.intake.motion_model import CHANGE, REST
+from service.core.intake.motion_model import CHANGE, REACH, REST, STEADY
 from service.core.intake.tuning import (
     LEAST_MODE_PROBABILITY,
     MAX_TREMOR_M,
@@ -40,21 +40,20 @@ from service.core.intake.tuning import (
     REST_MAX_SPEED_MPS,
     REST_SPEED_STD_MPS,
     START_SPEED_STD_MPS,
-    TREMOR_RATE_PER_S,
-    TREMOR_STDS_M,
 )
 from service.core.numerics import PROBABILITY_ROUND_TO
 from service.core.vectors import square
 
 
 @compiled
-def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector) -> None:
+def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, tremor: Vector) -> None:
     """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
 
         mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
 
-    with σ_v = START_SPEED_STD_MPS and the mode's tremor σ. The variance of the acceleration is the
-    stationary one of the mode CHANGE. The probabilities are MODE_PRIOR.
+    with σ_v = START_SPEED_STD_MPS, and the rate ω and the mode's σ² of the `tremor` (1 + MODES,).
+    The variance of the acceleration is the stationary one of the mode CHANGE. The probabilities are
+    MODE_PRIOR.
     """
     of_acceleration = MODE_INTENSITIES_M2PS5[CHANGE] / (2.0 * MODE_ACCELERATION_REVERSIONS_PER_S[CHANGE])
     means[:] = 0.0
@@ -65,49 +64,97 @@ def start(means: Vector, covariances: Vector, modes: Vector, noise: float, posit
         covariances[mode, 0, 0] = noise
         covariances[mode, 1, 1] = START_SPEED_STD_MPS**2
         covariances[mode, 2, 2] = of_acceleration
-        _tremble(means[mode], covariances[mode], mode)
+        _tremble(means[mode], covariances[mode], tremor, mode)
         modes[mode] = MODE_PRIOR[mode]
 
 
 @compiled
-def advance(means: Vector, covariances: Vector, transition: Vector, noise: Vector) -> None:
-    """Prediction of all modes: m = F m, P = F P Fᵀ + Q, with each mode's `transition` F and `noise`
-    Q, both (MODES, STATES, STATES). F has a motion block (3, 3) and a tremor block (2, 2).
+def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremor: Vector) -> None:
+    """Prediction of all modes over an interval. `overs` (1,) is a record of `motion_model.model`,
+    `rate` the index of the tremor's rate, and `tremor` (1 + MODES,) has its variance in each mode.
+
+    With an evident tremor, REACH has the motion STEADY: otherwise the steady innovation of a hand
+    whose velocity does not revert would count as a change, and a change follows the tremor.
     """
-    moved, product = np.empty((STATES, 3)), np.empty((STATES, STATES))
     for mode in range(MODES):
-        mean, covariance, over = means[mode], covariances[mode], transition[mode]
-        for row in range(STATES):
-            first, end = (0, 3) if row < 3 else (3, STATES)  # F is block-diagonal: motion and tremor
-            for column in range(STATES):
-                p = 0.0
-                for k in range(first, end):
-                    p += over[row, k] * covariance[k, column]
-                product[row, column] = p
-            for axis in range(3):
-                m = 0.0
-                for k in range(first, end):
-                    m += over[row, k] * mean[k, axis]
-                moved[row, axis] = m
-        mean[:] = moved
-        for row in range(STATES):
-            for column in range(row, STATES):
-                p = noise[mode, row, column]
-                first, end = (0, 3) if column < 3 else (3, STATES)
-                for k in range(first, end):
-                    p += product[row, k] * over[column, k]
-                covariance[row, column] = covariance[column, row] = p
+        motion = STEADY if mode == REACH and tremor[1 + CHANGE] > 0.0 else mode
+        move_on(means[mode], covariances[mode], overs, motion, rate, tremor[1 + mode])
 
 
 @compiled
-def _tremble(mean: Vector, covariance: Vector, mode: int) -> None:
+def move_on(mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float) -> None:
+    """Prediction of one filter: m = F m, P = F P Fᵀ + Q, in place.
+
+    F and Q (STATES, STATES) have a motion block (3, 3), number `motion` of `motion_model.model`,
+    and a tremor block (2, 2), that of the `rate`. That of Q is multiplied by the variance `tremor`
+    [m²].
+    """
+    moved, product, over = np.empty((STATES, 3)), np.empty((STATES, STATES)), np.empty((STATES, 3))
+    moves, trembles = overs[0].transition[motion], overs[0].tremor[rate]
+    driving, trembling = overs[0].noise[motion], overs[0].tremor_noise[rate]
+    for row in range(STATES):
+        for k in range(3 if row < 3 else 2):
+            over[row, k] = moves[row, k] if row < 3 else trembles[row - 3, k]
+    for row in range(STATES):
+        first, count = (0, 3) if row < 3 else (3, 2)  # F is block-diagonal: motion and tremor
+        for column in range(STATES):
+            p = 0.0
+            for k in range(count):
+                p += over[row, k] * covariance[first + k, column]
+            product[row, column] = p
+        for axis in range(3):
+            m = 0.0
+            for k in range(count):
+                m += over[row, k] * mean[first + k, axis]
+            moved[row, axis] = m
+    mean[:] = moved
+    for row in range(STATES):
+        for column in range(row, STATES):
+            p = 0.0
+            if column < 3:
+                p = driving[row, column]
+            elif row >= 3:
+                p = tremor * trembling[row - 3, column - 3]
+            first, count = (0, 3) if column < 3 else (3, 2)
+            for k in range(count):
+                p += product[row, first + k] * over[column, k]
+            covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def measure(mean: Vector, p: Vector, noise: float, position: Vector) -> tuple[float, float]:
+    """Update of one filter, in place, by a sample z (3,) [m] of noise variance r [m²], with H = [1,
+    0, 0, 1, 0]:
+
+        S = H P Hᵀ + r,   K = P Hᵀ / S,   m = m + K (z - H m),   P = P - K S Kᵀ
+
+    Returns S and |z - H m|² / S before the update.
+    """
+    seen, error = np.empty(STATES), 0.0
+    for row in range(STATES):
+        seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
+    variance = seen[0] + seen[3] + noise
+    for axis in range(3):
+        innovation = position[axis] - mean[0, axis] - mean[3, axis]
+        error += innovation * innovation
+        for row in range(STATES):
+            mean[row, axis] += seen[row] / variance * innovation
+    for row in range(STATES):
+        for column in range(row, STATES):
+            p[row, column] -= seen[row] * seen[column] / variance
+            p[column, row] = p[row, column]
+    return variance, error / variance
+
+
+@compiled
+def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> None:
     """Reset the tremor of one mode to its stationary distribution: mean 0, variances σ² of y and (ω
     σ)² of w, uncorrelated with the motion.
     """
     mean[3:] = 0.0
     covariance[3:, :] = 0.0
     covariance[:, 3:] = 0.0
-    covariance[3, 3], covariance[4, 4] = TREMOR_STDS_M[mode] ** 2, (TREMOR_STDS_M[mode] * TREMOR_RATE_PER_S) ** 2
+    covariance[3, 3], covariance[4, 4] = tremor[1 + mode], tremor[1 + mode] * tremor[0] ** 2
 
 
 @compiled
@@ -117,14 +164,14 @@ def _come_to_rest(mean: Vector, covariance: Vector) -> None:
     """
     for known in range(1, 3):
         spread = REST_SPEED_STD_MPS if known == 1 else REST_ACCELERATION_STD_MPS2
-        row_of = covariance[known, :3].copy()
+        row_of = covariance[known].copy()
         variance = row_of[known] + spread * spread
         for axis in range(3):
             off = mean[known, axis]
-            for row in range(3):
+            for row in range(STATES):
                 mean[row, axis] -= row_of[row] / variance * off
-        for row in range(3):
-            for column in range(3):
+        for row in range(STATES):
+            for column in range(STATES):
                 covariance[row, column] -= row_of[row] * row_of[column] / variance
 
 
@@ -144,7 +191,7 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 
 @compiled
-def _bounded(innovation: float) -> float:
+def bounded(innovation: float) -> float:
     """Squared, normalised innovation x on three axes, at most so large that exp(-½ x) =
     LEAST_MODE_PROBABILITY³, a factor for each axis: a less probable sample does not distinguish
     modes.
@@ -170,33 +217,34 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
             shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
         if i != REST:
             speed = square(means[i, 1])
-            slow = math.exp(-0.5 * _bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
+            slow = math.exp(-0.5 * bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
 
 
 @compiled
-def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -> None:
+def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector, tremor: Vector) -> None:
     """Mixed initial condition of each mode j from the `shares` s (MODES, MODES) of `_switched`, in
     place; the predicted probabilities c (MODES,) are written to `expected`.
 
         c_j = Σ_i s_ij,   m_j = Σ_i s_ij m_ij / c_j
         P_j = Σ_i s_ij (P_ij + Σ_axes (m_ij - m_j)(m_ij - m_j)ᵀ / 3) / c_j
 
-    m_ij and P_ij are those of mode i; for i ≠ j, after `_come_to_rest` (j = REST) or `_leave_rest`
-    (i = REST), and with the tremor of mode j reset. Of each P_j, only the upper triangle is
-    computed.
+    m_ij and P_ij are those of mode i; for i ≠ j, after `_come_to_rest` (j = REST). Without an
+    evident tremor (σ = 0 in CHANGE), also after `_leave_rest` (i = REST), and with the tremor of
+    mode j reset. Of each P_j, only the upper triangle is computed.
     """
     of_means, of_covariances = np.empty((MODES, MODES, STATES, 3)), np.empty((MODES, MODES, STATES, STATES))
+    is_evident = tremor[1 + CHANGE] > 0.0
     for j in range(MODES):
         for i in range(MODES):
             of_means[j, i], of_covariances[j, i] = means[i], covariances[i]
-            if i != j:
-                if j == REST:
-                    _come_to_rest(of_means[j, i], of_covariances[j, i])
-                elif i == REST:
+            if i != j and j == REST:
+                _come_to_rest(of_means[j, i], of_covariances[j, i])
+            if i != j and not is_evident:
+                if i == REST:
                     _leave_rest(of_means[j, i], of_covariances[j, i])
-                _tremble(of_means[j, i], of_covariances[j, i], j)
+                _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
     for j in range(MODES):
         expected[j], mixed, spread = 0.0, means[j], covariances[j]
         for i in range(MODES):
@@ -218,7 +266,7 @@ def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector) -
 
 
 @compiled
-def _beyond_rest(mean: Vector) -> float:
+def _beyond_rest(mean: Vector, tremor: Vector) -> float:
     """Squared, normalised excess of the speed and tremor of the mode REST over their bounds:
 
         max(|v|² - v_max², 0) / σ_v² + max(|y|² + |w|² / ω² - y_max², 0) / σ²
@@ -226,51 +274,50 @@ def _beyond_rest(mean: Vector) -> float:
     with v_max = REST_MAX_SPEED_MPS, σ_v = REST_SPEED_STD_MPS, y_max = MAX_TREMOR_M and the tremor's
     σ.
     """
-    speed, tremor = square(mean[1]), 0.0
+    speed, amplitude = square(mean[1]), 0.0
     for axis in range(3):
-        tremor += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATE_PER_S) ** 2
-    trembles = max(tremor - MAX_TREMOR_M**2, 0.0) / float(TREMOR_STDS_M[REST]) ** 2
+        amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
+    trembles = max(amplitude - MAX_TREMOR_M**2, 0.0) / float(tremor[1 + REST])
     return max(speed - REST_MAX_SPEED_MPS**2, 0.0) / REST_SPEED_STD_MPS**2 + trembles
 
 
 @compiled
 def update(
-    means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, interval_s: float
+    means: Vector,
+    covariances: Vector,
+    modes: Vector,
+    noise: float,
+    position: Vector,
+    interval_s: float,
+    tremor: Vector,
 ) -> None:
     """Posterior of all modes after a sample z (3,) [m] with noise variance r [m²], `interval_s`
     after the sample before. The modes must have been advanced to the time of the sample.
 
-    The modes are mixed (`_switched`, `_mix`), then each is updated with H = [1, 0, 0, 1, 0]:
+    Without an evident tremor, that of CHANGE is cleared first, as it may have been evident before.
+    The modes are mixed (`_switched`, `_mix`), then each is updated (`measure`), with the tremor of
+    rate ω and variances σ² in `tremor` (1 + MODES,):
 
-        S = H P Hᵀ + r,   K = P Hᵀ / S,   m = m + K (z - H m),   P = P - K S Kᵀ
         log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
     The innovation in log L is that before the update. For REST, log L is reduced by half of
     `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY and are rounded.
     """
-    shares, expected, likelihood, seen = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES), np.empty(STATES)
+    shares, expected, likelihood = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES)
+    if tremor[1 + CHANGE] == 0.0:
+        _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
     _switched(means, covariances, modes, interval_s, shares)
-    _mix(means, covariances, shares, expected)
+    _mix(means, covariances, shares, expected, tremor)
     best = -1e300
     for i in range(MODES):
         mean, p = means[i], covariances[i]
         for row in range(STATES):
             for column in range(row):
                 p[row, column] = p[column, row]
-            seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
-        variance, error = seen[0] + seen[3] + noise, 0.0
-        for axis in range(3):
-            innovation = position[axis] - mean[0, axis] - mean[3, axis]
-            error += innovation * innovation
-            for row in range(STATES):
-                mean[row, axis] += seen[row] / variance * innovation
-        for row in range(STATES):
-            for column in range(row, STATES):
-                p[row, column] -= seen[row] * seen[column] / variance
-                p[column, row] = p[row, column]
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * _bounded(error / variance)
+        variance, error = measure(mean, p, noise, position)
+        likelihood[i] = -1.5 * math.log(variance) - 0.5 * bounded(error)
         if i == REST:
-            likelihood[i] -= 0.5 * _beyond_rest(mean)
+            likelihood[i] -= 0.5 * _beyond_rest(mean, tremor)
         best = max(best, likelihood[i])
     for i in range(MODES):
         modes[i] = expected[i] * math.exp(likelihood[i] - best)

@@ -9,8 +9,9 @@ and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each o
 
 Velocity and acceleration revert to zero by k_v (MODE_VELOCITY_REVERSIONS_PER_S2) and k_a
 (MODE_ACCELERATION_REVERSIONS_PER_S); q is MODE_INTENSITIES_M2PS5 [m²/s⁵]. These three and the
-tremor's stationary standard deviation σ (TREMOR_STDS_M) differ between the modes; ω =
-TREMOR_RATE_PER_S and ζ = TREMOR_DAMPING are shared. W1 and W2 are independent Wiener processes.
+tremor's stationary standard deviation σ differ between the modes; ω, one of TREMOR_RATES_PER_S, and
+ζ = TREMOR_DAMPING are shared. Rate and strength of a hand's tremor are estimated (`tremor`). W1 and
+W2 are independent Wiener processes.
 
 The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
 sample, the velocity of a hand that reaches or changes does not revert to zero: otherwise the end of
@@ -25,69 +26,71 @@ import numpy as np
 from scipy.linalg import expm
 
 from service.core.frame import Records, Vector, structured
-from service.core.intake import MODES, STATES
+from service.core.intake import MODES, TREMOR_RATES
 from service.core.intake.tuning import (
     MODE_ACCELERATION_REVERSIONS_PER_S,
     MODE_INTENSITIES_M2PS5,
     MODE_VELOCITY_REVERSIONS_PER_S2,
     TREMOR_DAMPING,
-    TREMOR_RATE_PER_S,
-    TREMOR_STDS_M,
+    TREMOR_RATES_PER_S,
     VELOCITY_KEPT_S,
 )
 
 REST, REACH, CHANGE = range(MODES)  # a hand rests, reaches, or changes its motion
+STEADY = MODES  # motion of the bank of tremor filters: REACH that does not end
 
 
 @functools.cache
 def models(period_s: float, count: int) -> Records:
     """Transition, process noise and extrapolation of all modes over 0 to `count` - 1 periods.
 
-    Record n holds, for the interval t = n `period_s`, `transition` F(t) and `noise` Q(t) as `model`
-    computes them, and `onward` (MODES, 3, 3), which extrapolates (p, v, a) from the newest sample.
-    With h = min(t, VELOCITY_KEPT_S):
+    Record n holds, for the interval t = n `period_s`, the fields of `model`, and `onward` (MODES,
+    3, 3), which extrapolates (p, v, a) from the newest sample. With h = min(t, VELOCITY_KEPT_S):
 
         onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -k_a]]
 
     For REST, onward = F(t)[:3, :3].
     """
-    kinds = [(name, np.float64, (MODES, STATES, STATES)) for name in ("transition", "noise")]
-    out = structured(count, [*kinds, ("onward", np.float64, (MODES, 3, 3))])
+    motions = [(name, np.float64, (MODES + 1, 3, 3)) for name in ("transition", "noise")]
+    tremors = [(name, np.float64, (TREMOR_RATES, 2, 2)) for name in ("tremor", "tremor_noise")]
+    out = structured(count, [*motions, *tremors, ("onward", np.float64, (MODES, 3, 3))])
     times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
     kept_on_s: Vector = np.minimum(times_s, VELOCITY_KEPT_S)
-    out["transition"], out["noise"] = model(times_s)
-    out["onward"] = model(times_s - kept_on_s)[0][:, :, :3, :3]
+    for name, values in model(times_s).items():
+        out[name] = values
+    out["onward"] = model(times_s - kept_on_s)["transition"][:, :MODES]
     for mode, fades in enumerate(MODE_ACCELERATION_REVERSIONS_PER_S):
         out["onward"][:, mode] = out["onward"][:, mode] @ _over(_motion(0.0, fades), kept_on_s)[0]
-    out["onward"][:, REST] = out["transition"][:, REST, :3, :3]
+    out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
 
-def model(interval_s: float | Vector) -> tuple[Vector, Vector]:
-    """Transition F and process noise Q, both (..., MODES, STATES, STATES), over intervals t (...).
+def model(interval_s: float | Vector) -> dict[str, Vector]:
+    """Transition F and process noise Q over intervals t (...), of the motion of each mode and of a
+    tremor of unit variance at each of the TREMOR_RATES_PER_S:
 
-    Both are block-diagonal, with a motion block (3, 3) and a tremor block (2, 2):
+    * `transition`, `noise` (..., MODES + 1, 3, 3), with A = [[0, 1, 0], [0, 0, 1], [0, -k_v, -k_a]]
+      and c = q; the last one, STEADY, is REACH with k_v = 0
+    * `tremor`, `tremor_noise` (..., TREMOR_RATES, 2, 2), with A = [[0, 1], [-ω², -2 ζ ω]] and
+      c = 4 ζ ω³
 
-        F = expm(A t),   A = [[0, 1, 0], [0, 0, 1], [0, -k_v, -k_a]]  or  [[0, 1], [-ω², -2 ζ ω]]
-        Q = c ∫ expm(A s) e eᵀ expm(A s)ᵀ ds,  s = 0 ... t,   c = q  or  4 ζ ω³ σ²
+        F = expm(A t),   Q = c ∫ expm(A s) e eᵀ expm(A s)ᵀ ds,  s = 0 ... t
 
-    where e is the unit vector of the block's last state (acceleration or tremor velocity).
+    where e is the unit vector of the last state (acceleration or tremor velocity).
     """
     interval_s = np.asarray(interval_s, np.float64)
-    transition, noise = np.zeros((2, *interval_s.shape, MODES, STATES, STATES))
-    motion, tremor = slice(0, 3), slice(3, STATES)
-    dynamics = np.array([[0.0, 1.0], [-(TREMOR_RATE_PER_S**2), -2.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S]])
-    trembles, driven = _over(dynamics, interval_s)
-    for mode in range(MODES):
-        moves, driving = _over(
-            _motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], MODE_ACCELERATION_REVERSIONS_PER_S[mode]), interval_s
-        )
-        transition[..., mode, motion, motion] = moves
-        noise[..., mode, motion, motion] = MODE_INTENSITIES_M2PS5[mode] * driving
-        transition[..., mode, tremor, tremor] = trembles
-        unit = 4.0 * TREMOR_DAMPING * TREMOR_RATE_PER_S**3 * TREMOR_STDS_M[mode] ** 2
-        noise[..., mode, tremor, tremor] = unit * driven
-    return transition, noise
+    transition, noise = np.empty((2, *interval_s.shape, MODES + 1, 3, 3))
+    reversions = [*MODE_VELOCITY_REVERSIONS_PER_S2, 0.0]
+    for motion, mode in enumerate((REST, REACH, CHANGE, REACH)):
+        dynamics = _motion(reversions[motion], MODE_ACCELERATION_REVERSIONS_PER_S[mode])
+        transition[..., motion, :, :], driven = _over(dynamics, interval_s)
+        noise[..., motion, :, :] = MODE_INTENSITIES_M2PS5[mode] * driven
+    tremor, tremor_noise = np.empty((2, *interval_s.shape, TREMOR_RATES, 2, 2))
+    for k, rate in enumerate(TREMOR_RATES_PER_S):
+        oscillator = np.array([[0.0, 1.0], [-(rate**2), -2.0 * TREMOR_DAMPING * rate]])
+        tremor[..., k, :, :], driven = _over(oscillator, interval_s)
+        tremor_noise[..., k, :, :] = 4.0 * TREMOR_DAMPING * rate**3 * driven
+    return {"transition": transition, "noise": noise, "tremor": tremor, "tremor_noise": tremor_noise}
 
 
 def _motion(revert_v: float, revert_a: float) -> Vector:

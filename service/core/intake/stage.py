@@ -71,19 +71,24 @@ class Intake:
 
     def __init__(self, settings: Settings) -> None:
         hands = settings.hands
-        self.stale_ticks = _stale_ticks("hands/left", settings)
+        self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings)
         self._names = settings.joints.names
         self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
-        unseen_ticks = max(self.stale_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
-        self._models = models(settings.period_s, unseen_ticks + math.ceil(MAX_LATE_S / settings.period_s) + 1)
+        longest_s = hands.longest_stale_ms / 1000
+        stale_max_ticks = max(self._stale_ticks, math.ceil(round(longest_s / settings.period_s, 6)))
+        unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        max_late_s = max(MAX_LATE_S, longest_s)
+        self._models = models(settings.period_s, unseen_ticks + math.ceil(max_late_s / settings.period_s) + 1)
         joints = settings.joints
         limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
         self._parameters = parameters(
             period_s=settings.period_s,
-            stale_ticks=self.stale_ticks,
+            stale_ticks=self._stale_ticks,
+            stale_max_ticks=stale_max_ticks,
+            max_late_s=max_late_s,
             unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
@@ -111,6 +116,7 @@ class Intake:
         """Set the values that hold before the first sample, in a state of zeros."""
         for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
             state[field] = -1
+        state["stale_ticks"] = self._stale_ticks
         self._estimator.begin(state)
 
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:

@@ -21,19 +21,19 @@ from service.core.codes import (
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO
-from service.core.intake import KEPT
+from service.core.intake import CONFIRMED_SAMPLES, KEPT
 from service.core.intake.arm_samples import compared, unwrap
 from service.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
-from service.core.intake.late_samples import expected, take_late, tick_made
+from service.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
 from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
 from service.core.intake.tuning import (
     ARM_STILL_RAD,
+    CONFIRMED_S,
     CONTESTED_OFF_SHARE,
     CONTESTED_ON_SHARE,
     JOINT_JUMP_RAD,
     JUMP_NOISE_STDS,
     MAX_HAND_DISTANCE_M,
-    MAX_LATE_S,
     SCATTER_LEAST_SAMPLES,
     SCATTER_OFF_M,
     SCATTER_ON_M,
@@ -41,7 +41,7 @@ from service.core.intake.tuning import (
     TO_AND_FRO_MPS2,
     TRACKER_MEMORY_S,
 )
-from service.core.vectors import squared_distance
+from service.core.vectors import distance, squared_distance
 
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
@@ -199,10 +199,10 @@ def take_hand(
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
         far += in_base[i] * in_base[i]
-    stale_ticks, period_s = config.stale_ticks, config.period_s
+    stale_ticks, period_s = state.stale_ticks[side], config.period_s
     since = state.tick - state.hand_ticks[side]
     fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
-    jumped, cause, order, made = False, -1, 0, state.tick
+    jumped, cause, order, made, wrong = False, -1, 0, state.tick, 0
     if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
         cause = NOT_FINITE
     elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
@@ -211,13 +211,13 @@ def take_hand(
         cause = OUT_OF_RANGE
     else:
         newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
-        cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, MAX_LATE_S)
+        cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, config.max_late_s)
         if cause < 0:
             if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, config.unseen_ticks)):
                 state.kept[side] = 0
             elif fresh and stamp_ns < newest_ns:
                 order = order_of(states, side, stamp_ns)
-            late = ticks_late(states, side, stamp_ns, period_s)
+            late = ticks_late(states, side, stamp_ns, period_s, config.max_late_s)
             if order >= KEPT - 1:
                 order, cause = 0, OLDER
             elif order < 0:
@@ -233,11 +233,14 @@ def take_hand(
             passed_s = abs(made - state.kept_ticks[side, at]) * period_s
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
+            if jumped and not another and cause < 0 and order == 0:
+                wrong = wrong_samples(states, models, side, made, in_base)
             if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
                 # a higher share would only decay later
                 another = _turns_hard(states, side, at, in_base, passed_s, period_s)
                 another = another and is_to_and_fro(states, side, order, in_base)
             note(states, side, another, stale_ticks * period_s, period_s)
+            jumped = jumped and wrong == 0
         elif cause != REPEATED:
             note(states, side, False, stale_ticks * period_s, period_s)
         if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
@@ -247,18 +250,41 @@ def take_hand(
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
-    if order == 0 and made == state.tick:
+    there = state.hands[side, 0].copy()
+    if wrong > 0:
+        drop(states, side, wrong)
+    if order == 0 and made == state.tick and wrong == 0:
         take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
     else:
-        note_clock(states, side, stamp_ns, period_s, fresh)
+        note_clock(states, parameters, side, stamp_ns, fresh)
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
     if order == 0:
+        _note_correction(states, side, wrong, there, period_s)
         state.jump_count[side] = state.jump_is_swap[side] = 0
         state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, frame)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
     return -1
+
+
+@compiled
+def _note_correction(states: Records, side: int, wrong: int, before: Vector, period_s: float) -> None:
+    """Note how far a hand was moved when `wrong` samples were dropped, from the estimate `before`
+    (3,) [m].
+
+    Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
+    CONFIRMED_S, the hand may be as far away from it (`hand_doubt_m`).
+    """
+    state = states[0]
+    if wrong > 0:
+        moved = distance(before, state.hands[side, 0])
+        state.hand_doubt_m[side] = max(state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO)
+        state.corrected_tick[side], state.doubted_samples[side] = state.tick, CONFIRMED_SAMPLES
+    elif state.doubted_samples[side] > 0:
+        state.doubted_samples[side] -= 1
+    if state.doubted_samples[side] == 0 and (state.tick - state.corrected_tick[side]) * period_s >= CONFIRMED_S:
+        state.hand_doubt_m[side] = 0.0
 
 
 @compiled
@@ -275,15 +301,17 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
         frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
     for side in range(2):
         seen = state.hand_ticks[side]
-        frame.hand_ages[side] = -1 if seen < 0 else state.tick - seen
+        frame.hand_ages[side], frame.stale_ticks[side] = -1 if seen < 0 else state.tick - seen, state.stale_ticks[side]
         frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    known, least, most = 0, frame.hand_ages.min(), frame.hand_ages.max()
-    if 0 <= least < config.stale_ticks and most < config.unseen_ticks:
+    known, ages, stale = 0, frame.hand_ages, frame.stale_ticks
+    is_seen = ages[0] < stale[0], ages[1] < stale[1]
+    if ages.min() >= 0 and ages.max() < config.unseen_ticks and (is_seen[0] or is_seen[1]):
         known = HANDS_KNOWN
-        if most >= config.stale_ticks:
-            known |= UNSEEN[0 if frame.hand_ages[0] == most else 1]
+        for side in range(2):
+            if not is_seen[side]:
+                known |= UNSEEN[side]
     if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
         known |= ARM_HEARD
         if state.tick - state.arm_still_tick >= config.still_ticks:

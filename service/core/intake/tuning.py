@@ -31,19 +31,23 @@ MODE_VELOCITY_REVERSIONS_PER_S2 = np.array([0.3, 95.0, 95.0])  # [1/s²] low in 
 # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
 TREMOR_STDS_M = np.array([5e-4, 3e-4, 0.0])  # standard deviation on each axis; larger tremor has the same frequency
 # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
-TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] angular frequency; physiological tremor has 8 to 12 Hz
+TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
 # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
-TREMOR_DAMPING = 0.18  # damping ratio of the tremor's oscillator
+TREMOR_DAMPING = 0.1  # damping ratio of the tremor's oscillator
+# [1/s] possible rates, 4 to 12 Hz; neighbours differ by the width of the resonance
+TREMOR_RATES_PER_S = TREMOR_RATE_PER_S * (1.0 + 2.0 * TREMOR_DAMPING) ** np.arange(-5.0, 2.0)
 # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
 MAX_TREMOR_M = 6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
-# 0.1 to 1. More: new hands move sooner. Less: new hands rest longer.
-START_SPEED_STD_MPS = 0.3  # standard deviation of the speed after a hand's first sample
+# [m/s] after a hand's first sample: OUTLIER_STDS times the stationary one of the mode CHANGE
+START_SPEED_STD_MPS = OUTLIER_STDS * math.sqrt(
+    MODE_INTENSITIES_M2PS5[-1] / (2.0 * MODE_VELOCITY_REVERSIONS_PER_S2[-1] * MODE_ACCELERATION_REVERSIONS_PER_S[-1])
+)
 # 3e-3 to 0.03. More: faster drift counts as rest. Less: rest is left sooner.
 REST_SPEED_STD_MPS = 0.01  # standard deviation of a resting hand, each axis: hands that hold something drift
 REST_ACCELERATION_STD_MPS2 = REST_SPEED_STD_MPS  # [m/s²] it changes its drift by as much in a second
 REST_MAX_SPEED_MPS = OUTLIER_STDS * REST_SPEED_STD_MPS  # a faster hand does not rest: reaches are seen at once
-# 1e-6 to 1e-2. More: modes switch sooner. Less: modes switch later.
-LEAST_MODE_PROBABILITY = 1e-4  # no mode becomes less probable, so that each can return
+# no mode becomes less probable than an outlier on two axes, so that each can return
+LEAST_MODE_PROBABILITY = math.exp(-(OUTLIER_STDS**2))
 REAPPEARED_VARIANCE_SHARE = OUTLIER_STDS**2  # squared distance / variance of a hand that continues its filter
 
 # Measurement noise, estimated from third differences of the samples.
@@ -54,8 +58,7 @@ NOISE_SAMPLES = 60  # number of samples over which the noise is averaged
 NOISE_OUTLIER_SHARE = OUTLIER_STDS**2  # upper limit of one squared difference / variance
 
 # Stillness, which distinguishes a hand that waits from one on its way.
-# 0.03 to 0.3. More: stronger tremor is ignored. Less: stillness follows faster.
-STILLNESS_LOWPASS_S = 0.1  # time constant of the velocity's lowpass, which removes a tremor of 8 to 12 Hz
+STILLNESS_LOWPASS_S = 2.0 * math.pi / TREMOR_RATE_PER_S  # time constant of the velocity's lowpass: a period of tremor
 # 0.01 to 0.1. More: stillness ends later. Less: stillness ends sooner.
 STILLNESS_FALL_S = 0.03  # time constant with which stillness ends
 
@@ -72,12 +75,9 @@ DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this: 1 %
 # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
 MAX_HAND_DISTANCE_M = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
 JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation is no jump; twice, as the prediction is uncertain too
-# 2 to 10. More: jumps are followed later. Less: outliers are followed.
-CONFIRMED_SAMPLES = 3  # a jump is accepted after this number of successive samples that agree
 # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
 CONFIRMED_S = 0.02  # successive samples that confirm a jump span at least this time
-# 5e-3 to 0.05. More: near sources are mixed. Less: noise looks like two sources.
-SOURCES_APART_M = 0.012  # smallest distance between the positions that two sources report
+SOURCES_APART_M = 2.0 * MAX_TREMOR_M  # smallest distance between the positions of two sources; tremor spans as much
 # 0.1 to 0.8. More: noise looks like two sources. Less: noisy sources are mixed.
 SOURCE_SPREAD_SHARE = 0.4  # largest scatter of one source's samples / distance between the sources
 # [m/s²] below twice the acceleration of the strongest tremor, a single hand may move to and fro
@@ -91,14 +91,12 @@ SCATTER_OFF_M = END_SHARE * SCATTER_ON_M  # a contested hand remains so until th
 SCATTER_LEAST_SAMPLES = NOISE_SAMPLES // 2  # with fewer, one outlier in four differences looks like scatter
 
 # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
-# 20 to 1000. More: wrong samples pass. Less: fast arms are rejected.
-MAX_JOINT_RADPS = 100.0  # samples of a faster joint are rejected
 # 0.05 to 1. More: jumps of the arm pass. Less: coarse joint states are rejected.
 JOINT_JUMP_RAD = 0.2  # a joint may differ from its newest sample by JOINT_JUMP_RAD + jump speed * elapsed time
 # 1 to 20. More: jumps of the arm pass. Less: an arm moved by hand is rejected.
 JOINT_JUMP_RADPS = 5.0  # smallest jump speed, because an arm can be moved by hand; else the fastest joint's limit
+MAX_JOINT_RADPS = JOINT_JUMP_RAD / 2e-3  # [rad/s] samples of a joint are rejected that would jump within 2 ms
 MAX_OUTSIDE_RAD = JOINT_JUMP_RAD  # samples of a joint farther outside its limits are rejected; it is moved back by hand
 # 2e-3 to 0.1. More: a moving arm counts as still. Less: a noisy arm never starts.
 ARM_STILL_RAD = 0.02  # an arm is at rest if no joint moves by more than this within ARM_STILL_S
-# 0.03 to 1. More: the arm starts later. Less: a moving arm counts as still.
-ARM_STILL_S = 0.1  # time for which an arm must be at rest before it is ready
+ARM_STILL_S = MAX_LATE_S  # an arm must be at rest for this time before it is ready; a late state counts

@@ -57,7 +57,7 @@ class Separation:
         self._capsules, self._pairs = body.capsules, body.pairs
         direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake, things.brake])
         late_s = things.reaction_ms / 1000
-        reaction_s = np.array([(settings.hands.stale_ms + people.reaction_ms) / 1000, late_s, late_s])
+        reaction_s = np.array([(settings.hands.longest_stale_ms + people.reaction_ms) / 1000, late_s, late_s])
         self._parameters = parameters(
             brake=brake,
             reaction_s=reaction_s,
@@ -68,7 +68,7 @@ class Separation:
             planned_margin=PLANNED_MARGIN_M,
             contact_speed=float(people.contact_speed),
             unknown_speed=float(people.unknown_speed),
-            unseen_s=np.array([settings.hands.stale_ms, settings.hands.unseen_ms]) / 1000,
+            unseen_s=np.array([settings.hands.longest_stale_ms, settings.hands.unseen_ms]) / 1000,
             period_s=settings.period_s,
             tremor_speed=float(people.tremor_speed),
             hand_radius=float(people.radius),

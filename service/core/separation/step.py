@@ -79,9 +79,10 @@ def step(
 
     braked = brake max(h - BRAKE_RAMP_S, 0) is the speed [m/s] that the arm can brake until then.
 
-    A hand that has been out of sight for t seconds more than stale_ms is assumed to accelerate
+    A hand that has been out of sight for t seconds longer than it may be is assumed to accelerate
     toward the arm by g = UNSEEN_ACCELERATION_MPS2 during t: u grows by w = min(g t, unknown_speed),
-    d shrinks by w (t - w / 2g).
+    d shrinks by w (t - w / 2g). After a correction, d also shrinks by `hand_doubt_m`, and u is
+    unknown_speed.
 
     Only constraints that the joints can violate are kept.
     """
@@ -100,15 +101,16 @@ def step(
         variance = 0.0
         for mode in range(state.mode_probabilities.shape[1]):
             variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
+        doubt = state.hand_doubt_m[side]
         known, receives = (
-            variance <= UNKNOWN_VELOCITY_STD_MPS * UNKNOWN_VELOCITY_STD_MPS,
+            variance <= UNKNOWN_VELOCITY_STD_MPS * UNKNOWN_VELOCITY_STD_MPS and doubt == 0.0,
             _receives(contacts, state.hands, side),
         )
         age_s = (state.tick - state.hand_ticks[side]) * config.period_s
         # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
         unseen_s = age_s - config.unseen_s[0] if config.unseen_s[0] < age_s < config.unseen_s[1] else 0.0
         speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, config.unknown_speed)
-        nearer = speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
+        nearer = doubt + speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
         moment = _swiftness(state.hands[side, 1], config.tremor_speed) if known else 0.0
         for k in range(len(LOOKAHEAD_S) if moment > 0.0 else 1):
             ahead = moment * LOOKAHEAD_S[k]

@@ -115,7 +115,7 @@ def _through_core(
         known = intake.step(state, frame, 1, inbox)
         hands = state["hands"]
         if alone is not None:
-            known = HANDS_KNOWN * bool(frame["hand_ages"][alone] < intake.stale_ticks)
+            known = HANDS_KNOWN * bool(frame["hand_ages"][alone] < frame["stale_ticks"][alone])
             hands = hands[[alone, alone]]
         goes = bool(known & HANDS_KNOWN)
         if skill is not None and goes:
