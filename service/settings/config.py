@@ -60,9 +60,9 @@ class Following(NamedTuple):
 
 
 FOLLOWING = {
-    "closely": Following(stop_room=3.0, jerk_share=1.0),
+    "closely": Following(stop_room=2.0, jerk_share=1.0),
     "default": Following(stop_room=1.0, jerk_share=1.0),
-    "calmly": Following(stop_room=0.0, jerk_share=0.5),
+    "calmly": Following(stop_room=0.5, jerk_share=0.5),
 }
 
 
