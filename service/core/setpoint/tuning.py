@@ -43,7 +43,7 @@ PLANNED_SPEED_SHARE = float(PLANNED_LIMIT_SHARES[0])  # planned share of max_spe
 # 3e-3 to 0.05. More: a late tool is waited for less. Less: lags slow the setpoint.
 GAP_SLOW_M = 0.012  # share of the speed = 1 / (1 + (gap - GAP_FREE_M) / GAP_SLOW_M)
 GAP_FREE_M = GAP_SLOW_M / 4.0  # a tool this far behind its setpoint does not slow it
-GAP_WAITING_M = GAP_FREE_M + 9.0 * GAP_SLOW_M  # from here on its target is moved closer: a tenth of its speed is left
+GAP_WAITING_M = GAP_FREE_M + 8.0 * GAP_SLOW_M  # from here on its target is moved closer: a ninth of its speed is left
 GAP_STOPPED_M = 2.0 * GAP_WAITING_M  # the setpoint stops at this distance from its tool
 
 ENGAGED_GAP_M = STUCK_GAP_M  # a setpoint nearer to its target than this has engaged
