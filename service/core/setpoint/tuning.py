@@ -17,10 +17,10 @@ TRACKER_RATE_SHARE = 1.1  # largest tracker rate / (jerk / acceleration); joints
 
 # Stopping where the hands would stop at the soonest.
 # 2 to 20. More: more lag, less overshoot. Less: less lag, more overshoot and jerk.
-HAND_BRAKE_MPS2 = 4.0  # [m/s²] largest mean deceleration of a hand, from when it begins to brake
+HAND_BRAKE_MPS2 = 5.0  # [m/s²] largest mean deceleration of a hand, from when it begins to brake
 STOP_OVERSHOOT_M = 2.0 * LEAST_NOISE_M  # the setpoint may stop this far beyond that: targets at rest differ by noise
 # 0.03 to 0.3. More: ends of reaches are braked early. Less: stops are passed.
-DECELERATION_LOOKAHEAD_S = 0.13  # predicted speed = speed + this * min(acceleration, 0)
+DECELERATION_LOOKAHEAD_S = 0.12  # predicted speed = speed + this * min(acceleration, 0)
 PROMPT_RESPONSE_S = float((LEAST_NOISE_M**2 / 30.0 / MODE_INTENSITIES_M2PS5[2]) ** (1 / 6))  # good tracker, 30 Hz
 # 0 to 10. More: slow trackers overshoot less. Less: slow trackers lag less.
 LATE_STOP_SHARE = 4.0  # delay with which a slow tracker shows a stop / (response time - PROMPT_RESPONSE_S)
