@@ -33,13 +33,13 @@ Change: TypeAlias = Mapping[str, Mapping[str, Any]]  # values by table and setti
 
 # What a user can set and belongs together, a row each.
 CHANGES: tuple[Change, ...] = (
-    {"tool": {"stop_room": 0.0}},
-    {"tool": {"stop_room": 2.0}},
-    {"tool": {"stop_room": 3.0}},
+    {"tool": {"follow": "closely"}},
+    {"tool": {"follow": "default"}},
+    {"tool": {"follow": "calmly"}},
     {"tool": {"max_jerk": 200.0}},
     {"tool": {"max_jerk": 100.0}},
     {"tool": {"max_jerk": 50.0}},
-    {"tool": {"stop_room": 2.0, "max_jerk": 150.0}},
+    {"tool": {"follow": "closely", "max_jerk": 150.0}},
     {"tool": {"max_speed": 0.5}},  # its acceleration and jerk follow from it
     {"tool": {"max_speed": 0.3}},
     {"hands": {"noise_std_m": 0.005}},

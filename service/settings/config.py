@@ -11,7 +11,7 @@ import tomllib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
@@ -46,7 +46,24 @@ PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a le
 
 # Retired settings by table and name, and what takes their place. In a cell's file they are accepted
 # with a warning and have no effect. Recordings replay with the values that they hold.
-RETIRED = {("tool", "jerk_weight"): "a lower max_jerk makes the tool follow more calmly"}
+RETIRED = {
+    ("tool", "jerk_weight"): "a lower max_jerk makes the tool follow more calmly",
+    ("tool", "stop_room"): "follow chooses between lag and overshoot",
+}
+
+
+class Following(NamedTuple):
+    """Values that `[tool] follow` sets together."""
+
+    stop_room: float  # share of the hand's braking distance that the setpoint uses for its own stop
+    jerk_share: float  # share of `max_jerk` that the setpoint uses
+
+
+FOLLOWING = {
+    "closely": Following(stop_room=2.0, jerk_share=1.0),
+    "default": Following(stop_room=1.0, jerk_share=1.0),
+    "calmly": Following(stop_room=0.5, jerk_share=0.5),
+}
 
 
 class RetiredSettingWarning(FutureWarning):
@@ -107,7 +124,8 @@ class ToolSettings(Section, frozen=True):
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
     jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] retired: see RETIRED
-    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # larger values reduce lag and increase overshoot
+    follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: see `tune`
+    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # retired: see RETIRED
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
     @property
@@ -131,9 +149,14 @@ class ToolSettings(Section, frozen=True):
     @property
     def jerk(self) -> float:
         """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most 500 `max_speed`,
-        which reaches that acceleration within 25 ms.
+        which reaches that acceleration within 25 ms; of this, the share that `follow` uses.
         """
-        return min(self.max_jerk, MAX_JERK_PER_SPEED * self.max_speed)
+        return FOLLOWING[self.follow].jerk_share * min(self.max_jerk, MAX_JERK_PER_SPEED * self.max_speed)
+
+    @property
+    def room(self) -> float:
+        """Share of the hand's braking distance that the setpoint uses for its own stop."""
+        return FOLLOWING[self.follow].stop_room * self.stop_room
 
     @property
     def stop_acceleration(self) -> float:

@@ -23,8 +23,8 @@ def test_settings_are_tried_on_a_recording(tmp_path: Path) -> None:
     done = told("tune", GOLDEN, "--part", "2", "4.2", "--json", "--plot", str(plot))
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert [one["name"] for one in found["variants"]][:2] == ["as recorded", "stop_room = 0"]
-    assert len(found["variants"]) == 1 + len(CHANGES)
+    assert [one["name"] for one in found["variants"]][:2] == ["as recorded", "follow = closely"]
+    assert len(found["variants"]) == len(CHANGES)  # "as recorded", and all but the recording's own `follow`
     assert found["judged_s"] > 2.0
     left = found["hands"]["left"]
     assert left["noise_mm"] == pytest.approx(0.5, abs=0.15)

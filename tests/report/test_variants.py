@@ -71,13 +71,15 @@ def test_settings_are_judged_by_the_true_hands(judged_hands: JudgedHands) -> Non
 def test_every_change_is_valid_in_the_shipped_cell_and_can_be_written_to_a_file() -> None:
     for change in CHANGES:
         settings = changed(Settings(), change)
-        assert settings is not None
+        assert (settings is None) is (change == {"tool": {"follow": "default"}})
+        if settings is None:
+            continue
         assert parse(toml(change), origin="tune") == settings
     words: Change = {"tool": {"orientation": "full"}}
     assert parse(toml(words), origin="tune").tool.orientation == "full"
     assert written_change(words) == "orientation = full"
     assert changed(Settings(), {"tool": {"max_speed": 9.0}}) is None
-    assert changed(Settings(), {"tool": {"stop_room": Settings().tool.stop_room}}) is None
+    assert changed(Settings(), {"tool": {"max_speed": Settings().tool.max_speed}}) is None
 
 
 def figures(

@@ -11,7 +11,16 @@ import pytest
 from service.contract.explain import validated
 from service.daemon.launch import described
 from service.files.shipped import cell_of
-from service.settings.config import WAM, Files, RetiredSettingWarning, Settings, load, parse, robot_description
+from service.settings.config import (
+    FOLLOWING,
+    WAM,
+    Files,
+    RetiredSettingWarning,
+    Settings,
+    load,
+    parse,
+    robot_description,
+)
 from service.settings.file_content import SettingsError
 from service.settings.network import Network, is_local
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
@@ -337,11 +346,20 @@ def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, l
     assert message in str(caught.value)
 
 
-def test_a_retired_setting_has_no_effect_in_a_file_and_is_kept_by_recordings() -> None:
-    with pytest.warns(RetiredSettingWarning, match=r"cell.toml: \[tool\] jerk_weight is retired and has no effect; "):
-        assert parse("[tool]\njerk_weight = 'x'", origin="cell.toml") == Settings()
-    recorded = msgspec.json.encode({"tool": {"jerk_weight": 1e-8}})  # a recording replays with what was in effect
-    assert validated(msgspec.json.decode(recorded), Settings).tool.jerk_weight == 1e-8
+@pytest.mark.parametrize(("name", "value"), [("jerk_weight", 1e-8), ("stop_room", 2.0)])
+def test_a_retired_setting_has_no_effect_in_a_file_and_is_kept_by_recordings(name: str, value: float) -> None:
+    with pytest.warns(RetiredSettingWarning, match=rf"cell.toml: \[tool\] {name} is retired and has no effect; "):
+        assert parse(f"[tool]\n{name} = 'x'", origin="cell.toml") == Settings()
+    recorded = msgspec.json.encode({"tool": {name: value}})  # a recording replays with what was in effect
+    assert getattr(validated(msgspec.json.decode(recorded), Settings).tool, name) == value
+
+
+def test_follow_chooses_between_lag_and_calm_motion() -> None:
+    tools = [parse(f'[tool]\nfollow = "{name}"', origin="cell.toml").tool for name in FOLLOWING]
+    assert tools[1] == Settings().tool
+    assert tools[0].room > tools[1].room > tools[2].room
+    assert tools[0].jerk == tools[1].jerk > tools[2].jerk
+    assert "[tool] follow: 'fast' given; calmly, closely, default accepted" in refusal('[tool]\nfollow = "fast"')
 
 
 LAB = """

@@ -53,7 +53,7 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
             max_jerk=one_of(5.0, 20.0, 100.0, 200.0, 1000.0),
         )
     if happens(0.3):
-        tool = replace(tool, stop_room=one_of(0.0, 0.25, 0.5, 2.0, 3.0))
+        tool = replace(tool, follow=("closely", "calmly")[random.integers(2)])
     if happens(0.2):
         tool = replace(tool, max_turn_speed=one_of(0.2, 0.5, 2.0), max_turn_acceleration=one_of(0.5, 2.0, 20.0))
     if happens(0.3):

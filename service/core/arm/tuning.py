@@ -45,8 +45,7 @@ PLANNED_LIMIT_SHARES = np.array([0.97, 0.95, 0.85])  # shares of joint speed, ac
 TOOL_SPEED_SHARE = 0.5 * (1.0 + float(PLANNED_LIMIT_SHARES[0]))  # speed of setpoint and closing in / max_speed
 
 # The posture, in what is left free.
-# 0.1 to 10. More: the posture is kept closely. Less: the posture may drift.
-POSTURE_GAIN_PER_S = 1.0  # [1/s] pull to the configured posture
+POSTURE_GAIN_PER_S = TURN_GAIN_SHARE * POSITION_GAIN_PER_S / 10.0  # [1/s] pull to the configured posture, after turns
 POSTURE_SPEED_RADPS = CLOSING_SPEED_MPS  # [rad/s] largest speed of this pull, for each joint, on a lever of 1 m
-# 0.05 to 1. More: idle motion ends sooner. Less: idle motion ends softly.
-IDLE_BRAKE_SHARE = 0.25  # share of the joints' acceleration for braking motion that does not move the tool
+# Idle motion may end faster than the tool closes in: the tool does not show it.
+IDLE_BRAKE_SHARE = 2.5 * CLOSING_BRAKE_SHARE  # share of the joints' acceleration for braking it

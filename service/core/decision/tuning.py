@@ -23,8 +23,7 @@ STUCK_GAP_M = 0.02  # a tool nearer than this has reached its target; a target t
 STUCK_S = 0.8  # time within which progress is expected, toward a target or out of a thing
 # 0.02 to 0.3. More: slow progress looks stuck. Less: a stuck tool is missed.
 PROGRESS_SHARE = 0.08  # expected progress, as share of the distance
-# 0.1 to 0.8. More: it stays stuck longer. Less: it is freed by chance.
-FREED_SHARE = 0.25  # progress that ends being stuck, as share of the distance
+FREED_SHARE = 3.0 * PROGRESS_SHARE  # progress that ends being stuck, as share of the distance: more than chance
 PROGRESS_SPEED_SHARE = FREED_SHARE  # upper limit of expected progress, as share of max_speed times STUCK_S
 ANOTHER_TARGET_M = 2.0 * STUCK_GAP_M  # a target this far from the one that could not be reached is tried
 

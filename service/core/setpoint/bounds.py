@@ -6,7 +6,7 @@ docs/bounds.md proves what these bounds guarantee. Its symbols are used here, on
     V         limit of the norm of the velocity: max_speed, or engaging_speed while it engages
     Â, Ĵ      max_acceleration and max_jerk, limits of the norms of acceleration and jerk
     A, J      stop_acceleration and stop_jerk, limits of a stop on each axis
-    ρ         V / 16, speed at which a setpoint beyond a bound returns (RETURN_SHARE)
+    ρ         0.06 V, speed at which a setpoint beyond a bound returns (RETURN_SHARE)
     π(v, a)   largest displacement [m] along the fastest stop from v, a within A and J
     top       x + π(v, a), the farthest position of the fastest stop
     P         x + π(v + ρ, a), the same for the fastest change to -ρ, in a frame that moves at -ρ

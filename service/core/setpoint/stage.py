@@ -56,7 +56,7 @@ class SetpointGenerator:
             max_jerk=tool.jerk,
             stop_acceleration=tool.stop_acceleration,
             stop_jerk=tool.stop_jerk,
-            stop_room=float(tool.stop_room),
+            stop_room=tool.room,
             longest_stop=longest_stop,
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
             span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),

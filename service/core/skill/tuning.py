@@ -46,10 +46,9 @@ AMBIGUOUS_S = 1.5 * SAMPLE_CORRELATION_S  # shorter ambiguity is a transition be
 # Errors of the prediction.
 # 0.05 to 1. More: errors are averaged wider. Less: errors are local.
 ERROR_WIDTH = 0.2  # width, in the inputs, of the neighbourhood in which errors are averaged
-# 0 to 0.5. More: stages share their errors. Less: stages have their own errors.
-OTHER_STAGE_ERROR_WEIGHT = 0.05  # weight of an error in another stage
 # 0.01 to 0.5. More: regions grow sooner away from what was shown. Less: they grow later.
 SUPPORT_MASS = 0.1  # a place is supported where errors of demonstrations weigh more than this
+OTHER_STAGE_ERROR_WEIGHT = 0.5 * SUPPORT_MASS  # weight of an error in another stage: one alone supports no place
 # 1 to 16. More: errors are local. Less: errors are averaged wider.
 SUPPORT_SHARPNESS = 4.0  # sharpness of the kernel of errors / of the primitive's kernel, over the hands' inputs
 # 1e-3 to 0.01. More: the region is larger. Less: the region is smaller.
