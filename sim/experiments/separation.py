@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import msgspec
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
@@ -37,7 +38,8 @@ KINDS = ("random", "thrust", "unheeded")
 EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
 GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
 REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
-AHEAD_M = 0.22  # distance ahead of the tool, on its path, at which a hand is thrust
+AHEAD_M, AHEAD_S = 0.22, 1.5  # a hand is thrust this far ahead of the tool on its path, and at most this time
+PATH_STEP_S = 0.02  # times at which the path is sampled
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
 SHOWN_SCENES, SHOWN_TICKS = 5, 10  # the figure shows the first scenes, and every tenth tick
@@ -57,15 +59,8 @@ class ThrustScript(HandScript):
         teacher = Teacher(drawn.scene, seed=drawn.seed, clock=clock)
         self.side, self.lasts_s = int(random.integers(2)), float(random.uniform(*REACH_S))
         self.away_s = 2 * self.lasts_s + STAY_S
-        while True:
-            self.at_s = float(random.uniform(0.5, clock.elapsed(drawn.scene.duration_s) - 1.0))
-            here = teacher.truth(self.at_s).position
-            way = [teacher.truth(t).position for t in self.at_s + np.arange(0.0, 1.5, 0.02)]
-            ahead = [at for at in way if np.linalg.norm(at - here) >= AHEAD_M]
-            there_s = self.at_s + self.lasts_s
-            if ahead and all(p.at_s + p.lasts_s <= self.at_s or p.at_s >= there_s for p in drawn.pauses):
-                self._place = ahead[0]
-                break
+        self.at_s, self._place = _thrust(random, teacher, drawn, clock.elapsed(drawn.scene.duration_s), self.lasts_s)
+        there_s = self.at_s + self.lasts_s
         later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
         back = ScriptPause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
         super().__init__(
@@ -91,6 +86,25 @@ class ThrustScript(HandScript):
             motion.acceleration,
         )
         return HandMotions(*hands)
+
+
+def _thrust(
+    random: np.random.Generator, teacher: Teacher, drawn: Drawn, duration_s: float, lasts_s: float
+) -> tuple[float, Array]:
+    """Time [s], outside of pauses, and place (3,) [m] on the tool's path of a thrust.
+
+    The tool is AHEAD_M from the place and gets there within AHEAD_S. If the tool is never that
+    fast, the time and the place are those where it gets farthest.
+    """
+    times, count = np.arange(0.5, duration_s - 1.0, PATH_STEP_S), round(AHEAD_S / PATH_STEP_S)
+    path = np.array([teacher.truth(times[0] + i * PATH_STEP_S).position for i in range(len(times) + count - 1)])
+    ahead = sliding_window_view(path, count, axis=0).transpose(0, 2, 1)  # (T, count, 3)
+    away_m = np.linalg.norm(ahead - ahead[:, :1], axis=2)
+    for pause in drawn.pauses:
+        away_m[(times < pause.at_s + pause.lasts_s) & (times + lasts_s > pause.at_s)] = 0.0
+    least_m = min(AHEAD_M, away_m.max())
+    start = random.choice(np.flatnonzero(away_m.max(axis=1) >= least_m))
+    return float(times[start]), ahead[start, np.argmax(away_m[start] >= least_m)]
 
 
 def _reach(u: float) -> tuple[float, float]:

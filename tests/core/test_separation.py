@@ -410,3 +410,28 @@ def test_joints_of_which_some_lead_away_do_not_take_turns_between_stopping_and_g
         approach.append(row @ state["joints"][1])
     assert max(approach) < 0.05
     assert max(approach[50:]) <= 0.006
+
+
+def test_a_stop_in_a_hold_does_not_approach_a_hand_that_it_passes() -> None:
+    """The direction to a hand that sweeps past turns, until a straight stop approaches it."""
+    separation, state, frame = Separation(ASSUMED, URDF), blank(STATE), blank(frame_layout(7))
+    stage, approach = LimiterStage(ASSUMED, ARM), []
+    for is_heeded in (False, True):
+        stage.begin(state, POSTURE)
+        state["joints"][1] = [0.8, -0.35, 1.0, 0.25, 1.4, 0.45, 0.0]
+        along = ARM.at(POSTURE).tasks[:3] @ state["joints"][1]
+        along /= np.linalg.norm(along)
+        away = np.cross([0.0, 0.0, 1.0], along)
+        away /= np.linalg.norm(away)
+        speeds = []
+        for tick in range(90):
+            turn = 0.0044 * tick - 0.1
+            row = (math.sin(turn) * along + math.cos(turn) * away) @ ARM.at(state["joints"][0]).tasks[:3]
+            separation.constraints["row"][0], separation.constraints["allowed"][0] = row, SLIP_SPEED_MPS
+            separation.count = int(is_heeded)
+            stage.stop(state, frame, separation)
+            speeds.append(row @ state["joints"][1])
+        assert not state["joints"][1].any()
+        approach.append(max(speeds))
+    assert approach[0] > 0.04
+    assert approach[1] < 0.5 * approach[0]

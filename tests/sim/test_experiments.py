@@ -29,8 +29,10 @@ from sim.experiments.reproduction.table import METHODS
 from sim.experiments.reproduction.writing import recorded, write
 from sim.experiments.results import Array, ExperimentError
 from sim.experiments.scenes import draw
+from sim.experiments.separation import ThrustScript
 from sim.experiments.statistics import SCENES, wilson
 from sim.scene import MOST_MOVED, Scene
+from sim.script import Clock, Teacher
 from support.paths import ROOT
 
 pytestmark = pytest.mark.timeout(300)
@@ -269,6 +271,18 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
     assert min(progress) > -0.05  # before the start the hands rest
     assert script.clock.at(script.duration_s)[0] == pytest.approx(drawn.scene.duration_s, abs=1e-6)
     assert max(progress) <= drawn.scene.duration_s + 1e-6
+
+
+def test_a_hand_is_thrust_where_the_tool_is_going_in_a_scene_that_is_too_slow_too() -> None:
+    """In this scene the tool is nowhere 22 cm farther after 1.5 s."""
+    drawn = draw(29, seed=7003)
+    script = ThrustScript(drawn)
+    teacher = Teacher(drawn.scene, seed=drawn.seed, clock=Clock(speed=drawn.speed, pauses=drawn.pauses))
+    path = np.array([teacher.truth(t).position for t in script.at_s + np.arange(0.0, 1.5, 0.01)])
+    there = script.truth(script.at_s + script.lasts_s)[script.side].position
+    assert np.linalg.norm(path - there, axis=1).min() < 0.003
+    assert 0.15 < np.linalg.norm(there - path[0]) < 0.22
+    assert all(p.at_s + p.lasts_s <= script.at_s or p.at_s >= script.at_s + script.lasts_s for p in drawn.pauses)
 
 
 def test_the_interval_of_a_rate_is_wilsons() -> None:

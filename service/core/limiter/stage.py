@@ -189,7 +189,7 @@ class LimiterStage:
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm, self._max_speed = arm, settings.tool.max_speed
         self._limiter = Limiter(settings.joints, settings.period_s)
-        self._still, self._jerk = np.zeros(len(settings.joints.names)), np.array(settings.joints.jerk)
+        self._jerk = np.array(settings.joints.jerk)
 
     def begin(self, state: Record, joints: Vector) -> None:
         """Start with the joints (J,) [rad] at rest."""
@@ -199,10 +199,9 @@ class LimiterStage:
     def step(self, state: Record, frame: Record, wanted: Vector, ramp: Vector, separation: Separation) -> Moved:
         """Move the joints one period toward velocities `wanted` (J,), which change at `ramp` (J,).
 
-        If the step exceeds an `allowed` limit of separation, try in order: the synchronised step
-        (`Limiter.together`), if it exceeds none; a stop; the smallest correction of the present
-        velocities (`Separation.less`), if the stop exceeds as much as the step. The result is taken
-        if it exceeds less than the step.
+        If the step exceeds an `allowed` limit of separation, the synchronised step
+        (`Limiter.together`) is taken if it exceeds none. Otherwise the joints brake (`_brake`), if
+        this exceeds less than the step.
 
         If the tool would come too near its speed limit, in the step or in the stop after it, the
         joints stop. If the tool exceeds its limit in this stop, its speed is reported as
@@ -215,9 +214,7 @@ class LimiterStage:
         if separated:
             other = self._limiter.together(q, dq, ddq, wanted)
             if other is None or separation.excess(*other[1:3]) > 0.0:
-                other = self._limiter.stop(q, dq, ddq)
-            if separation.excess(*other[1:3]) >= excess:  # alternating between step and stop would end neither
-                other = self._limiter.step(q, dq, ddq, separation.less(dq, moved[1:3]))
+                other = self._brake(state, separation)[0]
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
         here, excess_speed = self._arm.at(moved.position), 0.0
@@ -232,22 +229,33 @@ class LimiterStage:
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
         """Move the joints one period further in a stop.
 
-        All joints come to rest at the same time. If this exceeds a limit of separation, each joint
-        stops as fast as it can instead, provided that this exceeds less, and that the tool keeps
-        its speed limit or is no faster than in the common stop.
+        The joints brake (`_brake`), provided that the tool keeps its speed limit, or is no faster
+        than in the stop without a correction.
         """
-        q, dq, ddq = state["joints"]
-        moved = self._limiter.stop(q, dq, ddq)
-        here, excess = self._arm.at(moved.position), separation.excess(*moved[1:3])
-        if excess > 0.0:
-            other = self._limiter.step(q, dq, ddq, self._still)
-            if separation.excess(*other[1:3]) < excess:
-                there = self._arm.at(other.position)
-                speed = self._largest_speed_in_stop(other, there)
-                if speed <= self._max_speed or speed <= self._largest_speed_in_stop(moved, here):
-                    moved, here = other, there
+        moved, stop = self._brake(state, separation)
+        here = self._arm.at(moved.position)
+        if moved is not stop:
+            there, speed = self._arm.at(stop.position), self._largest_speed_in_stop(moved, here)
+            if speed > max(self._max_speed, self._largest_speed_in_stop(stop, there)):
+                moved, here = stop, there
         moving = take(as_array(state), as_array(frame), here.record, *moved[:3])
         return Moved(here, limited=False, separated=False, excess_speed=0.0, moving=moving)
+
+    def _brake(self, state: Record, separation: Separation) -> tuple[Limited, Limited]:
+        """Step of a stop in which all joints come to rest at the same time, corrected if necessary.
+
+        If it exceeds an `allowed` limit of separation, the smallest correction of its velocities
+        (`Separation.less`) replaces it, provided that this exceeds less. Returns the step that is
+        taken, and that of the stop without a correction.
+        """
+        q, dq, ddq = state["joints"]
+        stop = self._limiter.stop(q, dq, ddq)
+        excess = separation.excess(*stop[1:3])
+        if excess > 0.0:
+            corrected = self._limiter.step(q, dq, ddq, separation.less(*stop[1:3]))
+            if separation.excess(*corrected[1:3]) < excess:
+                return corrected, stop
+        return stop, stop
 
     def _largest_speed_in_stop(self, moved: Limited, here: Kinematics) -> float:
         """Largest speed [m/s] of the tool if the joints stop after the step `moved`.

@@ -82,7 +82,7 @@ class Separation:
         self._bare["clearance"] = 0.0
         capsules, joints = len(body.capsules), len(limits.names)
         most = 2 * capsules * len(LOOKAHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
-        self._jerk = np.array(limits.jerk)
+        self._jerk, self._weights = np.array(limits.jerk), np.square(limits.acceleration)
         self.constraints = self.constraints_for(joints, most)
         self._contacts = structured(0, CONTACT)
         self.count, self.nearest_m, self.speed_limit, self.setpoint_share = 0, FARTHEST_REPORTED_M, self.max_speed, 1.0
@@ -150,14 +150,16 @@ class Separation:
         """
         return float(excess_of(self.constraints, self.count, velocity, acceleration, self._jerk)[0])
 
-    def less(self, velocity: Vector, moved: tuple[Vector, Vector]) -> Vector:
+    def less(self, velocity: Vector, acceleration: Vector) -> Vector:
         """Joint velocities (J,), changed as little as possible to end the largest excess.
 
-            velocity - excess row / |row|²
+            velocity - excess W row / (row · W row),    W = diag(max_acceleration²)
 
-        `moved`: velocity and acceleration of the joints (J,) that cause the excess.
+        The excess is that of `velocity` and `acceleration` (J,), [rad/s, rad/s²]. Joints with a
+        higher limit of acceleration take a larger part of the change.
         """
-        excess, k = excess_of(self.constraints, self.count, *moved, self._jerk)
+        excess, k = excess_of(self.constraints, self.count, velocity, acceleration, self._jerk)
         row = self.constraints["row"][k]
-        slower: Vector = velocity - excess / (row @ row) * row
+        change = self._weights * row
+        slower: Vector = velocity - excess / (row @ change) * change
         return slower
