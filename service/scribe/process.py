@@ -27,6 +27,7 @@ from service.contract.explain import in_words
 from service.contract.images import decode_image
 from service.core.frame import state_layout
 from service.process import child
+from service.process.pages import release_library_pages
 from service.scribe.paths import RecordingPaths
 from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, unpack
 from service.scribe.segments import Segments
@@ -91,6 +92,7 @@ class DrawingThread:
         self._wait()
         try:
             viewer = self.viewer = make()
+            release_library_pages()
         except Exception as error:  # the recording continues without Rerun
             self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
