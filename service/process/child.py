@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from service.process.pages import release_library_pages
+from service.process.pages import release_start_memory
 
 _PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
@@ -254,7 +254,7 @@ def _serve(control: socket.socket) -> None:
         module = importlib.import_module(name)
         if descriptors:
             gc.collect()
-            release_library_pages()
+            release_start_memory()
             gc.freeze()  # children share the memory pages that they do not write to
             with socket.socket(fileno=descriptors[0]) as channel:
                 try:

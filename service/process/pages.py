@@ -1,4 +1,4 @@
-"""Memory pages of libraries that a process used at its start and does not need afterwards."""
+"""Memory that a process used at its start and does not need afterwards."""
 
 from __future__ import annotations
 
@@ -7,22 +7,31 @@ import ctypes
 import re
 from pathlib import Path
 
-_MAPPING = re.compile(r"([0-9a-f]+)-([0-9a-f]+) r-.p \S+ \S+ [1-9]\d* ")  # private, read-only, of a file
-_MADV_DONTNEED = 4  # Linux defines it; Python's mmap has it for its own maps only
+_MAPPING = re.compile(  # of a file, private to this process: begin, end, is writable, path, anonymous pages [kB]
+    r"^([0-9a-f]+)-([0-9a-f]+) r(.).p \S+ \S+ [1-9]\d* +(.+)\n(?:[A-Z].*\n)*?Anonymous: +(\d+) kB", re.MULTILINE
+)
+_MADV_DONTNEED, _M_ARENA_MAX = 4, -8  # Linux and glibc define them
 
 
-def release_library_pages() -> None:
-    """Release the unmodified pages of all libraries, half of the memory of a process that compiled.
+def release_start_memory() -> None:
+    """Release code and constants of all libraries, and memory that was freed.
 
-    A page that is used again is mapped again from the system's cache of files, in some microseconds.
-    Nothing is released on a system without /proc.
+    What is used again is mapped again from the system's cache of files, in some microseconds.
+    Segments that relocation or this process changed are kept, as are libraries that are just being
+    loaded: their writable segment is mapped last. Without Linux and glibc nothing is released.
     """
-    with contextlib.suppress(OSError):
-        madvise = ctypes.CDLL(None).madvise
-        mapping: re.Match[str] | None = None
-        for line in Path("/proc/self/smaps").read_text(errors="replace").splitlines():
-            if "-" in line.partition(" ")[0]:
-                mapping = _MAPPING.match(line)
-            elif mapping is not None and line.split() == ["Anonymous:", "0", "kB"]:  # relocated pages are anonymous
-                begin, end = int(mapping[1], 16), int(mapping[2], 16)
-                madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        libc.malloc_trim(0)
+        mappings = _MAPPING.findall(Path("/proc/self/smaps").read_text(errors="replace"))
+        loaded = {path for _, _, writable, path, _ in mappings if writable == "w"}
+        for begin, end, writable, path, anonymous_kb in mappings:
+            if path in loaded and writable == "-" and anonymous_kb == "0":
+                at = int(begin, 16)
+                libc.madvise(ctypes.c_void_p(at), ctypes.c_size_t(int(end, 16) - at), _MADV_DONTNEED)
+
+
+def share_one_heap() -> None:
+    """Have threads that begin later allocate from one heap: each of several keeps what it freed."""
+    with contextlib.suppress(AttributeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)

@@ -10,6 +10,7 @@ Recording does not wait for drawing: Rerun is imported on the drawing's own thre
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import socket
@@ -27,7 +28,7 @@ from service.contract.explain import in_words
 from service.contract.images import decode_image
 from service.core.frame import state_layout
 from service.process import child
-from service.process.pages import release_library_pages
+from service.process.pages import release_start_memory, share_one_heap
 from service.scribe.paths import RecordingPaths
 from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, unpack
 from service.scribe.segments import Segments
@@ -45,8 +46,12 @@ MAX_WAITING_DRAWINGS = 5000  # [ticks] with more, the oldest is dropped
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
-# are dropped.
-RERUN_LOG = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
+# are dropped. Arrow's own allocator would keep memory that it does not use.
+LIBRARY_OPTIONS = {
+    "RUST_LOG": "warn,re_quota_channel=error",
+    "NO_COLOR": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
 SOCKET_POLL_S = 0.02  # polling, because to wake a blocked reader costs the sender 25 µs per tick
 
 
@@ -92,12 +97,11 @@ class DrawingThread:
         self._wait()
         try:
             viewer = self.viewer = make()
-            release_library_pages()
         except Exception as error:  # the recording continues without Rerun
             self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
             return
-        flushed = time.monotonic()
+        flushed, is_first = time.monotonic(), True
         while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
             while self._waiting:
                 self._wait()
@@ -111,6 +115,10 @@ class DrawingThread:
             if time.monotonic() - flushed > DRAW_FLUSH_S:
                 viewer.flush()
                 flushed = time.monotonic()
+                if is_first:  # what the first drawing compiled and read is not used again
+                    is_first = False
+                    gc.collect()
+                    release_start_memory()
         viewer.close()
 
     def _wait(self) -> None:
@@ -308,7 +316,8 @@ def run(source: socket.socket) -> None:
     """Write and draw the received messages until the other side closes."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends with its socket, after writing everything
-    for name, value in RERUN_LOG.items():
+    share_one_heap()
+    for name, value in LIBRARY_OPTIONS.items():
         os.environ.setdefault(name, value)
     child.end_with_parent(MAX_CLOSING_S)
     _run_with(CATCH_UP_NICE)
