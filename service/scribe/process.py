@@ -41,14 +41,15 @@ CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that 
 MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
 DRAW_FLUSH_S = 10.0  # a kill loses at most this time of a drawing, which can be drawn again
+FIRST_FLUSH_S = 5.0  # the same, at the begin of a file
 DRAW_END_S = 8.0  # a drawing that does not end within this time is abandoned
 MAX_WAITING_DRAWINGS = 5000  # [ticks] with more, the oldest is dropped
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
-# are dropped. Arrow's own allocator would keep memory that it does not use.
+# are dropped, nor of files without a footer. Arrow's own allocator would keep unused memory.
 LIBRARY_OPTIONS = {
-    "RUST_LOG": "warn,re_quota_channel=error",
+    "RUST_LOG": "warn,re_quota_channel=error,re_log_encoding=error",
     "NO_COLOR": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
@@ -101,22 +102,23 @@ class DrawingThread:
             self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
             return
-        flushed, is_first = time.monotonic(), True
+        flushed, is_fresh = time.monotonic(), True
         while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
             while self._waiting:
                 self._wait()
                 next_ = self._waiting.popleft()
                 if isinstance(next_, Path):
                     viewer.draw_into(next_)
+                    is_fresh = True
                     if self._wanted_file is next_:
                         self._wanted_file = None
                 else:
                     next_(viewer)
-            if time.monotonic() - flushed > DRAW_FLUSH_S:
+            if time.monotonic() - flushed > (FIRST_FLUSH_S if is_fresh else DRAW_FLUSH_S):
                 viewer.flush()
                 flushed = time.monotonic()
-                if is_first:  # what the first drawing compiled and read is not used again
-                    is_first = False
+                if is_fresh:  # neither what the begin of a file needed nor the end of the last one is used again
+                    is_fresh = False
                     gc.collect()
                     release_start_memory()
         viewer.close()

@@ -331,20 +331,22 @@ class Viewer:
         """End the current file, if there is one, and continue in another.
 
         Each file can be viewed alone. One endless file would fill the memory, because Rerun keeps a
-        list of everything that was sent.
+        list of what was sent. Files with a budget have no footer, for which it would keep more;
+        `rerun rrd optimize` adds one.
         """
         name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
         self.rrd = None
         with self._contained(name, drawn):
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
+            sink = rr.FileSink(rrd, write_footer=self._thinning is None)
             if drawn is None:
                 batch_s = FILE_BATCH_S if self._thinning is None else THIN_BATCH_S
                 thinned: dict[str, Any] = {"thinning": self._thinning, "batch_s": batch_s}
-                self._file = _Destination(name, rr.FileSink(rrd), rrd, live=False, **thinned, **self._common)
+                self._file = _Destination(name, sink, rrd, live=False, **thinned, **self._common)
                 self._destinations.append(self._file)
             else:
-                drawn.redirect(name, rr.FileSink(rrd), rrd)
+                drawn.redirect(name, sink, rrd)
             self.rrd = str(rrd)
 
     @contextlib.contextmanager
