@@ -101,8 +101,7 @@ class _Destination:
         self._repeated_ns, self._open = 0, True
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(self._settings.cell)
-        # once per sink, because Rerun keeps 1.5 MB of each blueprint permanently
-        self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
+        blueprint(self._settings, live=self._live, gate_m=self._gate_m).send_to(self._stream)
         log_static(self._stream, self.models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
         if self._thinning is not None:
@@ -201,10 +200,8 @@ class _Destination:
         self.send()
         if self._open and not self._live and self._dynamic.end_s > 0:
             tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
-            self._stream.send_blueprint(
-                blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._dynamic.end_s),
-                make_active=True,
-            )
+            curves: dict[str, Any] = {"tops": tops, "end_s": self._dynamic.end_s}
+            blueprint(self._settings, live=False, gate_m=self._gate_m, **curves).send_to(self._stream)
 
     @property
     def _gate_m(self) -> float:
