@@ -29,7 +29,7 @@ from sim.script import Array
 from sim.tracked_hands import TrackedHands
 
 THINGS_HZ = 10
-FINAL_STOP_S = 0.5  # the bench runs for this time after the last hands, so that the service can stop the arm
+FINAL_STOP_S = 1.0  # the bench runs for this time after the last hands, so that the service can stop the arm
 QUIET_S = 1.0  # missing commands are reported after this time
 MOST_QUEUED = 256  # commands wait in a queue of this length while the bench is held up
 DRIVE_HEADROOM = 1.25  # drive limits / command limits, so that the arm can catch up after a hold-up

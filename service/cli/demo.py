@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import re
 import subprocess
@@ -109,12 +110,15 @@ def run(
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
             bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
+            ends: list[tuple[Status, int]] = []  # the service ends before the bench: an arm that disappears is a fault
+            play = functools.partial(
+                played, service.endpoint, *bench, reported=lambda: ends.append((client.status(), service.stop()))
+            )
             if page:
-                report = _played_on_page(session, client, service.endpoint, bench, page, browser=browser, say=say)
+                report = _played_on_page(session, client, play, page, browser=browser, say=say)
             else:
-                report = json.loads(played(service.endpoint, *bench, say=say))
-            status = client.status()
-        code, missing = service.stop(), service.missing()
+                report = json.loads(play(say=say))
+        ((status, code),), missing = ends, service.missing()
         if code != 0 and not missing:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
     return _report(report, status) | {"missing": missing}
@@ -123,15 +127,14 @@ def run(
 def _played_on_page(
     session: zenoh.Session,
     client: Client,
-    endpoint: str,
-    bench: list[str],
+    play: Callable[..., str],
     listen: Address,
     *,
     browser: bool,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """The report of the bench, whose hands a person plays on a page. Raises LaunchError,
-    UsageError.
+    """The report of the bench, which `play` runs and whose hands a person plays on a page. Raises
+    LaunchError, UsageError.
     """
     running: list[subprocess.Popen[str]] = []
 
@@ -153,9 +156,8 @@ def _played_on_page(
             say(f"  {url}")
             invite(url, address, browser=browser)
             report: dict[str, Any] = json.loads(
-                played(
-                    endpoint,
-                    *("--tracked-hands", str(PLAY_S), "--wait", str(PAGE_WAIT_S), *bench),
+                play(
+                    *("--tracked-hands", str(PLAY_S), "--wait", str(PAGE_WAIT_S)),
                     say=heard,
                     begun=running.append,
                     timeout_s=PLAY_TIMEOUT_S,

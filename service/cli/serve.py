@@ -62,6 +62,7 @@ def _run(args: argparse.Namespace) -> int:
         from service.daemon import daemon  # a slow import, during which `start` answers requests
         from service.scribe.scribe import Scribe
 
+        gc.freeze()  # no later collection visits what was imported
         gc.enable()
 
         def announce(running: daemon.Daemon) -> None:

@@ -257,7 +257,10 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
 def last_followed(rrd: Path, end: int) -> int:
     """The last time [ns] in mode `follow` in a drawing that ends at `end` [ns], or `end`."""
     times, modes = [], []
-    for chunk in rr.chunk.RrdReader(rrd).stream():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RRD file has no footer")  # the service writes none
+        reader = rr.chunk.RrdReader(rrd)
+    for chunk in reader.stream():
         if chunk.entity_path == "/mode" and not chunk.is_static:
             rows = chunk.to_record_batch()
             times += rows[TIMELINE].cast("int64").to_pylist()

@@ -54,6 +54,7 @@ from service.daemon.task_limits import TaskLimits
 from service.daemon.way_finder import WayFinder
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
+from service.process.pages import release_start_memory
 from service.scribe.protocol import pack
 from service.scribe.scribe import Scribe
 from service.settings.config import Settings, robot_description
@@ -100,6 +101,8 @@ class Daemon:
         urdf = robot_description(settings)
         self._session = start.session
         warm_up(settings, skill, urdf=urdf)
+        release_start_memory()  # the compiler and what only imports used: 150 MB
+        warm_up(settings, skill, urdf=urdf)  # maps again what the loop calls, before its memory is locked
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))

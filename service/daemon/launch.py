@@ -165,10 +165,14 @@ def played(
     *arguments: str,
     say: Callable[[str], None] = lambda line: None,
     begun: Callable[[subprocess.Popen[str]], None] = lambda process: None,
+    reported: Callable[[], object] = lambda: None,
     timeout_s: float = BENCH_TIMEOUT_S,
 ) -> str:
-    """The report in JSON of one run of the bench (`python -m sim` with the arguments); `say` is
-    called with its progress, and `begun` with its process. Raises LaunchError.
+    """The report in JSON of one run of the bench (`python -m sim` with the arguments). `say` is
+    called with its progress, from another thread, and `begun` with its process.
+
+    `reported` is called once the report has arrived; the bench follows commands a moment longer, in
+    which the service can be stopped: an arm that disappears is a fault. Raises LaunchError.
     """
     at = ("--connect", endpoint, "--cell", "thirdhand")
     command, environment = python("-m", "sim", *at, *_end_with_this(), "--once", "--output", "-", *arguments)
@@ -177,22 +181,29 @@ def played(
     clock.start()
     begun(process)
     lines: list[str] = []
-    try:
+
+    def hear() -> None:
         assert process.stderr is not None
-        assert process.stdout is not None
         for line in process.stderr:
             lines.append(line.rstrip())
             say(f"  {lines[-1]}")
-        report = process.stdout.read()
-        if process.wait() != 0:
-            raise LaunchError(
-                f"the bench ended with code {process.returncode}: {lines[-1] if lines else 'it gave no reason'}"
-            )
-    finally:
-        clock.cancel()
-        process.kill()
-        process.communicate()
-    return next((line for line in report.splitlines() if line.startswith("{")), "")
+
+    hearing = threading.Thread(target=hear, name="bench", daemon=True)
+    hearing.start()
+    with process:
+        try:
+            assert process.stdout is not None
+            report = next((line for line in process.stdout if line.startswith("{")), "")
+            if report:
+                reported()
+            code = process.wait()
+        finally:
+            clock.cancel()
+            process.kill()
+            hearing.join()
+    if code != 0:
+        raise LaunchError(f"the bench ended with code {code}: {lines[-1] if lines else 'it gave no reason'}")
+    return report
 
 
 def _end_with_this() -> tuple[str, str]:

@@ -30,6 +30,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from service.process.pages import release_start_memory
+
 _PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
 ENDED_POLL_S = 0.5
@@ -241,6 +243,7 @@ def _serve(control: socket.socket) -> None:
     """The fork server: imports modules and forks children until the other end closes."""
     _continue_with_parent()
     _set_name("fork server")
+    gc.disable()  # imports leave no garbage
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(CHILD_NICE)
@@ -251,7 +254,7 @@ def _serve(control: socket.socket) -> None:
         name, *more = request.decode().split("\0")
         module = importlib.import_module(name)
         if descriptors:
-            gc.collect()
+            release_start_memory()
             gc.freeze()  # children share the memory pages that they do not write to
             with socket.socket(fileno=descriptors[0]) as channel:
                 try:
@@ -274,6 +277,7 @@ def _fork_again(name: str, module: Any, channel: socket.socket) -> None:
             while os.getppid() == between:
                 time.sleep(0.0005)
             _set_name(name)
+            gc.enable()
             channel.send(_PID.pack(os.getpid()))
             module.run(channel)
         code = 0

@@ -10,6 +10,7 @@ Recording does not wait for drawing: Rerun is imported on the drawing's own thre
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import socket
@@ -27,6 +28,7 @@ from service.contract.explain import in_words
 from service.contract.images import decode_image
 from service.core.frame import state_layout
 from service.process import child
+from service.process.pages import release_start_memory, share_one_heap
 from service.scribe.paths import RecordingPaths
 from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, unpack
 from service.scribe.segments import Segments
@@ -39,13 +41,18 @@ CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that 
 MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
 DRAW_FLUSH_S = 10.0  # a kill loses at most this time of a drawing, which can be drawn again
+FIRST_FLUSH_S = 5.0  # the same, at the begin of a file
 DRAW_END_S = 8.0  # a drawing that does not end within this time is abandoned
 MAX_WAITING_DRAWINGS = 5000  # [ticks] with more, the oldest is dropped
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
-# are dropped.
-RERUN_LOG = {"RUST_LOG": "warn,re_quota_channel=error", "NO_COLOR": "1"}
+# are dropped, nor of files without a footer. Arrow's own allocator would keep unused memory.
+LIBRARY_OPTIONS = {
+    "RUST_LOG": "warn,re_quota_channel=error,re_log_encoding=error",
+    "NO_COLOR": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
 SOCKET_POLL_S = 0.02  # polling, because to wake a blocked reader costs the sender 25 µs per tick
 
 
@@ -95,20 +102,25 @@ class DrawingThread:
             self.problems.append(f"nothing is drawn: {in_words(error)}")
             self._wanted_file = None
             return
-        flushed = time.monotonic()
+        flushed, is_fresh = time.monotonic(), True
         while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
             while self._waiting:
                 self._wait()
                 next_ = self._waiting.popleft()
                 if isinstance(next_, Path):
                     viewer.draw_into(next_)
+                    is_fresh = True
                     if self._wanted_file is next_:
                         self._wanted_file = None
                 else:
                     next_(viewer)
-            if time.monotonic() - flushed > DRAW_FLUSH_S:
+            if time.monotonic() - flushed > (FIRST_FLUSH_S if is_fresh else DRAW_FLUSH_S):
                 viewer.flush()
                 flushed = time.monotonic()
+                if is_fresh:  # neither what the begin of a file needed nor the end of the last one is used again
+                    is_fresh = False
+                    gc.collect()
+                    release_start_memory()
         viewer.close()
 
     def _wait(self) -> None:
@@ -306,7 +318,8 @@ def run(source: socket.socket) -> None:
     """Write and draw the received messages until the other side closes."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends with its socket, after writing everything
-    for name, value in RERUN_LOG.items():
+    share_one_heap()
+    for name, value in LIBRARY_OPTIONS.items():
         os.environ.setdefault(name, value)
     child.end_with_parent(MAX_CLOSING_S)
     _run_with(CATCH_UP_NICE)

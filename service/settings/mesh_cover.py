@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from service.contract.explain import in_words
 from service.settings.urdf import COVER, UrdfError
@@ -190,6 +189,8 @@ def capsule_around(points: Points) -> tuple[float, ...]:
     distances d from it and heights h along it, a radius r requires the axis to reach from
     min(h + sqrt(r² - d²)) to max(h - sqrt(r² - d²)). The radius of lowest cost is taken.
     """
+    from scipy.optimize import minimize  # a slow import, which a cover from the cache does not need
+
     outline = _outline(points)
     middle = outline.mean(axis=0)
     outline = outline - middle

@@ -101,8 +101,7 @@ class _Destination:
         self._repeated_ns, self._open = 0, True
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(self._settings.cell)
-        # once per sink, because Rerun keeps 1.5 MB of each blueprint permanently
-        self._stream.send_blueprint(blueprint(self._settings, live=self._live, gate_m=self._gate_m))
+        blueprint(self._settings, live=self._live, gate_m=self._gate_m).send_to(self._stream)
         log_static(self._stream, self.models, self._settings)
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
         if self._thinning is not None:
@@ -201,10 +200,8 @@ class _Destination:
         self.send()
         if self._open and not self._live and self._dynamic.end_s > 0:
             tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
-            self._stream.send_blueprint(
-                blueprint(self._settings, live=False, gate_m=self._gate_m, tops=tops, end_s=self._dynamic.end_s),
-                make_active=True,
-            )
+            curves: dict[str, Any] = {"tops": tops, "end_s": self._dynamic.end_s}
+            blueprint(self._settings, live=False, gate_m=self._gate_m, **curves).send_to(self._stream)
 
     @property
     def _gate_m(self) -> float:
@@ -331,20 +328,22 @@ class Viewer:
         """End the current file, if there is one, and continue in another.
 
         Each file can be viewed alone. One endless file would fill the memory, because Rerun keeps a
-        list of everything that was sent.
+        list of what was sent. Files with a budget have no footer, for which it would keep more;
+        `rerun rrd optimize` adds one.
         """
         name, drawn = f"the drawing in {rrd}", self._file if self._file in self._destinations else None
         self.rrd = None
         with self._contained(name, drawn):
             rrd.parent.mkdir(parents=True, exist_ok=True)
             rrd.open("wb").close()
+            sink = rr.FileSink(rrd, write_footer=self._thinning is None)
             if drawn is None:
                 batch_s = FILE_BATCH_S if self._thinning is None else THIN_BATCH_S
                 thinned: dict[str, Any] = {"thinning": self._thinning, "batch_s": batch_s}
-                self._file = _Destination(name, rr.FileSink(rrd), rrd, live=False, **thinned, **self._common)
+                self._file = _Destination(name, sink, rrd, live=False, **thinned, **self._common)
                 self._destinations.append(self._file)
             else:
-                drawn.redirect(name, rr.FileSink(rrd), rrd)
+                drawn.redirect(name, sink, rrd)
             self.rrd = str(rrd)
 
     @contextlib.contextmanager

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from service.cli.demo import EVENT_TITLES, NEVER_THERE, exit_code, text
-from service.settings.config import WAM
+from service.client import Client, Tracker, open_session
+from service.contract.records import Mode, Reason
+from service.daemon.launch import launched, played
+from service.files.recording import Recording
+from service.report.columns import read
+from service.settings.config import WAM, Settings
+from sim.scene import Scene
 from support.cell import thirdhand, told
 from support.paths import ROOT
 
@@ -108,6 +115,38 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     report = json.loads(out)
     assert re.fullmatch(r"[1-9]\d* of \d+ ticks are not recorded", report["missing"])
     assert f"The recording is not complete: {report['missing']}." in text(report)
+
+
+@timed
+def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
+    """A person's hands are still there when the bench reports, so the arm still follows them."""
+    settings, stop, ends = Settings(rate_hz=100), threading.Event(), list[tuple[str, int]]()
+    with (
+        launched(tmp_path, "--joints", "state", settings=settings, record=tmp_path, rerun=False) as service,
+        open_session(connect=[service.endpoint]) as session,
+        Tracker(session) as tracker,
+    ):
+
+        def hold_still() -> None:
+            while not stop.wait(0.01):
+                for side, start in (("left", Scene().left_start), ("right", Scene().right_start)):
+                    tracker.publish(side, start)
+
+        def end() -> None:
+            ends.append((Client(session).status().mode, service.stop()))
+
+        person = threading.Thread(target=hold_still)
+        person.start()
+        try:
+            assert played(service.endpoint, "--tracked-hands", "1", reported=end)
+        finally:
+            stop.set()
+            person.join()
+    assert ends == [("follow", 0)]
+    (recording,) = tmp_path.glob("*.mcap")
+    frames = read(Recording.open(recording)).frames
+    assert (frames["reason"][-1], frames["mode"][-1]) == (Reason.OPERATOR, Mode.HOLD)
+    assert Reason.ARM_SILENT not in frames["reason"]
 
 
 def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, Any]:

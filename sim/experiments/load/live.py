@@ -27,13 +27,12 @@ def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = 
     with (
         tempfile.TemporaryDirectory() as scratch,  # nothing taught from before
         launched(Path(scratch), "--joints", "state", record=folder if record else None) as service,
+        open_session(connect=[service.endpoint]) as session,
     ):
-        with open_session(connect=[service.endpoint]) as session:
-            if taught:
-                Client(session).add(drawn.scene.via_points(), tolerance=TOLERANCE_M)
-            report = msgspec.json.decode(played(service.endpoint, *_arguments(drawn, Path(scratch))), type=RunReport)
-        service.stop()
-    return report
+        if taught:
+            Client(session).add(drawn.scene.via_points(), tolerance=TOLERANCE_M)
+        report = played(service.endpoint, *_arguments(drawn, Path(scratch)), reported=service.stop)
+    return msgspec.json.decode(report, type=RunReport)
 
 
 def _arguments(drawn: Drawn, folder: Path) -> list[str]:
