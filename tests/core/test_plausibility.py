@@ -89,10 +89,9 @@ def test_what_is_off_for_a_moment_leaves_no_trace_in_the_estimate(rate_hz: int, 
         assert told.state[name].tobytes() == missing.state[name].tobytes(), name
 
 
-@pytest.mark.parametrize("off_m", [(0.068, 0.08), (0.03, 0.06)])
-def test_wrong_samples_that_did_not_jump_are_dropped_by_the_next_right_one(off_m: tuple[float, float]) -> None:
+def test_wrong_samples_that_did_not_jump_are_dropped_by_the_next_right_one() -> None:
     """They make the hand seem to move at 2 m/s."""
-    rate_hz = 30
+    rate_hz, off_m = 30, (0.068, 0.08)
     hands, random, place = Hands(), np.random.default_rng(5), np.array([0.5, 0.1, 0.2])
     off = {2 * rate_hz: off_m[0], 2 * rate_hz + 1: off_m[1]}
     for k in range(3 * rate_hz):
