@@ -39,7 +39,7 @@ EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_l
 GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
 REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
 AHEAD_M, AHEAD_S = 0.22, 1.5  # a hand is thrust this far ahead of the tool on its path, and at most this time
-PATH_STEP_S = 0.02  # times at which the path is sampled
+THRUST_STEP_S = 0.02  # times at which the path is sampled
 CLEARANCE_TICKS, WITHIN_M = 5, 0.3
 SHOWN_M, STEP_S = 0.3, 1e-6
 SHOWN_SCENES, SHOWN_TICKS = 5, 10  # the figure shows the first scenes, and every tenth tick
@@ -96,8 +96,8 @@ def _thrust(
     The tool is AHEAD_M from the place and gets there within AHEAD_S. If the tool is never that
     fast, the time and the place are those where it gets farthest.
     """
-    times, count = np.arange(0.5, duration_s - 1.0, PATH_STEP_S), round(AHEAD_S / PATH_STEP_S)
-    path = np.array([teacher.truth(times[0] + i * PATH_STEP_S).position for i in range(len(times) + count - 1)])
+    times, count = np.arange(0.5, duration_s - 1.0, THRUST_STEP_S), round(AHEAD_S / THRUST_STEP_S)
+    path = np.array([teacher.truth(times[0] + i * THRUST_STEP_S).position for i in range(len(times) + count - 1)])
     ahead = sliding_window_view(path, count, axis=0).transpose(0, 2, 1)  # (T, count, 3)
     away_m = np.linalg.norm(ahead - ahead[:, :1], axis=2)
     for pause in drawn.pauses:
