@@ -24,7 +24,7 @@ from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError, in_words
 from service.files.mcap_file import machine
 from service.files.shipped import cell_of
-from service.scribe.paths import MB
+from service.scribe.paths import MB, named_after, stem_of
 from service.settings.config import Settings, without_secrets
 
 LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
@@ -38,7 +38,7 @@ def bundle(args: argparse.Namespace) -> int:
     """Write the archive and print what it holds; exit code 0 also if the daemon does not answer."""
     settings, now = cell_of(str(args.config)) if args.config else None, datetime.now(UTC)
     args.cell = args.cell or (settings or Settings()).cell
-    path = args.output or Path(f"thirdhand-{args.cell.replace('/', '-')}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
+    path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
     check_writable(path)
     installed = {(one.metadata["Name"], one.version) for one in metadata.distributions()}
     texts = {
@@ -51,7 +51,7 @@ def bundle(args: argparse.Namespace) -> int:
     texts |= {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()} if settings else {}
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
         folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
-    found = sorted(Path(folder).glob(f"{args.cell.replace('/', '-')}-[0-9]*Z*.mcap")) if folder else []
+    found = named_after(args.cell, Path(folder), ".mcap") if folder else []
     recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
     about = "".join(f"{name}: {len(text.splitlines())} lines\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
@@ -83,7 +83,7 @@ def _log(args: argparse.Namespace) -> str:
         with args.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - LOG_BYTES))
             return str(file.read(LOG_BYTES).decode(errors="replace"))
-    unit = args.config.stem if args.config else args.cell.replace("/", "-")
+    unit = args.config.stem if args.config else stem_of(args.cell)
     command = ["journalctl", "--unit", f"thirdhand@{unit}", "--no-pager", "--lines", str(JOURNAL_LINES)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=JOURNAL_TIMEOUT_S, check=False)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time as clock
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

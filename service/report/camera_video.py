@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
-from collections.abc import Iterator, Sequence
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from service.contract.explain import ExplainedError, in_words
+from service.contract.images import CompressedImage
 from service.files.recording import Recording
 
 CODEC, PIXELS = "h264", "yuv420p"
@@ -27,24 +31,59 @@ class CameraRows(NamedTuple):
     times_ns: NDArray[np.int64]
 
 
-def cameras(recordings: Sequence[Recording]) -> list[str]:
-    """The keys of the images that all recordings hold."""
-    found = [{key for key, *_ in recording.images()} for recording in recordings]
-    return sorted(set.intersection(*found)) if found else []
+class _Video:
+    """The MP4 file of one camera, with sampled pixels (P, 3) of each episode.
 
+    Raises ExplainedError without PyAV.
+    """
 
-def pictures(rows: CameraRows, key: str) -> Iterator[Image.Image]:
-    """For each row the newest image of a camera at its time, else the first one."""
-    images = ((image, at_ns) for name, image, at_ns in rows.recording.images() if name == key)
-    now, after = next(images), next(images, None)
-    shown = _opened(now[0].data)
-    for time_ns in rows.times_ns.tolist():
-        before = now
-        while after is not None and after[1] <= time_ns:
-            now, after = after, next(images, None)
-        if now is not before:
-            shown = _opened(now[0].data)
-        yield shown
+    def __init__(self, path: Path, key: str, fps: int) -> None:
+        try:
+            import av  # an extra, as its libraries are large
+        except ImportError:
+            raise ExplainedError(f"images of {key} need PyAV for a video: pip install 'thirdhand[video]'") from None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path, self.fps, self.sampled = path, fps, list[list[NDArray[np.float64]]]()
+        self.container, self._encoded = av.open(path, "w"), av.VideoFrame.from_image
+        self._stream: Any = self.container.add_stream(CODEC, rate=fps, options=OPTIONS)
+        self._stream.pix_fmt, self._stream.time_base = PIXELS, Fraction(1, fps)
+        self._size: tuple[int, int] | None = None
+
+    def begin(self, episodes: Sequence[CameraRows]) -> None:
+        """Begin a recording with these episodes, whose images follow."""
+        self._rows = [(time_ns, i) for one in episodes for i, time_ns in enumerate(one.times_ns.tolist())][::-1]
+        self._newest: CompressedImage | None = None
+
+    def show(self, image: CompressedImage | None, at_ns: float) -> None:
+        """Write the rows before an image's time with the image before it, else with itself; None
+        ends the recording.
+        """
+        shown, picture = self._newest or image, None
+        while shown is not None and self._rows and self._rows[-1][0] < at_ns:
+            picture = picture or _opened(shown.data)
+            self._write(picture, self._rows.pop()[1])
+        self._newest = image
+
+    def _write(self, picture: Image.Image, row: int) -> None:
+        if self._size is None:
+            self._size = picture.width // 2 * 2, picture.height // 2 * 2  # even, as the colours need it
+            self._stream.width, self._stream.height = self._size
+        shown = picture if picture.size == self._size else picture.resize(self._size)
+        if row == 0:
+            self.sampled.append([])
+        if row % SAMPLED == 0:
+            self.sampled[-1].append(np.asarray(shown, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255)
+        self.container.mux(self._stream.encode(self._encoded(shown)))
+
+    def feature(self) -> dict[str, Any]:
+        """End the stream; the feature of the data set's description."""
+        self.container.mux(self._stream.encode(None))
+        assert self._size is not None
+        width, height = self._size
+        about = {"height": height, "width": width, "channels": 3, "codec": CODEC, "pix_fmt": PIXELS, "fps": self.fps}
+        info = {f"video.{name}": value for name, value in about.items()}
+        info |= {"video.is_depth_map": False, "has_audio": False}
+        return {"dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"], "info": info}
 
 
 def _opened(file: bytes) -> Image.Image:
@@ -54,34 +93,31 @@ def _opened(file: bytes) -> Image.Image:
         raise ExplainedError(f"an image of the recording cannot be decoded: {in_words(error)}") from None
 
 
-def write_video(path: Path, episodes: Sequence[CameraRows], key: str, *, fps: int) -> tuple[dict[str, Any], list[Any]]:
-    """Write the pictures of a camera in all episodes to one MP4 file. Return the feature of the
-    data set's description, and the statistics of each episode. Raises ExplainedError without PyAV.
+def write_videos(
+    episodes: Sequence[CameraRows], path_of: Callable[[str], Path], *, fps: int
+) -> dict[str, tuple[dict[str, Any], list[Any]]]:
+    """Write a video of each camera that all recordings have, reading each recording once.
+
+    Return, by key, the feature of the data set's description, and sampled pixels of each episode.
+    Raises ExplainedError without PyAV.
     """
-    try:
-        import av  # an extra, as its libraries are large
-    except ImportError:
-        raise ExplainedError(f"images of {key} need PyAV for a video: pip install 'thirdhand[video]'") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    size: tuple[int, int] | None = None
-    statistics = []
-    with av.open(path, "w") as container:
-        stream: Any = container.add_stream(CODEC, rate=fps, options=OPTIONS)
-        stream.pix_fmt, stream.time_base = PIXELS, Fraction(1, fps)
-        for rows in episodes:
-            sampled = []
-            for i, picture in enumerate(pictures(rows, key)):
-                if size is None:
-                    size = picture.width // 2 * 2, picture.height // 2 * 2  # even, as the colours need it
-                    stream.width, stream.height = size
-                shown = picture if picture.size == size else picture.resize(size)
-                if i % SAMPLED == 0:
-                    sampled.append(np.asarray(shown, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255)
-                container.mux(stream.encode(av.VideoFrame.from_image(shown)))
-            statistics.append(sampled)
-        container.mux(stream.encode(None))
-    assert size is not None
-    about = {"height": size[1], "width": size[0], "channels": 3, "codec": CODEC, "pix_fmt": PIXELS, "fps": fps}
-    info = {f"video.{name}": value for name, value in about.items()} | {"video.is_depth_map": False, "has_audio": False}
-    names = ["height", "width", "channels"]
-    return {"dtype": "video", "shape": (size[1], size[0], 3), "names": names, "info": info}, statistics
+    videos: dict[str, _Video] = {}
+    with contextlib.ExitStack() as closing:
+        for number, (_, group) in enumerate(itertools.groupby(episodes, lambda one: id(one.recording))):
+            parts, seen = list(group), set[str]()
+            for key, image, at_ns in parts[0].recording.images():
+                if number == 0 and key not in videos:
+                    videos[key] = _Video(path_of(key), key, fps)
+                    closing.enter_context(videos[key].container)
+                if key in videos:
+                    if key not in seen:
+                        seen.add(key)
+                        videos[key].begin(parts)
+                    videos[key].show(image, at_ns)
+            for key in seen:
+                videos[key].show(None, math.inf)
+            for key in videos.keys() - seen:
+                video = videos.pop(key)
+                video.container.close()
+                video.path.unlink()
+        return {key: (video.feature(), video.sampled) for key, video in sorted(videos.items())}

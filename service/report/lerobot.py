@@ -19,7 +19,7 @@ from pyarrow import parquet
 from service.contract import cdr
 from service.contract.explain import ExplainedError
 from service.core.intake.arm_samples import in_turn
-from service.report.camera_video import CameraRows, cameras, write_video
+from service.report.camera_video import CameraRows, write_videos
 from service.report.columns import Columns, runs
 
 FEATURES = ("observation.state", "observation.environment_state", "action")
@@ -83,13 +83,12 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     ((arm, joints),) = arms
     names = dict(zip(FEATURES, (joints, HANDS, joints), strict=True))
-    keys = cameras([one.recording for one in recordings])
     first = FILE.format(chunk_index=0, file_index=0)
-    videos = {}
-    for key in keys:
-        name = f"observation.images.{key.replace('/', '_')}"
-        path = folder / VIDEO.format(video_key=name, chunk_index=0, file_index=0)
-        videos[name] = write_video(path, shown, key, fps=fps)
+
+    def video_of(key: str) -> Path:
+        return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)
+
+    videos = {_named(key): video for key, video in write_videos(shown, video_of, fps=fps).items()}
     info = {
         "codebase_version": "v3.0", "robot_type": arm, "fps": fps, "splits": {"train": f"0:{len(parts)}"},
         "total_episodes": len(parts), "total_frames": ends[-1], "total_tasks": 1, "chunks_size": 1000,
@@ -128,6 +127,11 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     statistics = _statistics(whole) | _video_statistics(videos, slice(None))
     (meta / "stats.json").write_bytes(msgspec.json.encode(statistics))
     return len(parts), ends[-1]
+
+
+def _named(key: str) -> str:
+    """The name of a camera's feature."""
+    return f"observation.images.{key.replace('/', '_')}"
 
 
 def _write(path: Path, *groups: pa.Table) -> None:

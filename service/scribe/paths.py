@@ -21,6 +21,18 @@ def existing_folder(folder: Path) -> Path:
     return next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
 
 
+def stem_of(cell: str) -> str:
+    """The begin of the names of a cell's files; other cells with slashes may have the same."""
+    return cell.replace("/", "-")
+
+
+def named_after(cell: str, folder: Path, suffix: str) -> list[Path]:
+    """The files of a kind in a folder that have names of this cell's recordings, oldest first."""
+    names = re.compile(re.escape(stem_of(cell)) + r"-\d{8}T\d{6}Z(-2)*")
+    found = sorted(folder.glob(f"*Z*{suffix}"))
+    return [path for path in found if path.suffix == suffix and names.fullmatch(path.stem)]
+
+
 class RecordingPaths:
     """The paths of successive recordings.
 
@@ -37,7 +49,6 @@ class RecordingPaths:
         self._number = attempt
         self._newest = datetime.min.replace(tzinfo=UTC)
         self._own: dict[str, bool] = {}  # True for this cell's recordings, by stem
-        self._cell = settings.cell.replace("/", "-")
         # Growth before each file takes an older one's place; None: without end, or not known yet.
         self.keep_mb_left: float | None = None
 
@@ -61,7 +72,7 @@ class RecordingPaths:
 
     def _named(self, at: datetime) -> tuple[Path, Path]:
         assert self._folder is not None
-        stem = f"{self._cell}-{at:%Y%m%dT%H%M%SZ}"
+        stem = f"{stem_of(self._settings.cell)}-{at:%Y%m%dT%H%M%SZ}"
         return self._folder / f"{stem}.mcap", self._folder / f"{stem}.rrd"
 
     def prune(self, writing: Path | None) -> list[Path]:
@@ -93,20 +104,16 @@ class RecordingPaths:
     def _found(self, suffix: str) -> list[tuple[Path, int, float]]:
         """This cell's files of a kind in order, with size [bytes] and time of change [s]."""
         assert self._folder is not None
-        own_names = re.compile(re.escape(self._cell) + r"-\d{8}T\d{6}Z(-2)*")
         found = []
-        for path in sorted(self._folder.glob(f"*Z*{suffix}")):
-            if path.suffix == suffix and own_names.fullmatch(path.stem) and self._is_own(path):
+        for path in named_after(self._settings.cell, self._folder, suffix):
+            if self._is_own(path):
                 with contextlib.suppress(OSError):
                     about = path.stat()
                     found.append((path, about.st_size, about.st_mtime))
         return found
 
     def _is_own(self, path: Path) -> bool:
-        """True if a recording, or the recording of a drawing, is this cell's.
-
-        With slashes replaced, another cell may have the same name.
-        """
+        """True if a recording, or the recording of a drawing, is this cell's."""
         if path.stem not in self._own:
             messages = Messages(path.with_suffix(".mcap"))
             with contextlib.suppress(OSError):
