@@ -159,6 +159,8 @@ def _advance_both(states: Records, stale_ticks: int, one: Records, models: Recor
     state.response_s = _response_s(states, period_s)
     for side in range(2):
         hand = state.hands[side]
+        if state.tremors[side, 0] == 0.0:  # a state that an earlier version recorded
+            no_tremor(states, side)
         if is_fresh(states, side, stale_ticks):
             advance_hand(states, side, one)
             look_ahead(states, models, side)
