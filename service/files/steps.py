@@ -40,6 +40,9 @@ LATER_FIELDS = {
     *("clutch_until_tick", "gripper_wish", "engaging", "followed_tick", "task_clock"),
     *("known_gate_m", "unprimed_belief", "error_probability"),
     *("guided_until_tick", "guided_tick", "held", "held_tick", "held_stage", "held_hands"),
+    *("tremor_rate", "trembles", "tremors", "bank_stamps_ns", "bank_ticks", "bank_means", "bank_covariances"),
+    *("bank_evidence", "bank_variances", "stale_ticks", "longest_delay_ticks", "corrected_tick", "doubted_samples"),
+    "hand_doubt_m",
 }
 _LAYOUTS = {"state": STATE, "frame": FRAME}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
