@@ -1,7 +1,7 @@
 """`python docs/experiments_page.py` writes the figures of the experiments from
 recordings/experiments: experiments.md from its template, experiments.md.jinja; in the README,
-camera.md and faults.md what stands between `<!-- evidence -->` marks, and the last cells of the
-table of faults.
+camera.md, tune.md and faults.md what stands between `<!-- evidence -->` marks, and the last cells
+of the table of faults.
 
 A number of a template is an expression of a result, as `{{ phase.tremor_mm | fixed(1) }}`; without
 that result it is an error. What was measured with another version is marked as stale.
@@ -46,6 +46,18 @@ teacher would take. A mere look-up of the taught places succeeds in
 {{ one.depth_mm | fixed }} mm | {{ one.about_own_mean_median_mm | fixed }} mm | \
 {{ one.about_own_mean_p95_mm | fixed }} mm |
 {% endfor %}""",
+    "docs/tune.md": """{{ stale("motion") }}
+{% if "ours, calmly" in motion.by_follower -%}
+| `follow` | error, rms | lag | jerk, multiple of the hands' | overshoot of sudden stops, mean | worst |
+|---|---|---|---|---|---|
+{% for dial, name in (("closely", "ours, closely"), ("default", "ours"), ("calmly", "ours, calmly")) -%}
+{% set one, stops = motion.by_follower[name].clean, motion.by_follower[name]["sudden stops"] -%}
+| `"{{ dial }}"` | {{ one.error_rms_mm | fixed(1) }} mm | {{ one.lag_ms | fixed }} ms | \
+{{ one.jerk_ratio | fixed(1) }} | {{ stops.overshoot_mean_mm | fixed(1) }} mm | \
+{{ stops.overshoot_worst_mm | fixed(1) }} mm |
+{% endfor %}
+{% endif -%}
+The hands are modelled people, tracked at 100 Hz.""",
     "docs/faults.md": """{{ stale("faults") }}
 In that run, {{ faults.unaccounted_ticks }} ticks were lost without a mark, and
 {{ faults.unasked_faults }} faults of the service occurred that nobody had caused.""",

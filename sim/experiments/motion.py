@@ -62,11 +62,11 @@ SMALL_HZ = range(1, 13)
 SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
-WEIGHTS = (1e-8, 4e-8)  # jerk weights besides the default
+DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
 LABELS = {
-    "ours": "ours, by jerk weight (ringed: the default)",
+    "ours": "ours, by [tool] follow (ringed: the default)",
     "chase": "One-Euro filter, then Ruckig after the target",
     "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
 }
@@ -125,9 +125,9 @@ def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follo
     """All followers; for a quick look one of each kind, and ours."""
     found = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
-    for weight in WEIGHTS if share == 1 else ():
-        tool = msgspec.structs.replace(settings.tool, jerk_weight=weight)
-        found[f"ours, jerk weight {weight:g}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
+    for dial in DIALS if share == 1 else ():
+        tool = msgspec.structs.replace(settings.tool, follow=dial)
+        found[f"ours, {dial}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
     for least_hz, beta in CHASES[:first]:
         found[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
     for coefficient in SERVOS[:first]:
