@@ -198,6 +198,8 @@ def tuning() -> Tuning:
         replace = _Reads(f"{stage}/tuning.py", found.reads, stage, inside=True)
         for node in tree.body:
             replace.visit(node) if isinstance(node, ast.ImportFrom) else None
+        sizes = {name: value for name, value in vars(sys.modules[f"service.core.{stage}"]).items() if name.isupper()}
+        replace.named |= {name: ast.Constant(value) for name, value in sizes.items() if isinstance(value, int)}
         for name, formula in _assigned(tree):
             if _named(formula):
                 found.reads[f"{stage}.{name}"] = replace.named[name] = replace.visit(formula)
@@ -267,7 +269,7 @@ class _Loader(SourceFileLoader):
         return compile(reading(path, self.get_data(path), self.reads), path, "exec")
 
     def exec_module(self, module: ModuleType) -> None:
-        vars(module)["_memory"] = sys.modules[__name__]
+        vars(module).update(_memory=sys.modules[__name__], math=math, np=np)  # what the formulas name
         super().exec_module(module)
 
 

@@ -17,7 +17,6 @@ from service.contract.incidents import BY_WORD, INCIDENTS, Condition, in_full, w
 from service.contract.records import GONE_S, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 from service.core.decision.tuning import STUCK_S, TOO_FAST_S
-from service.core.intake import CONFIRMED_SAMPLES
 from service.core.intake import tuning as intake
 from service.settings.config import ArmSettings, HandSettings, Settings, ToolSettings
 from support.paths import ROOT
@@ -99,7 +98,7 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Condition.ARM_UNSETTLED, f"for {intake.ARM_STILL_S:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
-    assert (intake.CONTESTED_ON_SHARE, CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
+    assert (intake.CONTESTED_ON_SHARE, intake.CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
 
 
 def test_without_figures_the_sentence_is_the_general_one_and_with_them_theirs() -> None:

@@ -138,7 +138,7 @@ def test_learn_remembers_where_hands_alone_tell_too_little_and_nowhere_else() ->
     assert msgspec.json.decode(skill.figures)["taken"].startswith("memory")
     assert order(learn(takes(8, remembers=False))) == 0
     back = decoded(skill.file, origin="again")
-    hands = motion(np.array([0.3]))[0].reshape(2, 3) + 0.4
+    hands = np.array(skill.hands[len(skill.hands) // 2]).reshape(2, 3)
     past = np.tile(hands, (ORDER, 1, 1)) + 0.05
     still = np.zeros((2, 3))
     there = [one.predict(hands, still, still, past=past).position for one in (skill, back)]

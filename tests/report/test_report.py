@@ -160,7 +160,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SESSION_S, abs=0.05)
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     for reason, (begin_s, end_s) in {
-        Reason.STALE_HAND: (DROPOUT_S[0] + 0.25, DROPOUT_S[1]),  # so long the tool could do without that hand
+        Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),  # until then the tool does not depend on that hand
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: AWAY_S,
     }.items():

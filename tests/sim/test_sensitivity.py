@@ -72,7 +72,7 @@ def test_each_name_of_the_tuning_reads_its_own_value() -> None:
         stage, name = key.split(".")
         code = compile(ast.fix_missing_locations(ast.Expression(read)), key, "eval")
         value = getattr(sys.modules[f"service.core.{stage}.tuning"], name)
-        np.testing.assert_array_equal(eval(code, {"_memory": sensitivity, "np": np}), value, err_msg=key)
+        np.testing.assert_array_equal(eval(code, {"_memory": sensitivity, "np": np, "math": math}), value, err_msg=key)
     assert set(reads) - set(numbers)  # formulas of other numbers
 
 

@@ -81,7 +81,7 @@ class Cell:
         return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
 
     def frame(self) -> dict[str, Any]:
-        unseen = {"hand_ages": np.array((-1, -1)), "hands": np.zeros((2, 3))}
+        unseen = {"hand_ages": np.array((-1, -1)), "stale_ticks": np.array((50, 50)), "hands": np.zeros((2, 3))}
         return {"tick": self._tick, "mode": self.mode, "reason": self.reason, **unseen}
 
     def _drain(self) -> None:

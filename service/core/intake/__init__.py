@@ -9,8 +9,6 @@ STATES = 5  # states of each mode and axis: position, velocity, acceleration, tr
 TREMOR_RATES, USUAL_RATE = 7, 5  # rates of tremor that are distinguished, from slow to fast, and the usual one
 NO_TREMOR = 2  # filters without tremor in the bank of tremor filters
 BANK = NO_TREMOR + TREMOR_RATES  # filters of that bank
-SETTLED_SAMPLES = 4  # a sample is settled when this number of newer ones is retained
-CONFIRMED_SAMPLES = 3  # successive samples confirm a jump: as many as show position, velocity and acceleration
 KEPT = 49  # retained samples of each hand, among which late ones are inserted: 0.1 s of the fastest tracker
 STATE = (
     Field("hand_stamps_ns", "int64", (2,)),  # stamp of the newest sample

@@ -21,7 +21,7 @@ from kmp.compiled import compiled
 from service.core.codes import DOUBTED, LEARNING, TRUSTED
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
-from service.core.intake import KEPT, MODES, SETTLED_SAMPLES
+from service.core.intake import KEPT, MODES
 from service.core.intake.mode_filter import advance, start, update
 from service.core.intake.motion_model import CHANGE, model
 from service.core.intake.tremor import no_tremor, note_tremor
@@ -34,6 +34,7 @@ from service.core.intake.tuning import (
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     REAPPEARED_VARIANCE_SHARE,
+    SETTLED_SAMPLES,
     STILLNESS_FALL_S,
     STILLNESS_LOWPASS_S,
     TRACKER_MEMORY_S,

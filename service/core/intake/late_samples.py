@@ -19,7 +19,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.codes import TRUSTED
 from service.core.frame import Record, Records, Vector
-from service.core.intake import KEPT, SETTLED_SAMPLES
+from service.core.intake import KEPT
 from service.core.intake.hand_estimator import (
     advance_hand,
     filter_in,
@@ -30,7 +30,7 @@ from service.core.intake.hand_estimator import (
     slot,
 )
 from service.core.intake.motion_model import CHANGE
-from service.core.intake.tuning import REAPPEARED_VARIANCE_SHARE, TRACKER_MEMORY_S
+from service.core.intake.tuning import REAPPEARED_VARIANCE_SHARE, SETTLED_SAMPLES, TRACKER_MEMORY_S
 from service.core.numerics import TICK_ROUNDING
 from service.core.vectors import squared_distance
 

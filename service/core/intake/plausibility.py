@@ -27,10 +27,10 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from service.core.frame import Records, Vector
-from service.core.intake import CONFIRMED_SAMPLES
 from service.core.intake.hand_estimator import slot
 from service.core.intake.tuning import (
     CONFIRMED_S,
+    CONFIRMED_SAMPLES,
     SOURCE_SPREAD_SHARE,
     SOURCES_APART_M,
 )

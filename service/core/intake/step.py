@@ -21,7 +21,7 @@ from service.core.codes import (
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO
-from service.core.intake import CONFIRMED_SAMPLES, KEPT
+from service.core.intake import KEPT
 from service.core.intake.arm_samples import compared, unwrap
 from service.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
 from service.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
@@ -29,6 +29,7 @@ from service.core.intake.plausibility import is_confirmed, is_of_another, is_swa
 from service.core.intake.tuning import (
     ARM_STILL_RAD,
     CONFIRMED_S,
+    CONFIRMED_SAMPLES,
     CONTESTED_OFF_SHARE,
     CONTESTED_ON_SHARE,
     JOINT_JUMP_RAD,

@@ -11,6 +11,8 @@ import math
 
 import numpy as np
 
+from service.core.intake import STATES
+
 # 2 to 5. More: noise and outliers are trusted. Less: ordinary noise counts as an outlier.
 OUTLIER_STDS = 3.0  # what differs by more than this number of standard deviations is an outlier
 
@@ -75,6 +77,8 @@ DELAY_TOLERANCE_S = 0.01  # minimum delays of two windows agree within this: 1 %
 # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
 MAX_HAND_DISTANCE_M = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
 JUMP_NOISE_STDS = 2.0 * OUTLIER_STDS  # a smaller deviation is no jump; twice, as the prediction is uncertain too
+CONFIRMED_SAMPLES = STATES - 2  # agreeing samples that confirm a jump: they show all states but tremor
+SETTLED_SAMPLES = CONFIRMED_SAMPLES + 1  # a sample is settled with this number of newer ones: a jump is confirmed
 # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
 CONFIRMED_S = 0.02  # successive samples that confirm a jump span at least this time
 SOURCES_APART_M = 2.0 * MAX_TREMOR_M  # smallest distance between the positions of two sources; tremor spans as much
