@@ -46,6 +46,5 @@ UNSEEN_ACCELERATION_MPS2 = 5.0  # [m/s²] a hand out of sight is assumed to acce
 CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a via-point's radius, on each axis
 
 # The body.
-# 0 to 0.03. More: the arm folds less. Less: parts come nearer.
-OWN_CLEARANCE_M = 0.01  # largest clearance between own parts; more would keep the arm from folding
+OWN_CLEARANCE_M = PLANNED_MARGIN_M  # largest clearance between own parts; more would keep the arm from folding
 CAPSULE_EXCESS_M = OWN_CLEARANCE_M  # capsules around meshes exceed them by about as much

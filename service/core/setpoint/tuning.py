@@ -24,7 +24,8 @@ DECELERATION_LOOKAHEAD_S = 0.12  # predicted speed = speed + this * min(accelera
 PROMPT_RESPONSE_S = float((LEAST_NOISE_M**2 / 30.0 / MODE_INTENSITIES_M2PS5[2]) ** (1 / 6))  # good tracker, 30 Hz
 # 0 to 10. More: slow trackers overshoot less. Less: slow trackers lag less.
 LATE_STOP_SHARE = 4.0  # delay with which a slow tracker shows a stop / (response time - PROMPT_RESPONSE_S)
-LATE_STOP_MAX_M = STUCK_GAP_M  # largest travel that is allowed for such a delay: a tool this near is there
+# 0 to 0.02. More: slow trackers overshoot less. Less: slow trackers lag less.
+LATE_STOP_MAX_M = 0.008  # largest travel that is allowed for such a delay
 
 # Smallest planned braking / largest braking, to meet a target that brakes too: the share of the
 # jerk that planning leaves.
