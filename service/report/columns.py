@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -101,8 +100,8 @@ class Columns:
     @property
     def stale_ticks(self) -> Records:
         """Age from which each hand is stale (T, 2); `stale_ms` where it was not recorded."""
-        least = math.ceil(round(self.recording.settings.hands.stale_ms / 1000 / self.period_s, 6))
-        found: Records = np.maximum(self.frames["stale_ticks"], least)
+        settings = self.recording.settings
+        found: Records = np.maximum(self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000))
         return found
 
     @property

@@ -449,6 +449,12 @@ class Settings(Section, frozen=True):
         """Duration of one tick [s]."""
         return 1.0 / self.rate_hz
 
+    def ticks_in(self, duration_s: float) -> int:
+        """Number of ticks that last at least this time [s]. The quotient is rounded to 6 decimals
+        first, so that the period's rounding does not add a tick.
+        """
+        return math.ceil(round(duration_s / self.period_s, 6))
+
     @property
     def frame_every(self) -> int:
         """Ticks from one whole frame of a recording to the next."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -57,7 +56,7 @@ class DynamicScene:
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
-        self._stale_ticks = math.ceil(round(settings.hands.stale_ms / self._period_ms, 6))
+        self._stale_ticks = settings.ticks_in(settings.hands.stale_ms / 1000)
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
             name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
         }

@@ -28,7 +28,7 @@ def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
 
 def still_ticks(settings: Settings) -> int:
     """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
-    return math.ceil(round(ARM_STILL_S / settings.period_s, 6))
+    return settings.ticks_in(ARM_STILL_S)
 
 
 @compiled

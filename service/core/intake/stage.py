@@ -41,12 +41,10 @@ def base_from(hands: HandSettings) -> NDArray[np.float64]:
 
 
 def _stale_ticks(key: str, settings: Settings) -> int:
-    """Number of ticks, at least one, after which a channel's source is silent. The duration is
-    rounded first, so that the period's rounding does not add a tick.
-    """
+    """Number of ticks, at least one, after which a channel's source is silent."""
     section, name = BY_KEY[key].stale_after or ("", "")
     duration_ms: float = getattr(getattr(settings, section), name)
-    return max(1, math.ceil(round(duration_ms / 1000 / settings.period_s, 6)))
+    return max(1, settings.ticks_in(duration_ms / 1000))
 
 
 class Refused(NamedTuple):
@@ -78,7 +76,7 @@ class Intake:
         self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         longest_s = hands.longest_stale_ms / 1000
-        stale_max_ticks = max(self._stale_ticks, math.ceil(round(longest_s / settings.period_s, 6)))
+        stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
         unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         max_late_s = max(MAX_LATE_S, longest_s)
         self._models = models(settings.period_s, unseen_ticks + math.ceil(max_late_s / settings.period_s) + 1)
