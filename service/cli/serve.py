@@ -17,7 +17,7 @@ import msgspec
 from service.cli.usage import UsageError, end_with
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
-from service.daemon.start import starting
+from service.daemon.start import ahead_of_others, starting
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process import child
 from service.settings.config import Settings, converted
@@ -59,8 +59,9 @@ def _run(args: argparse.Namespace) -> int:
         child.preload("service.scribe.process")  # in parallel to the imports of this process
     with starting(settings) as start:
         gc.disable()  # imports leave no garbage, and its collection would take a tenth of their time
-        from service.daemon import daemon  # a slow import, during which `start` answers requests
-        from service.scribe.scribe import Scribe
+        with ahead_of_others():
+            from service.daemon import daemon  # a slow import, during which `start` answers requests
+            from service.scribe.scribe import Scribe
 
         gc.freeze()  # no later collection visits what was imported
         gc.enable()

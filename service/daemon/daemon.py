@@ -48,7 +48,7 @@ from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, skill_of
-from service.daemon.start import Startup
+from service.daemon.start import Startup, ahead_of_others
 from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.task_limits import TaskLimits
 from service.daemon.way_finder import WayFinder
@@ -100,9 +100,6 @@ class Daemon:
         self._ended = threading.Event()
         urdf = robot_description(settings)
         self._session = start.session
-        warm_up(settings, skill, urdf=urdf)
-        release_start_memory()  # the compiler and what only imports used: 150 MB
-        warm_up(settings, skill, urdf=urdf)  # maps again what the loop calls, before its memory is locked
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
@@ -112,7 +109,6 @@ class Daemon:
         self._failure = ""  # message of the service's last failure
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
-        start.stage("loop")
         self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
         self._saved_stage = SavedStage(settings)
         if reached := self._saved_stage.read(stored):
@@ -447,6 +443,14 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     return restored
 
 
+def rehearse(settings: Settings, stored: StoredSkill) -> None:
+    """Load or compile what the loop calls, and release what only that used."""
+    skill, urdf = stored.for_loop(), robot_description(settings)
+    warm_up(settings, skill, urdf=urdf)
+    release_start_memory()  # the compiler and what only imports used: 150 MB
+    warm_up(settings, skill, urdf=urdf)  # maps again what the loop calls, before its memory is locked
+
+
 def serve(
     settings: Settings,
     skill_path: Path,
@@ -466,13 +470,15 @@ def serve(
     skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
-        with start.counting():
+        with start.counting(), ahead_of_others():
             start.stage("skill")
             skill = load_skill(skill_path, settings)
             start.stage("rehearsal")
-            daemon = Daemon(
-                settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
-            )
+            rehearse(settings, skill)
+        start.stage("loop")
+        daemon = Daemon(
+            settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
+        )
         for number in STOPPING:
             signal.signal(number, daemon.stop)
         return daemon.serve(announce)

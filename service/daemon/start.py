@@ -30,7 +30,7 @@ log = logging.getLogger("thirdhand")
 REPORT_EVERY_S = 1.0  # interval of reports on a terminal
 LOG_EVERY_S = 20.0  # interval of reports in the log
 MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
-NETWORK_NICE = -15  # 28 times the weight of an ordinary thread
+AHEAD_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
 
 
@@ -146,7 +146,7 @@ def starting(settings: Settings) -> Iterator[Startup]:
     roles = network.revoked, network.ros2_domain, (*ros2.of_settings(settings.ros2),)
     with contextlib.closing(Lock(state_folder(settings), settings.cell)) as lock:
         allow_descriptors()
-        with _ahead_of_others():
+        with ahead_of_others():
             session = open_session(
                 connect=network.connect,
                 listen=network.listen,
@@ -164,15 +164,17 @@ def starting(settings: Settings) -> Iterator[Startup]:
 
 
 @contextlib.contextmanager
-def _ahead_of_others() -> Iterator[None]:
-    """A context in which new threads get a higher weight than other processes, if granted.
+def ahead_of_others() -> Iterator[None]:
+    """A context in which this thread, and threads that it starts, get a higher weight than other
+    processes, if granted.
 
-    It is for the network's threads, which otherwise wait up to 100 ms on a busy machine. They get
-    no real-time scheduling, because a flood of messages could use up the real-time share.
+    It is for the start, and for the network's threads, which otherwise wait up to 100 ms on a busy
+    machine. They get no real-time scheduling, because a flood of messages could use up the
+    real-time share.
     """
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, min(before, NETWORK_NICE))
+        os.setpriority(os.PRIO_PROCESS, 0, min(before, AHEAD_NICE))
     try:
         yield
     finally:

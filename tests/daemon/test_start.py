@@ -5,7 +5,9 @@ and is waited for as long as it gets further.
 from __future__ import annotations
 
 import logging
+import os
 import re
+import select
 import subprocess
 import sys
 import threading
@@ -14,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from service.cli.main import main
@@ -21,7 +24,7 @@ from service.client import Client, StartingError, UnreachableError, cells, endpo
 from service.contract.channels import CHANNELS
 from service.daemon import launch
 from service.daemon.launch import LaunchError, launched
-from service.daemon.start import LOG_EVERY_S, Startup, starting
+from service.daemon.start import AHEAD_NICE, LOG_EVERY_S, Startup, starting
 from service.settings.config import Files, Settings
 from service.settings.network import Network
 from support.cell import serving
@@ -120,6 +123,24 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     assert len({found[3] for found in counts}) == 1
     assert int(counts[0][3]) > 100  # of all that the loop may call
     assert sum("starting:" in line for line in logged) <= 4 + lasted_s / LOG_EVERY_S
+
+
+def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that(tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("this user may not put a process ahead of others")
+    command = [sys.executable, "-m", "service", "serve", "--listen", "tcp/127.0.0.1:0", "--record", str(tmp_path)]
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as service:
+        begun = set()
+        assert service.stdout is not None
+        while not select.select([service.stdout], [], [], 0.02)[0]:
+            begun.add(os.getpriority(os.PRIO_PROCESS, service.pid))
+        processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
+        kept = {one.name(): one.nice() for one in processes}
+        service.terminate()
+    assert min(begun) == AHEAD_NICE
+    assert len(kept) >= 3  # the scribe and the skill worker are children
+    assert all(nice >= 0 for nice in kept.values()), kept
 
 
 @pytest.mark.parametrize("terminal", [True, False])

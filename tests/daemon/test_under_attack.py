@@ -23,7 +23,7 @@ from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
 from service.daemon.daemon import MAX_NOTES_PER_S
 from service.daemon.single_instance import MAX_SESSIONS
-from service.daemon.start import NETWORK_NICE
+from service.daemon.start import AHEAD_NICE
 from support.cell import Daemon, serving
 from support.paths import ROOT
 
@@ -246,9 +246,9 @@ def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Dae
     if not any(ahead.values()):
         pytest.skip("this system does not let a process go before others")
     assert len(ahead) >= 5
-    assert set(ahead.values()) == {NETWORK_NICE}
+    assert set(ahead.values()) == {AHEAD_NICE}
     assert os.getpriority(os.PRIO_PROCESS, daemon.process.pid) == 0
-    took: dict[int, list[float]] = {NETWORK_NICE: [], 0: []}
+    took: dict[int, list[float]] = {AHEAD_NICE: [], 0: []}
     daemon.until(lambda status: status["tick"] > 0)
     with contextlib.ExitStack() as ending:
         for _ in range(4 * (os.cpu_count() or 1)):
@@ -257,8 +257,8 @@ def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Dae
             ending.callback(busy.kill)
         for task in Path("/proc/self/task").iterdir():
             ending.callback(put, int(task.name), os.getpriority(os.PRIO_PROCESS, int(task.name)))
-            put(int(task.name), NETWORK_NICE)
-        for nice in (NETWORK_NICE, 0) * 3:
+            put(int(task.name), AHEAD_NICE)
+        for nice in (AHEAD_NICE, 0) * 3:
             for thread in ahead:
                 put(thread, nice)
             end = time.monotonic() + 1.5
@@ -267,11 +267,11 @@ def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Dae
                 took[nice].append(time.monotonic() - begin)
                 time.sleep(0.01)
         for thread in ahead:
-            put(thread, NETWORK_NICE)
+            put(thread, AHEAD_NICE)
     slow = {nice: sorted(times)[9 * len(times) // 10] for nice, times in took.items()}
     # Some schedulers let who slept go first as it is: then there is nothing to be gained, and both
     # are the same but for noise.
-    assert slow[NETWORK_NICE] < max(1.25 * slow[0], AT_ONCE_S), slow
+    assert slow[AHEAD_NICE] < max(1.25 * slow[0], AT_ONCE_S), slow
 
 
 def put(thread: int, nice: int) -> None:

@@ -16,8 +16,7 @@ from typing import Any
 
 import msgspec
 
-from service.daemon import daemon
-from service.daemon.daemon import Daemon
+from service.daemon.daemon import Daemon, rehearse
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.start import starting
 from service.files.shipped import recordings, shipped_skill
@@ -31,6 +30,7 @@ RATE_HZ, ROS2_DOMAIN = 50, 7
 def main(folder: Path, endpoint: str, *cells: str) -> None:
     """Serves the cells; each says its name once it is announced."""
     skill, skill_worker = shipped_skill(), SkillWorker()
+    rehearse(Settings(), skill)
     daemons, held = [], contextlib.ExitStack()
     for cell in cells:
         settings = Settings(
@@ -43,7 +43,6 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
         start = held.enter_context(starting(settings))
         more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": start}
         daemons.append(Daemon(settings, skill, skills=recordings(), **more))
-        daemon.warm_up = lambda *_, **__: None  # once a process is enough
     for one, cell in zip(daemons, cells, strict=True):
         say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
         say.start()
