@@ -34,7 +34,7 @@ from service.trackers.web_server import Address
 
 DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
-ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
+DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
 MOUSE_RATE_HZ = 100  # at 500 Hz, a browser that draws without a GPU leaves two cores too little for the arm
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
@@ -61,7 +61,7 @@ def demo(args: argparse.Namespace) -> int:
         raise UsageError("--open opens the page of --mouse; --mouse needed with it")
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
     rate_hz = MOUSE_RATE_HZ if page and args.rate is None and args.arm in ARMS else args.rate
-    for left in reversed(range(ATTEMPTS)):
+    for left in reversed(range(DEMO_ATTEMPTS)):
         report = run(
             args.output,
             scene=args.scene,

@@ -19,7 +19,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import ATTEMPTS, EVENT_TITLES, NEVER_THERE, exit_code, text
+from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, exit_code, text
 from service.cli.main import main
 from service.client import Client, Tracker, open_session
 from service.contract.records import Mode, Reason
@@ -196,7 +196,7 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     left = iter(reports)
     monkeypatch.setattr("service.cli.demo.run", lambda *_, **__: next(left))
     assert main(["demo"]) == code
-    assert len(reports) - len(list(left)) == runs <= ATTEMPTS
+    assert len(reports) - len(list(left)) == runs <= DEMO_ATTEMPTS
     assert capsys.readouterr().err.count(f"{BUSY}: it is tried again") == runs - 1
 
 
