@@ -176,6 +176,53 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
 
 
 @compiled
+def _malformed(position: tuple[float, float, float], turn: tuple[float, float, float, float], in_base: Vector) -> int:
+    """Cause for which the pose itself is rejected: NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE; -1 if
+    it is accepted. `in_base` (3,) [m] is the position in frame base.
+    """
+    norm = far = 0.0
+    for k in range(4):
+        norm += turn[k] * turn[k]
+    for i in range(3):
+        far += in_base[i] * in_base[i]
+    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+        return NOT_FINITE
+    if not abs(math.sqrt(norm) - 1.0) <= 0.01:
+        return NOT_A_ROTATION
+    return -1 if far <= MAX_HAND_DISTANCE_M * MAX_HAND_DISTANCE_M else OUT_OF_RANGE
+
+
+@compiled
+def _in_time(
+    states: Records, parameters: Records, side: int, stamp_ns: int, in_base: Vector, fresh: bool
+) -> tuple[int, int, int]:
+    """Cause for which a sample of a hand is rejected by its stamp, or -1; its `order` among the
+    retained samples; and the tick in which it was made.
+
+    The retained samples are forgotten if a hand that is not `fresh` does not continue its filter at
+    `in_base` (3,) [m], or its clock was set back.
+    """
+    state, config, order = states[0], parameters[0], 0
+    newest_ns, period_s = state.hand_stamps_ns[side], config.period_s
+    passed_s = (state.tick - state.hand_ticks[side]) * period_s
+    stale_s = state.stale_ticks[side] * period_s
+    cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.max_late_s)
+    if cause >= 0:
+        return cause, 0, state.tick
+    if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, config.unseen_ticks)):
+        state.kept[side] = 0
+    elif fresh and stamp_ns < newest_ns:
+        order = order_of(states, side, stamp_ns)
+    late = ticks_late(states, side, stamp_ns, period_s, config.max_late_s)
+    if order >= KEPT - 1:
+        return OLDER, 0, state.tick
+    if order < 0:
+        return REPEATED, order, state.tick
+    made = tick_made(states, side, stamp_ns, order, late, period_s) if order > 0 or late > 0 else state.tick
+    return -1, order, made
+
+
+@compiled
 def take_hand(
     states: Records,
     parameters: Records,
@@ -192,43 +239,20 @@ def take_hand(
     `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
     `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
-    state, config, in_base, norm, far = states[0], parameters[0], np.empty(3), 0.0, 0.0
-    for k in range(4):
-        norm += turn[k] * turn[k]
+    state, period_s, in_base = states[0], parameters[0].period_s, np.empty(3)
     for i in range(3):
         in_base[i] = frame[i, 3]
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
-        far += in_base[i] * in_base[i]
-    stale_ticks, period_s = state.stale_ticks[side], config.period_s
-    since = state.tick - state.hand_ticks[side]
-    fresh = state.hand_ticks[side] >= 0 and since < stale_ticks
-    jumped, cause, order, made, wrong = False, -1, 0, state.tick, 0
-    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
-        cause = NOT_FINITE
-    elif not abs(math.sqrt(norm) - 1.0) <= 0.01:
-        cause = NOT_A_ROTATION
-    elif not far <= MAX_HAND_DISTANCE_M * MAX_HAND_DISTANCE_M:
-        cause = OUT_OF_RANGE
-    else:
-        newest_ns, passed_s = state.hand_stamps_ns[side], since * period_s
-        cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_ticks * period_s, config.max_late_s)
-        if cause < 0:
-            if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, config.unseen_ticks)):
-                state.kept[side] = 0
-            elif fresh and stamp_ns < newest_ns:
-                order = order_of(states, side, stamp_ns)
-            late = ticks_late(states, side, stamp_ns, period_s, config.max_late_s)
-            if order >= KEPT - 1:
-                order, cause = 0, OLDER
-            elif order < 0:
-                cause = REPEATED
-            elif order > 0 or late > 0:
-                made = tick_made(states, side, stamp_ns, order, late, period_s)
-        on_time, there = order == 0 and made == state.tick, np.empty(3)
+    fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
+    jumped, order, made, wrong = False, 0, state.tick, 0
+    cause = _malformed(position, turn, in_base)
+    if cause < 0:
+        cause, order, made = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
+        another = False
         if fresh and cause != REPEATED:
-            there[:] = state.hands[side, 0]
-            if not on_time:
+            there = state.hands[side, 0].copy()
+            if order > 0 or made != state.tick:
                 expected(states, models, side, order, made, there)
             at = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
             passed_s = abs(made - state.kept_ticks[side, at]) * period_s
@@ -240,18 +264,17 @@ def take_hand(
                 # a higher share would only decay later
                 another = _turns_hard(states, side, at, in_base, passed_s, period_s)
                 another = another and is_to_and_fro(states, side, order, in_base)
-            note(states, side, another, stale_ticks * period_s, period_s)
             jumped = jumped and wrong == 0
-        elif cause != REPEATED:
-            note(states, side, False, stale_ticks * period_s, period_s)
-        if cause != REPEATED and order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
-            jumped = is_swapped(states, parameters, side, in_base)
+        if cause != REPEATED:
+            note(states, side, another, state.stale_ticks[side] * period_s, period_s)
+            if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
+                jumped = is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
-    there = state.hands[side, 0].copy()
+    before = state.hands[side, 0].copy()
     if wrong > 0:
         drop(states, side, wrong)
     if order == 0 and made == state.tick and wrong == 0:
@@ -260,7 +283,7 @@ def take_hand(
         note_clock(states, parameters, side, stamp_ns, fresh)
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
     if order == 0:
-        _note_correction(states, side, wrong, there, period_s)
+        _note_correction(states, side, wrong, before, period_s)
         state.jump_count[side] = state.jump_is_swap[side] = 0
         state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, frame)
