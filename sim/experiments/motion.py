@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 
 from service.core.skill.skill import Skill
-from service.files.shipped import cell_of, recordings
+from service.files.shipped import ARMS, cell_of, recordings
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
@@ -247,6 +247,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "gain_by_frequency": _gains(results, options, dict(zip(("ours", "chase"), by_both, strict=True))),
         "joint_speeds_in_the_scene": _joint_speeds(found, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
+        "by_arm": _by_arm(results, options, [one for one in hands if one.group in FLOOR_GROUPS]),
     }
     draw_numbers(results, numbers)
     return numbers
@@ -276,6 +277,18 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
     """The figures of all tasks, shared out over processes."""
     begin = functools.partial(prepare, options.share, options.arm)
     return list(shared_out(measure, tasks, options.workers, prepare=begin))
+
+
+def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str, dict[str, dict[str, float]]]:
+    """The errors with each shipped arm by group, as of `_compared`."""
+    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
+    tasks, out = [(name, SHIPPED, one) for name in names for one in hands], {}
+    for arm in ARMS:
+        prepare(options.share, arm)  # of this process, which measures if there is one worker
+        found = _measured(tasks, replace(options, arm=arm))
+        out[arm] = {group: _compared([one for one in found if one.group == group]) for group in FLOOR_GROUPS}
+        results.say(f"{arm}, rms [mm]: {brief(out[arm])}")
+    return out
 
 
 def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
