@@ -15,7 +15,7 @@ from service.files.shipped import shipped_skill
 from service.report.columns import read
 from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.load.live import live_run
+from sim.experiments.load.live import SKIPPED, is_evidence, steady_run
 from sim.experiments.reached import EVENTS, ours
 from sim.experiments.rehearsal import demonstrated, rehearse
 from sim.experiments.reproduction.beside_the_paper import differences
@@ -31,8 +31,6 @@ MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED
 )
 MOVING_M_S = 0.05  # a hand at this speed has started
-ATTEMPTS = 3
-SKIPPED = 25  # a run with more skipped periods of the bench is no evidence: the machine was too busy
 SHOWN_HZ, SERVICE_HZ = 20, 500  # rates of the paths in the figure, and of their recordings
 EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.24), (640, 480)
 THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
@@ -60,7 +58,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         if options.share < 1:  # a quick look, in process
             found[name] = (None, _in_process(drawn, taught=taught))
             continue
-        ran, attempts = _steady(drawn, scratch, taught=taught)
+        ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)
         for suffix in (".mcap", ".rrd"):
             made = next(scratch.glob(f"*{suffix}"))
             made.replace(
@@ -91,17 +89,6 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _steady(drawn: Drawn, scratch: Path, *, taught: bool) -> tuple[RunReport, int]:
-    """A run in which the machine kept real time, or the last attempt, and the attempt's number."""
-    for attempt in range(1, ATTEMPTS + 1):
-        for old in scratch.glob("*"):
-            old.unlink()
-        ran = live_run(drawn, scratch, taught=taught, record=True)
-        if is_evidence(ran.skipped) or attempt == ATTEMPTS:
-            return ran, attempt
-    raise AssertionError
-
-
 def _numbers(ran: RunReport) -> dict[str, Any]:
     return {
         "success": ran.success,
@@ -110,11 +97,6 @@ def _numbers(ran: RunReport) -> dict[str, Any]:
         "periods_skipped_by_bench": ran.skipped,
         "evidence": is_evidence(ran.skipped),
     }
-
-
-def is_evidence(skipped: int) -> bool:
-    """True if a run with a number of skipped periods is evidence."""
-    return skipped <= SKIPPED
 
 
 def _recorded(path: Path) -> Traces:

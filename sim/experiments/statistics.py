@@ -13,7 +13,7 @@ import rerun as rr
 
 from service.files.shipped import shipped_skill
 from sim.experiments.catalogue import DRAWING, EXPERIMENTS
-from sim.experiments.load.live import live_run
+from sim.experiments.load.live import is_evidence, steady_run
 from sim.experiments.reached import EVENTS, places_in, shown
 from sim.experiments.rehearsal import rehearse
 from sim.experiments.results import ADAPTED, OTHER, Options, Results, brief, pyplot, rgb
@@ -92,20 +92,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"scene {one.number} missed: {one.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
             results.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
-    in_real_time = []
-    for inside in found["ours"][:live_count]:
-        number = inside.number
-        live = live_run(draw(number, seed=SCENES.seed), results.folder)
-        in_real_time.append(
-            {
-                "scene": number,
-                "success": live.success,
-                "errors_mm": [getattr(live.events, name).error_mm for name in EVENTS],
-                "errors_in_process_mm": inside.errors_mm,
-                "agrees": live.success == inside.success,
-            }
-        )
-        results.say(f"scene {number} over Zenoh in real time: {brief(in_real_time[-1])}")
+    in_real_time = [_in_real_time(results, inside) for inside in found["ours"][:live_count]]
     paths = {f"/{name}/{method}": (method, i) for method in found for i, name in enumerate(EVENTS)}
     styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(who))], names=[who]) for path, (who, _) in paths.items()}
     values = {path: [one.errors_mm[i] for one in found[who]] for path, (who, i) in paths.items()}
@@ -122,6 +109,21 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     }
     draw_numbers(results, numbers)
     return numbers
+
+
+def _in_real_time(results: Results, inside: Outcome) -> dict[str, Any]:
+    """The scene of an outcome again, over Zenoh in real time, and whether both agree."""
+    live, _ = steady_run(draw(inside.number, seed=SCENES.seed), results.folder)
+    found = {
+        "scene": inside.number,
+        "success": live.success,
+        "errors_mm": [getattr(live.events, name).error_mm for name in EVENTS],
+        "errors_in_process_mm": inside.errors_mm,
+        "agrees": live.success == inside.success,
+        "evidence": is_evidence(live.skipped),
+    }
+    results.say(f"scene {inside.number} over Zenoh in real time: {brief(found)}")
+    return found
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ pytest.importorskip(
 
 from sim.experiments.__main__ import main
 from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.hands import is_evidence
+from sim.experiments.load.live import is_evidence
 from sim.experiments.reproduction.table import METHODS
 from sim.experiments.reproduction.writing import recorded, write
 from sim.experiments.results import Array, ExperimentError
