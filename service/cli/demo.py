@@ -9,6 +9,7 @@ import contextlib
 import functools
 import json
 import re
+import shutil
 import subprocess
 import time
 from collections.abc import Callable
@@ -35,6 +36,7 @@ from service.trackers.web_server import Address
 DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
 DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
+TOO_BUSY = "too-busy"  # folder in --output of what such attempts recorded
 MOUSE_RATE_HZ = 100  # at 500 Hz, a browser that draws without a GPU leaves two cores too little for the arm
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
@@ -75,6 +77,10 @@ def demo(args: argparse.Namespace) -> int:
         if page or report["success"] or report["missing"] or not report["busy"] or not left:
             break
         say(f"the task failed on a machine that was too busy, {report['busy']}: it is tried again")
+        aside = args.output / TOO_BUSY
+        aside.mkdir(exist_ok=True)
+        for made in filter(None, (report["recording"], report["rrd"])):
+            shutil.move(made, aside)
     print(json.dumps(report, indent=2) if args.json else text(report))
     return exit_code(report)
 

@@ -19,7 +19,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, exit_code, text
+from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, TOO_BUSY, exit_code, text
 from service.cli.main import main
 from service.client import Client, Tracker, open_session
 from service.contract.records import Mode, Reason
@@ -173,6 +173,7 @@ def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | No
     assert (f"The recording is not complete: {missing}." in shown) == bool(missing)
 
 
+FILES = ("recording", "rrd")
 BUSY = "the bench paused for 118 ms"
 HELD = report_of(None, "the arm held", None)
 
@@ -192,11 +193,22 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     code: int,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
-    left = iter(reports)
-    monkeypatch.setattr("service.cli.demo.run", lambda *_, **__: next(left))
-    assert main(["demo"]) == code
+    made = [report | {name: str(tmp_path / f"{i}.{name}") for name in FILES} for i, report in enumerate(reports)]
+    left = iter(made)
+
+    def run(*_: Any, **__: Any) -> dict[str, Any]:
+        report = next(left)
+        for name in FILES:
+            Path(report[name]).touch()
+        return report
+
+    monkeypatch.setattr("service.cli.demo.run", run)
+    assert main(["demo", "--output", str(tmp_path)]) == code
     assert len(reports) - len(list(left)) == runs <= DEMO_ATTEMPTS
+    assert {path.name for path in tmp_path.glob("*.*")} == {f"{runs - 1}.{name}" for name in FILES}
+    assert len(list((tmp_path / TOO_BUSY).glob("*"))) == len(FILES) * (runs - 1)
     assert capsys.readouterr().err.count(f"{BUSY}: it is tried again") == runs - 1
 
 
