@@ -109,7 +109,7 @@ def _read(path: Path) -> dict[str, Any]:
         given = tomllib.loads(content(path, LARGEST_CONFIGURATION).decode())
     except (OSError, UnusableError, UnicodeDecodeError) as error:
         raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: {error}") from None
     if isinstance(given.get("connect"), str):
         given["connect"] = [given["connect"]]

@@ -22,6 +22,8 @@ NEEDED = {  # by the operating system's number of an error
     errno.EROFS: "a place that can be written needed",
     errno.EACCES: "permission of this user needed",
     errno.EPERM: "permission of this user needed",
+    errno.ELOOP: "a link that leads to a file or folder needed",
+    errno.ENAMETOOLONG: "a shorter name needed",
     errno.EADDRINUSE: "another program has it; another port, or 0 for any that is free, needed",
     errno.EADDRNOTAVAIL: "an address of this machine needed",
 }

@@ -36,6 +36,9 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
     try:
         with parallel_config(**backend) if backend else contextlib.nullcontext():
             parallel = Parallel(return_as="generator", max_nbytes=None)
+    except (OSError, ValueError) as error:  # the scheduler's address is not one, or nothing answers there
+        raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running scheduler's address needed") from None
+    try:
         yield from parallel(delayed(_alone)(work, item) for item in items)
     except BrokenProcessPool:
         raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None

@@ -609,7 +609,7 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
     """
     try:
         given = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also of a number with too many digits
         raise SettingsError(f"{origin}: {error}") from None
     except RecursionError:
         raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None

@@ -406,3 +406,8 @@ def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("digits", [4301, 9000])
+def test_a_number_with_too_many_digits_is_refused_with_the_name_of_its_file(digits: int) -> None:
+    assert refusal(f"rate_hz = {'9' * digits}").startswith("cell.toml: ")
