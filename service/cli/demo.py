@@ -64,16 +64,7 @@ def demo(args: argparse.Namespace) -> int:
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
     rate_hz = MOUSE_RATE_HZ if page and args.rate is None and args.arm in ARMS else args.rate
     for left in reversed(range(DEMO_ATTEMPTS)):
-        report = run(
-            args.output,
-            scene=args.scene,
-            arm=args.arm,
-            engine=args.engine,
-            rate_hz=rate_hz,
-            page=page,
-            browser=args.open,
-            say=say,
-        )
+        report = run(args, rate_hz, page)
         if page or report["success"] or report["missing"] or not report["busy"] or not left:
             break
         say(f"the task failed on a machine that was too busy, {report['busy']}: it is tried again")
@@ -90,26 +81,17 @@ def exit_code(report: dict[str, Any]) -> int:
     return 0 if report["success"] and not report["missing"] else 1
 
 
-def run(
-    out: Path,
-    *,
-    scene: Path | None,
-    arm: str,
-    engine: str | None,
-    rate_hz: int | None,
-    page: Address | None,
-    browser: bool,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
+def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> dict[str, Any]:
     """Run the scenario once and return its report. With the address of a `page`, a person plays the
-    hands there; it is opened if `browser`. Raises DemoError, SettingsError.
+    hands there. Raises DemoError, SettingsError.
     """
-    engine, settings = engine_of(engine), cell_of(arm, rate_hz=rate_hz)
+    out, engine, settings = args.output, engine_of(args.engine), cell_of(args.arm, rate_hz=rate_hz)
+    scene = [str(args.scene)] if args.scene else []
     if reason := no_room_to_brake(settings.period_s):
         raise DemoError(reason)
     say("starting: the scene, then the service")
     out.mkdir(parents=True, exist_ok=True)
-    request = _output("sim.scene", "--arm", arm, *([str(scene)] if scene else []), say=say)
+    request = _output("sim.scene", "--arm", args.arm, *scene)
     add = decode_request(request.encode(), Add)
     with launched(out, "--joints", "state", settings=settings, record=out, say=say) as service:
         say(f"service at {service.endpoint}")
@@ -120,13 +102,13 @@ def run(
                 f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", str(scene)] if scene else [])]
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", *scene] if scene else [])]
             ends: list[tuple[Status, int]] = []  # the service ends before the bench: an arm that disappears is a fault
             play = functools.partial(
                 played, service.endpoint, *bench, reported=lambda: ends.append((client.status(), service.stop()))
             )
             if page:
-                report = _played_on_page(session, client, play, page, browser=browser, say=say)
+                report = _played_on_page(session, client, play, page, browser=args.open)
             else:
                 report = json.loads(play(say=say))
         ((status, code),), missing = ends, service.missing()
@@ -142,7 +124,6 @@ def _played_on_page(
     listen: Address,
     *,
     browser: bool,
-    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """The report of the bench, which `play` runs and whose hands a person plays on a page. Raises
     LaunchError, UsageError.
@@ -286,7 +267,7 @@ def _shown(path: str) -> str:
     return path
 
 
-def _output(module: str, *arguments: str, say: Callable[[str], None]) -> str:
+def _output(module: str, *arguments: str) -> str:
     command, environment = python("-m", module, *arguments)
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False, env=environment

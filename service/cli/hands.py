@@ -19,8 +19,7 @@ from service.contract.explain import ExplainedError, in_words
 from service.process.progress import say
 from service.settings.network import is_local
 from service.trackers.cell_view import Latest
-from service.trackers.hands_page import HandsPage
-from service.trackers.headset_page import HeadsetPage
+from service.trackers.hands_page import HandsPage, HeadsetPage
 from service.trackers.mouse_page import MousePage
 from service.trackers.pinch import Pinches
 from service.trackers.web_server import Address, ServerCertificate, server_certificate

@@ -39,14 +39,13 @@ from service.daemon.clock import (
     ask_for_real_time,
     run_beside_real_time,
 )
-from service.daemon.foreign_streams import ForeignStreams
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
-from service.daemon.object_listener import ObjectListener
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
+from service.daemon.side_streams import side_streams
 from service.daemon.skill_worker import SkillWorker, skill_of
 from service.daemon.start import Startup, ahead_of_others
 from service.daemon.status import CellStatus, MeasuredArm, outcome
@@ -127,8 +126,7 @@ class Daemon:
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
-        self._objects = ObjectListener(self._session, settings.cell, note=scribe.note, say=self.note)
-        self._foreign = ForeignStreams(self._session, settings.recording.also, send=scribe.image, say=self.note)
+        self._side_streams = side_streams(self._session, settings, scribe, self.note)
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
         self._start, self._is_open = start, False
@@ -348,8 +346,8 @@ class Daemon:
                 self._way_finder.poll(self._frame, self._controller.state)
                 self._streams.show(self._frame, self._controller.state)
                 self._scribe.note("status", payload.decode(), time.time_ns())
-                self._objects.poll()
-                self._foreign.poll()
+                for stream in self._side_streams:
+                    stream.poll()
                 try:
                     self._scribe.supervise()
                 except OSError as error:  # a lack of descriptors or memory may be temporary

@@ -57,56 +57,43 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = WORK_TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        loaded: StoredSkill = self._ask(timeout_s, skill_of, path)
+        loaded: StoredSkill = self._ask(skill_of, path, timeout_s=timeout_s)
         return loaded
 
-    def adapt(
-        self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, timeout_s: float = WORK_TIMEOUT_S
-    ) -> StoredSkill:
-        """The skill with these via-points and no others.
-
-        Raises SkillError, also after `timeout_s` [s].
-        """
-        made: StoredSkill = self._ask(timeout_s, skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
+    def adapt(self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
+        """The skill with these via-points and no others. Raises SkillError."""
+        made: StoredSkill = self._ask(skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
         return made
 
-    def correct(
-        self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint, *, timeout_s: float = WORK_TIMEOUT_S
-    ) -> tuple[StoredSkill, Effect]:
+    def correct(self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
         """The skill with these via-points and no others, and what that changes at the correction
-        `at`. Raises SkillError, also after `timeout_s` [s].
+        `at`. Raises SkillError.
         """
         arguments = skill.file, tuple(via_points), at, self._max_gain
-        made: tuple[StoredSkill, Effect] = self._ask(timeout_s, corrected_skill_of, *arguments)
+        made: tuple[StoredSkill, Effect] = self._ask(corrected_skill_of, *arguments)
         return made
 
-    def way_out(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> list[Vector]:
-        """The result of `WayOut.find` for the cell. Raises SkillError, also after `timeout_s`
-        [s].
-        """
-        found: list[Vector] = self._ask(timeout_s, way_out_of, settings, *arguments)
+    def way_out(self, settings: Settings, *arguments: Vector) -> list[Vector]:
+        """The result of `WayOut.find` for the cell. Raises SkillError."""
+        found: list[Vector] = self._ask(way_out_of, settings, *arguments)
         return found
 
-    def has_posture(self, settings: Settings, *arguments: Vector, timeout_s: float = WORK_TIMEOUT_S) -> bool:
-        """The result of `WayOut.has_posture` for the cell. Raises SkillError, also after
-        `timeout_s` [s].
-        """
-        return bool(self._ask(timeout_s, has_posture_of, settings, *arguments))
+    def has_posture(self, settings: Settings, *arguments: Vector) -> bool:
+        """The result of `WayOut.has_posture` for the cell. Raises SkillError."""
+        return bool(self._ask(has_posture_of, settings, *arguments))
 
-    def beyond_m(self, settings: Settings, positions: Vector, *, timeout_s: float = WORK_TIMEOUT_S) -> Vector:
+    def beyond_m(self, settings: Settings, positions: Vector) -> Vector:
         """Distances (M,) [m] of positions (M, 3) beyond the reach, see `learning.reach.beyond_m`.
-        Raises SkillError, also after `timeout_s` [s].
+        Raises SkillError.
         """
-        distances: Vector = self._ask(timeout_s, beyond_m, settings, positions)
+        distances: Vector = self._ask(beyond_m, settings, positions)
         return distances
 
-    def tool_limits(
-        self, settings: Settings, file: bytes, *, timeout_s: float = WORK_TIMEOUT_S
-    ) -> dict[str, ToolLimits]:
+    def tool_limits(self, settings: Settings, file: bytes) -> dict[str, ToolLimits]:
         """The result of `limits_of_task` for the cell and the skill in force (the bytes of its
-        file). Raises SkillError, also after `timeout_s` [s].
+        file). Raises SkillError.
         """
-        limits: dict[str, ToolLimits] = self._ask(timeout_s, tool_limits_of, settings, file)
+        limits: dict[str, ToolLimits] = self._ask(tool_limits_of, settings, file)
         return limits
 
     def close(self) -> None:
@@ -124,8 +111,10 @@ class SkillWorker:
                 self._child.wait()
             self._child = None
 
-    def _ask(self, timeout_s: float, work: Callable[..., Any], *arguments: Any) -> Any:
-        """The value of `work(*arguments)` in the worker, for a function of an imported module."""
+    def _ask(self, work: Callable[..., Any], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Any:
+        """The value of `work(*arguments)` in the worker, for a function of an imported module.
+        Raises SkillError, also after `timeout_s` [s].
+        """
         with self._busy:
             working, end_s = self.start(), time.monotonic() + timeout_s
             progress = child.Progress(working)

@@ -7,7 +7,6 @@ import itertools
 import logging
 import math
 import os
-import shutil
 import sys
 import threading
 import time
@@ -24,6 +23,7 @@ from service.contract.requests import STARTING
 from service.contract.roles import access_control
 from service.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
 from service.daemon.systemd import Systemd
+from service.process.progress import say
 from service.settings.config import Settings
 
 log = logging.getLogger("thirdhand")
@@ -120,8 +120,7 @@ class Startup:
                 self.systemd.notify(f"STATUS={progress}", f"EXTEND_TIMEOUT_USEC={MAX_PAUSE_US}")
             now_in = 4 * self._ready // len(self._functions) if self._functions else -1
             if terminal:
-                width = shutil.get_terminal_size().columns - 1
-                print(f"{CLEAR}{progress[:width]}", end="", file=sys.stderr, flush=True)
+                say(progress)
             elif progress != logged and (now_in > quarter or now_s - logged_s >= LOG_EVERY_S):
                 log.info("%s", progress)
                 logged, logged_s, quarter = progress, now_s, now_in

@@ -50,11 +50,11 @@ def bench(args: argparse.Namespace) -> int:
     read: Callable[[Any], str]
     seconds = args.seconds or (SOAK_S if args.soak else BENCH_S)
     if args.soak:
-        report, read = soak.run(seconds / 60, settings.rate_hz, settings=settings, say=say), soak.text
+        report, read = soak.run(seconds / 60, settings.rate_hz, settings=settings), soak.text
     elif args.loads:
-        report, read = loads.run(settings.rate_hz, seconds, settings=settings, say=say), loads.text
+        report, read = loads.run(settings.rate_hz, seconds, settings=settings), loads.text
     else:
-        report, read = run(settings.rate_hz, seconds, arm=args.arm, say=say, keep=args.output), text
+        report, read = run(settings.rate_hz, seconds, arm=args.arm, keep=args.output), text
     if args.output is not None:
         (args.output / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
         if read is text:
@@ -68,7 +68,6 @@ def run(
     seconds: float,
     *,
     arm: str = "wam",
-    say: Callable[[str], None] = lambda line: None,
     program: tuple[str, ...] = PROGRAM,
     keep: Path | None = None,
 ) -> dict[str, Any]:
@@ -84,7 +83,7 @@ def run(
     for kind in ("empty", "core", "whole", "core", "empty"):
         if kind == "whole":
             say(f"whole: daemon with recorder and viewer, a tracker, {2 * part_s:g} s")
-            whole = _whole(rate_hz, 2 * part_s, skill, arm, program, say, keep)
+            whole = _whole(rate_hz, 2 * part_s, skill, arm, program, keep)
         else:
             say(f"{kind}: {part_s:g} s")
             found[kind].append(probe(kind, *kinds[kind]))
@@ -99,7 +98,6 @@ def _whole(
     skill: str,
     arm: str,
     program: tuple[str, ...],
-    say: Callable[[str], None],
     keep: Path | None,
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:

@@ -35,6 +35,7 @@ from service.daemon.launch import Launched, free_port, launched
 from service.files.replay import replay
 from service.files.shipped import SHIPPED_SKILL, recordings, shipped_skill
 from service.learning.skill_file import with_file
+from service.process.progress import say
 from service.settings.config import Settings
 from service.timing.probe import TRACKER_HZ, hands_of
 from service.timing.probe_processes import probe
@@ -195,9 +196,7 @@ LOADS = (
 )
 
 
-def run(
-    rate_hz: int, seconds: float, *, settings: Settings | None = None, say: Callable[[str], None]
-) -> list[dict[str, Any]]:
+def run(rate_hz: int, seconds: float, *, settings: Settings | None = None) -> list[dict[str, Any]]:
     """A row for each load: missed deadlines and lateness of the daemon's loop over `seconds` [s],
     of an empty loop under the same load, and the number of recorded ticks that replay identically.
 
@@ -211,13 +210,11 @@ def run(
         rows = []
         for load in LOADS:
             say(f"{load.what}: {2 * seconds:g} s")
-            rows.append({"load": load.what} | _row(load, rate_hz, seconds, skills, settings, say))
+            rows.append({"load": load.what} | _row(load, rate_hz, seconds, skills, settings))
         return rows
 
 
-def _row(
-    load: Load, rate_hz: int, seconds: float, skills: Path, settings: Settings | None, say: Callable[[str], None]
-) -> dict[str, Any]:
+def _row(load: Load, rate_hz: int, seconds: float, skills: Path, settings: Settings | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
         arguments = ("--joints", "assumed", "--rate", str(rate_hz), "--live", str(port))

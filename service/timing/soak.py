@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from service.client import Client, open_session
 from service.daemon.launch import launched
+from service.process.progress import say
 from service.settings.config import Settings
 from service.timing.loads import running_client, until_following
 from service.timing.probe_processes import family
@@ -24,9 +24,7 @@ WARM_UP = 0.2  # the first 20 % of the duration are not counted
 T_95 = 1.96  # half width of a 95 % interval / standard deviation
 
 
-def run(
-    minutes: float, rate_hz: int, *, settings: Settings | None = None, say: Callable[[str], None]
-) -> dict[str, Any]:
+def run(minutes: float, rate_hz: int, *, settings: Settings | None = None) -> dict[str, Any]:
     """Measure the growth of each process's memory [MB/h] with its interval, open files at start and
     end, and missed deadlines. Raises LoadError and LaunchError.
     """

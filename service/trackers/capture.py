@@ -133,17 +133,16 @@ class Capture:
         return Sample(arrived_ns, received, at)
 
     def _sample(self, key: str, arrived_ns: int, payload: bytes) -> Sample:
-        return Sample(arrived_ns, payload, self._at(key, payload))
-
-    def _at(self, key: str, payload: bytes) -> Vector:
+        """The sample of a hand, the tool or the gripper."""
         message = channels.BY_KEY[key].codec.decode(payload)
         if isinstance(message, PoseStamped):
             if not finite(message.position + message.orientation):
                 raise WireError("a pose that is not finite")
             hands = self.settings.hands_in(message.frame_id)
             is_scaled = is_by_tracker(key, message.frame_id, hands)
-            return UNIT_M[hands.unit if is_scaled else "m"] * np.array(message.position)
-        return np.array(message.position[:1])
+            at = UNIT_M[hands.unit if is_scaled else "m"] * np.array(message.position)
+            return Sample(arrived_ns, payload, at)
+        return Sample(arrived_ns, payload, np.array(message.position[:1]))
 
     @property
     def missing(self) -> list[str]:

@@ -16,6 +16,7 @@ from service.trackers.web_server import HTML, INLINE, JAVASCRIPT, ServerCertific
 
 PAGE_FOLDER = Path(__file__).parent
 WORKER = "link_worker.js"  # a thread of its own in the browser
+HEADSET_FRAME = "webxr"  # x to the right, y up, -z ahead of where the headset was when its floor was set, metres
 UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with its token."
 
 
@@ -67,3 +68,11 @@ class HandsPage:
             return answer(403, NO_TOKEN)
         socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"
         return answer(200, text, kind=kind, policy=f"connect-src 'self' {socket}; {policy}")
+
+
+class HeadsetPage(HandsPage):
+    """The page by which a headset's browser is the tracker: hands by WebXR, and the cell drawn
+    around the person.
+    """
+
+    page, scripts, frame = "headset.html", ("link", "controls", "scene"), HEADSET_FRAME

@@ -9,14 +9,13 @@ from service.timing import loads, soak
 from support.cell import told
 
 pytestmark = pytest.mark.timeout(180)
-QUIET = {"say": lambda line: None}
 
 
 @pytest.mark.timed
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
     monkeypatch.setattr(loads, "large_skill", bytes)
-    (row,) = loads.run(500, 1.0, **QUIET)
+    (row,) = loads.run(500, 1.0)
     assert row["mode"] == "follow"
     assert row["ticks"] == pytest.approx(500, abs=150)
     assert row["identical"] == row["recorded"] > 0
@@ -37,7 +36,7 @@ def test_a_leak_is_told_from_noise() -> None:
 
 @pytest.mark.timed
 def test_soak_reports_each_process() -> None:
-    report = soak.run(0.12, 500, **QUIET)
+    report = soak.run(0.12, 500)
     assert set(report["processes"]) == {"daemon", "fork server", "scribe", "skill worker"}
     assert report["lost"] == report["restarts"] == 0
     assert "MB/h" in soak.text(report)

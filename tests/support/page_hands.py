@@ -17,7 +17,7 @@ from service.contract.cdr import decode_pose
 from service.contract.messages import PoseStamped
 from service.trackers.cell_view import Latest
 from service.trackers.hand_message import HANDS_LAYOUT, HANDS_MAGIC
-from service.trackers.headset_page import HeadsetPage
+from service.trackers.hands_page import HeadsetPage
 from service.trackers.web_server import Address
 
 PALM = (0.1, 1.0, -0.4, 0.0, 0.0, 0.6, 0.8, 0.12, 1.02, -0.5, 0.03, 0.0)

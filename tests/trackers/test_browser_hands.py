@@ -25,8 +25,7 @@ from service.contract.messages import WireError
 from service.trackers import browser_hands
 from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
 from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
-from service.trackers.hands_page import WORKER
-from service.trackers.headset_page import HeadsetPage
+from service.trackers.hands_page import WORKER, HeadsetPage
 from service.trackers.web_server import FOREIGN, server_certificate
 from support.cell import told
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page

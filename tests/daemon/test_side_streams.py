@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import time
 
 import zenoh
 
-from service.contract.images import decode_image
-from service.daemon.foreign_streams import ForeignStreams
+from service.contract.images import decode_image, image_in
+from service.daemon.side_streams import WAITING_IMAGES, SideStream
 from support.pictures import grey
 
 
@@ -15,9 +16,14 @@ def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple
     near, far = sessions
     came: list[tuple[str, bytes]] = []
     said: list[str] = []
-    streams = ForeignStreams(
-        near, ("camera/front", "camera/side"), send=lambda key, data, _: came.append((key, data)), say=said.append
-    )
+
+    def pass_on(key: str, payload: bytes, now_ns: int) -> None:
+        came.append((key, image_in(payload, now_ns)))
+
+    streams = [
+        SideStream(near, key, functools.partial(pass_on, key), said.append, waiting=WAITING_IMAGES)
+        for key in ("camera/front", "camera/side")
+    ]
     sent = [("camera/front", grey(10)), ("camera/front", b"nonsense"), ("camera/front", b"nonsense")]
     sent += [("camera/front", grey(20)), ("camera/side", grey(30, kind="PNG")), ("camera/other", grey(40))]
     deadline = time.monotonic() + 20.0
@@ -27,7 +33,8 @@ def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple
             for key, payload in sent:
                 far.put(key, payload)
             time.sleep(0.3)
-        streams.poll()
+        for stream in streams:
+            stream.poll()
     assert [(key, decode_image(data).data) for key, data in came[:3]] == [
         (key, payload) for key, payload in sent[:-1] if payload != b"nonsense"
     ]
