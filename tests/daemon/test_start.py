@@ -27,7 +27,7 @@ from service.daemon.launch import LaunchError, launched
 from service.daemon.start import AHEAD_NICE, LOG_EVERY_S, Startup, starting
 from service.settings.config import Files, Settings
 from service.settings.network import Network
-from support.cell import serving
+from support.cell import LISTENING, serving
 from support.paths import ROOT
 
 COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
@@ -128,9 +128,10 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
 def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that(tmp_path: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("this user may not put a process ahead of others")
-    command = [sys.executable, "-m", "service", "serve", "--listen", "tcp/127.0.0.1:0", "--record", str(tmp_path)]
-    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as service:
+    files = f'[files]\nstate = "{tmp_path / "state"}"\nrecord = "{tmp_path / "recordings"}"\n'
+    (tmp_path / "cell.toml").write_text(LISTENING + files)
+    command = [sys.executable, "-m", "service", "serve", "--config", str(tmp_path / "cell.toml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as service:
         begun = set()
         assert service.stdout is not None
         while not select.select([service.stdout], [], [], 0.02)[0]:
