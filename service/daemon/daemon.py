@@ -194,7 +194,7 @@ class Daemon:
             self._streams.close()
             self._session.close()  # type: ignore[no-untyped-call]
             missing = self._scribe.close()
-            recording = self._scribe.status()["recording"]
+            recording = self._scribe.newest_recording
             kept = f"its newest recording is {recording}" if recording else "it recorded nothing"
             log.info("ended: the daemon of cell %s; %s", self._settings.cell, kept)
             if missing:

@@ -376,6 +376,15 @@ def from_memory(fd: int) -> list[memoryview]:
     return parts
 
 
+def descriptors(ancillary: Iterable[tuple[int, int, bytes]]) -> list[int]:
+    """The descriptors in the ancillary data of `recvmsg`."""
+    found: list[int] = []
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            found += [fd for (fd,) in struct.iter_unpack("=i", data)]
+    return found
+
+
 if __name__ == "__main__":
     with socket.socket(fileno=int(sys.argv[1])) as _control:
         _serve(_control)

@@ -53,7 +53,6 @@ LIBRARY_OPTIONS = {
     "NO_COLOR": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
-MAX_SENT_FILES = 16  # of a message
 SOCKET_POLL_S = 0.02  # polling, because to wake a blocked reader costs the sender 25 µs per tick
 
 
@@ -265,18 +264,21 @@ def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
     )
 
 
-def _receive(source: socket.socket) -> tuple[bytes, list[bytes]]:
+def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
     """The next message and the files sent with it; an empty message if the other side closed."""
     while True:
         try:
-            message, descriptors, _, _ = socket.recv_fds(source, MAX_PACKET_BYTES, MAX_SENT_FILES, socket.MSG_DONTWAIT)
-            return message, [bytes(child.from_memory(fd)[0]) for fd in descriptors]
+            size, ancillary, _, _ = source.recvmsg_into([buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT)
+            break
         except BlockingIOError:
             time.sleep(SOCKET_POLL_S)
+    files = [bytes(child.from_memory(fd)[0]) for fd in child.descriptors(ancillary)]
+    return bytes(memoryview(buffer)[:size]), files
 
 
 def _work(source: socket.socket) -> None:
-    first, skills = _receive(source)
+    buffer = bytearray(MAX_PACKET_BYTES)
+    first, skills = _receive(source, buffer)
     setup = msgspec.json.decode(first, type=ScribeSetup)
     waiting: deque[tuple[bytes, list[bytes]]] = deque()
     ended = threading.Event()
@@ -285,7 +287,7 @@ def _work(source: socket.socket) -> None:
         with contextlib.suppress(OSError):  # an ordinary weight: it needs little time, and its queue shows the backlog
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
-            while (received := _receive(source))[0]:
+            while (received := _receive(source, buffer))[0]:
                 waiting.append(received)
                 while len(waiting) >= MAX_WAITING:
                     time.sleep(SOCKET_POLL_S)

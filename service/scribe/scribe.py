@@ -80,6 +80,7 @@ class Scribe:
         self._started = 0.0
         self._memory: dict[int, tuple[bytes, int]] = {}
         self._report = ScribeReport()
+        self.newest_recording: str | None = None  # the path, also while no recording can be written
         self._errors: deque[str] = deque(maxlen=5)
 
     def start(self, *, skill: bytes, state: Record | None) -> None:
@@ -318,6 +319,7 @@ class Scribe:
         with contextlib.suppress(OSError):
             while data := self._child.socket.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT):
                 self._report = msgspec.json.decode(data, type=ScribeReport)
+                self.newest_recording = self._report.recording or self.newest_recording
                 self._progress.report()
                 self._errors.extend(self._report.errors)
                 self._listens = True

@@ -228,6 +228,7 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
                 pass
         status = one.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
         assert status["recording"] is None
+        assert one.scribe.newest_recording == str(*small_disk.glob("*.mcap"))
         full = [error for error in status["errors"] if error.startswith("recording to ")]
         assert len(full) == 1
         assert "No space left on device" in full[0]
