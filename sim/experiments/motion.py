@@ -279,10 +279,15 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
     return list(shared_out(measure, tasks, options.workers, prepare=begin))
 
 
+def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
+    """The tasks of ours and of the chases on these hands."""
+    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
+    return [(name, SHIPPED, one) for name in names for one in hands]
+
+
 def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str, dict[str, dict[str, float]]]:
     """The errors with each shipped arm by group, as of `_compared`."""
-    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
-    tasks, out = [(name, SHIPPED, one) for name in names for one in hands], {}
+    tasks, out = _beside_chases(hands), {}
     for arm in ARMS:
         prepare(options.share, arm)  # of this process, which measures if there is one worker
         found = _measured(tasks, replace(options, arm=arm))
@@ -319,8 +324,7 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
     """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
     harder = [("ours", SHIPPED, one) for one in hands if one.group in HARDER_GROUPS]
     hands = [one for one in hands if one.group in FLOOR_GROUPS]
-    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
-    found = _measured([(name, SHIPPED, one) for name in names for one in hands], options)
+    found = _measured(_beside_chases(hands), options)
     takes = Counter(one.person for one in hands if one.group == "clean")
     found += [
         replace(one, group=WITH_JUMPS, error_rms_mm=one.error_with_jumps_mm) for one in found if one.group == "recorded"
