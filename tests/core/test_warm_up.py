@@ -66,7 +66,7 @@ from sim.script import HandScript
 worker = SkillWorker()
 before = compiled_by(skill_of(Path(sys.argv[1])))  # as a daemon loads it
 loaded = worker.load(Path(sys.argv[1]), timeout_s=60.0)
-adapted = worker.adapt(loaded, Scene().via_points(), tolerance=0.05, timeout_s=60.0)
+adapted = worker.adapt(loaded, Scene().via_points(), tolerance=0.05)
 worker.close()
 for skill in (loaded.for_loop(), adapted.for_loop()):
     played(HandScript(Scene(), seed=1), lambda bench: skill, rate_hz=100)

@@ -294,7 +294,7 @@ REASONS = {
     "a folder": ("Is a directory; a file needed, and that is a folder",),
     "a pipe": ("it is not a file",),
     "a huge file": (f"it has {1 << 40} bytes, at most {MAX_STATE_BYTES} accepted",),
-    "a link to itself": ("Too many levels of symbolic links",),
+    "a link to itself": ("Too many levels of symbolic links; a link that leads to a file or folder needed",),
 }
 
 

@@ -136,11 +136,14 @@ def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that
         assert service.stdout is not None
         while not select.select([service.stdout], [], [], 0.02)[0]:
             begun.add(os.getpriority(os.PRIO_PROCESS, service.pid))
-        processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
-        kept = {one.name(): one.nice() for one in processes}
+        kept: dict[str, int] = {}
+        end_s = time.monotonic() + 20.0
+        while not kept.keys() >= {"scribe", "skill worker"} and time.monotonic() < end_s:
+            processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
+            kept = {one.name(): one.nice() for one in processes}
         service.terminate()
     assert min(begun) == AHEAD_NICE
-    assert len(kept) >= 3  # the scribe and the skill worker are children
+    assert kept.keys() >= {"scribe", "skill worker"}
     assert all(nice >= 0 for nice in kept.values()), kept
 
 
