@@ -105,6 +105,17 @@ def _sum(a: Array, b: Array) -> float:
 
 
 @compiled
+def add_table(x: Array, table: Array, scale: float, values: Array, room: Array, out: Array) -> None:
+    """Add sum_r exp(-scale |x - x_r|^2) w_r at x (I,), in the kernel's coordinates, to `out` (O,).
+
+    `values` (P,), which receives the kernel row, and `room` (P,) are working memory.
+    """
+    _kernel_values(x, table, scale, values, room)
+    for o in range(len(out)):
+        out[o] += _sum(values, table[len(x) + o])
+
+
+@compiled
 def means(
     queries: Array,
     table: Array,

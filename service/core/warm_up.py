@@ -25,7 +25,7 @@ from service.core.skill.memory import delayed, moving_features, turning
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 from service.core.skill.stages import MOST_STAGES
-from service.core.skill.support import LocalErrors
+from service.core.skill.support import error_table, local_scatter
 from service.core.skill.unseen import deviation_m
 from service.settings.config import Settings
 
@@ -73,7 +73,7 @@ def _rarely(settings: Settings, urdf: str) -> None:
     Separation(settings, urdf).share(still)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
-    LocalErrors(np.zeros((6, 1)), np.zeros((1, 3)), np.zeros(6), 1.0).covariances(np.zeros((1, 6)))
+    local_scatter(np.zeros(6), np.zeros(6), error_table(np.zeros((1, 6)), np.zeros((1, 3))), 1.0, np.empty((3, 3)))
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 

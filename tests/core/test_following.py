@@ -11,7 +11,6 @@ from service.core.frame import blank
 from service.core.intake.stage import Intake
 from service.core.setpoint.stage import SetpointGenerator
 from service.core.setpoint.tracker import tracker_gains
-from service.core.setpoint.tuning import LATE_STOP_MAX_M
 from service.core.skill.model import Target
 from service.settings.config import Settings, ToolSettings
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
@@ -110,26 +109,6 @@ def test_a_target_that_goes_to_and_fro_faster_than_the_arm_can_is_still_met(
     states, _ = driven(targets, costs=costs)
     off = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
     assert off[700:].max() < most_m
-
-
-def test_a_stop_that_a_tracker_shows_late_is_planned_for_earlier() -> None:
-    """Of a target that stops at once, from 0.4 m/s. While it moves, that costs LATE_STOP_MAX_M."""
-    velocity, passed, behind = np.array([0.4, 0.0, 0.0]), [], []
-    for response_s in (0.0235, 0.04):
-        generator, state, farthest = SetpointGenerator(Settings(tool=TOOL)), blank(STATE), 0.0
-        generator.begin(state, at_rest(MIDDLE))
-        state["response_s"] = response_s
-        for k in range(700):
-            here = MIDDLE + velocity * min(k, 300) * PERIOD_S
-            target = Target(here, velocity * (k < 300), np.zeros(3), clamped=False)
-            generator.step(state, target, BOX, FREE, 1.0)
-            farthest = max(farthest, float(state["setpoint"][0, 0] - here[0]))
-            if k == 299:
-                behind.append(float(here[0] - state["setpoint"][0, 0]))
-        passed.append(farthest)
-    assert passed[0] > 0.005
-    assert passed[1] < min(0.007, 0.6 * passed[0])
-    assert behind[1] - behind[0] < LATE_STOP_MAX_M + 0.002
 
 
 def test_a_setpoint_at_rest_on_its_target_stays_there_to_the_bit() -> None:

@@ -56,7 +56,6 @@ STATE = (
     Field("noise_variance", "float64", (2,)),  # variance of the samples on each axis [m²]
     Field("sample_interval_s", "float64", (2,)),  # interval between the two newest samples
     Field("gripper_wish", "float64"),  # newest closure that a tracker wished, 0 to 1; -1: none yet
-    Field("response_s", "float64"),  # time in which the hand filter follows a change of motion
     Field("past_samples", "float64", (2, 3, 3)),  # the last three positions, newest first [m]
     Field("kept_positions", "float64", (2, KEPT, 3)),
     Field("kept_means", "float64", (2, KEPT, MODES, STATES, 3)),  # `mode_means` after each retained sample

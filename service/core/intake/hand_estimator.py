@@ -29,8 +29,6 @@ from service.core.intake.tuning import (
     DELAY_TOLERANCE_S,
     END_SHARE,
     LEAST_NOISE_M,
-    MAX_LATE_S,
-    MODE_INTENSITIES_M2PS5,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     REAPPEARED_VARIANCE_SHARE,
@@ -112,7 +110,7 @@ class HandEstimator:
         """Advance both hands by some ticks. A hand without a sample for `stale_ticks` is assumed to
         stand still.
         """
-        _advance_both(as_array(state), stale_ticks, self._model(ticks), self._models, self._period_s)
+        _advance_both(as_array(state), stale_ticks, self._model(ticks), self._models)
 
 
 @compiled
@@ -151,13 +149,12 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, one: Records, models: Records, period_s: float) -> None:
+def _advance_both(states: Records, stale_ticks: int, one: Records, models: Records) -> None:
     """Advance modes, estimate and stillness of both hands to the current tick. `one` (1,) is the
     record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
     stands still: its velocity, acceleration and tremor are set to zero.
     """
     state, over = states[0], one[0]
-    state.response_s = _response_s(states, period_s)
     for side in range(2):
         hand = state.hands[side]
         if state.tremors[side, 0] == 0.0:  # a state that an earlier version recorded
@@ -211,25 +208,6 @@ def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> 
     apart = squared_distance(position, state.hands[side, 0])
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
     return bool(is_fresh(states, side, unseen_ticks) and apart < REAPPEARED_VARIANCE_SHARE * variance)
-
-
-@compiled
-def _response_s(states: Records, period_s: float) -> float:
-    """Time [s] in which the filter follows a change of motion: (r Δ / q)^(1/6), the larger one of
-    both hands.
-
-    r is the noise variance [m²], Δ the mean interval of the retained samples [s], at most
-    MAX_LATE_S, and q the intensity of the mode CHANGE [m²/s⁵]. The form is that of the steady-state
-    filter of a Wiener process of acceleration.
-    """
-    state, slowest = states[0], 0.0
-    for side in range(2):
-        more = max(state.kept[side] - 1, 0)  # many intervals are averaged, so that one late sample matters little
-        if more > 0:
-            passed = state.kept_ticks[side, slot(states, side, 0)] - state.kept_ticks[side, slot(states, side, more)]
-            each_s = min(passed * period_s / more, MAX_LATE_S)
-            slowest = max(slowest, state.noise_variance[side] * each_s / MODE_INTENSITIES_M2PS5[CHANGE])
-    return float(np.rint(slowest ** (1.0 / 6.0) * ROUND_TO) / ROUND_TO)
 
 
 @compiled

@@ -20,12 +20,9 @@ from service.core.setpoint.tuning import (
     GAP_FREE_M,
     GAP_SLOW_M,
     HAND_BRAKE_MPS2,
-    LATE_STOP_MAX_M,
-    LATE_STOP_SHARE,
     MEETING_BRAKE_LEAST_SHARE,
     PLANNED_BRAKE_SHARE,
     PLANNED_SPEED_SHARE,
-    PROMPT_RESPONSE_S,
     STOP_JERK_ERROR_M,
     STOP_OVERSHOOT_M,
 )
@@ -78,8 +75,7 @@ def lead(
     target[0], target[1], target[2] = position, velocity, acceleration
     state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
     jerk, ahead, dt = np.empty(3), np.empty((3, 3)), config.period_s
-    late_s = LATE_STOP_SHARE * max(0.0, state.response_s - PROMPT_RESPONSE_S)
-    met = _track(setpoint, target, parameters, costs, slow, late_s, box, jerk)
+    met = _track(setpoint, target, parameters, costs, slow, box, jerk)
     for i in range(3):
         x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
@@ -95,14 +91,7 @@ def lead(
 
 @compiled
 def _track(
-    setpoint: Vector,
-    target: Vector,
-    parameters: Records,
-    costs: Vector,
-    slow: float,
-    late_s: float,
-    box: Vector,
-    jerk: Vector,
+    setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, box: Vector, jerk: Vector
 ) -> int:
     """Write the tracker's jerk (3,) [m/s³], reduced along the motion where a barrier requires it.
 
@@ -123,8 +112,7 @@ def _track(
         top       speed that is planned with, `slow` times the limit of tool and joints
 
         stop      h = w + o - stop_distance(v, a, B, C)
-                  o    = STOP_OVERSHOOT_M - min(late_s v, LATE_STOP_MAX_M)
-                         + stop_room v_p² / (2 HAND_BRAKE_MPS2)
+                  o    = STOP_OVERSHOOT_M + stop_room v_p² / (2 HAND_BRAKE_MPS2)
                   v_p  = max(0, v_t + DECELERATION_LOOKAHEAD_S min(a_t, 0))    predicted speed
         meeting   h = w + STOP_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
                   M = max(B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
@@ -132,10 +120,9 @@ def _track(
 
         retained = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
 
-    In the stop, w grows by min(v_p, v) dt in a period. `late_s` is the additional delay with which
-    the hand tracker shows a stop. The meeting applies only while the setpoint is faster than its
-    target. The jerk is at least -C and, for stop and meeting, at least the one with which the
-    setpoint just comes to rest; below that one it would reverse.
+    In the stop, w grows by min(v_p, v) dt in a period. The meeting applies only while the setpoint
+    is faster than its target. The jerk is at least -C and, for stop and meeting, at least the one
+    with which the setpoint just comes to rest; below that one it would reverse.
 
     Returns PLANNED if a barrier reduced the jerk, else 0.
     """
@@ -167,8 +154,7 @@ def _track(
     change = min(change, STOP_JERK_ERROR_M * gains[0])
     top = slow * PLANNED_SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
     predicted_speed = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
-    overshoot = STOP_OVERSHOOT_M - min(late_s * speed, LATE_STOP_MAX_M)
-    overshoot += config.stop_room * predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
+    overshoot = STOP_OVERSHOOT_M + config.stop_room * predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
     # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from service.core.arm.tuning import PLANNED_LIMIT_SHARES, POSITION_GAIN_PER_S, TURN_GAIN_SHARE
 from service.core.decision.tuning import PROGRESS_SHARE, STUCK_GAP_M
-from service.core.intake.tuning import LEAST_NOISE_M, MODE_INTENSITIES_M2PS5
+from service.core.intake.tuning import LEAST_NOISE_M
 
 # The tracker: a linear-quadratic one, whose input is jerk.
 # 0.5 to 2. More: the setpoint follows faster. Less: the joints follow calmly.
@@ -21,11 +21,6 @@ HAND_BRAKE_MPS2 = 5.0  # [m/s²] largest mean deceleration of a hand, from when 
 STOP_OVERSHOOT_M = 2.0 * LEAST_NOISE_M  # the setpoint may stop this far beyond that: targets at rest differ by noise
 # 0.03 to 0.3. More: ends of reaches are braked early. Less: stops are passed.
 DECELERATION_LOOKAHEAD_S = 0.12  # predicted speed = speed + this * min(acceleration, 0)
-PROMPT_RESPONSE_S = float((LEAST_NOISE_M**2 / 30.0 / MODE_INTENSITIES_M2PS5[2]) ** (1 / 6))  # good tracker, 30 Hz
-# 0 to 10. More: slow trackers overshoot less. Less: slow trackers lag less.
-LATE_STOP_SHARE = 4.0  # delay with which a slow tracker shows a stop / (response time - PROMPT_RESPONSE_S)
-# 0 to 0.02. More: slow trackers overshoot less. Less: slow trackers lag less.
-LATE_STOP_MAX_M = 0.008  # largest travel that is allowed for such a delay
 
 # Smallest planned braking / largest braking, to meet a target that brakes too: the share of the
 # jerk that planning leaves.

@@ -120,7 +120,7 @@ class HandsKMP:
         deviation = _rounded(found.mean, found.velocity, found.acceleration, covariance, out)
         if known is None and self.errors is not None:
             errors, at = self.errors, np.ascontiguousarray(moving[0])
-            local_scatter(at, errors.stretch, errors.inputs, errors.errors, errors.unknown_std_m, out[3:])
+            local_scatter(at, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
         if known is not None and self.errors is not None:
             deviation = math.nan
@@ -187,7 +187,7 @@ class HandsKMP:
         if self.clock is not None:
             out["task_clock"] = self.clock.numbers
         if self.errors is not None:
-            out["error_inputs"] = np.ascontiguousarray(self.errors.inputs.T)
+            out["error_inputs"] = self.errors.inputs
             out["error_samples"] = self.errors.errors
             out["error_unknown_std"] = np.array(self.errors.unknown_std_m)
         return out

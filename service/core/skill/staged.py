@@ -4,7 +4,6 @@ hand has covered to the share that the tool covers.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from kmp import KMP
 from kmp.arrays.immutable import Immutable, frozen
+from kmp.loops.mean import table_of
 from kmp.named_arrays import from_arrays
 from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
@@ -36,13 +36,19 @@ from service.core.skill.stages import (
     scatter,
     tools_at,
 )
+from service.core.skill.support import error_table
 from service.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
 from service.core.skill.task_clock import TaskClock
-from service.core.skill.tuning import FIRST_STAGE_ODDS, PULL_SHARPNESS_PER_M2, STAGE_DISTANCE, STAGE_DISTANCE_BESIDE
+from service.core.skill.tuning import (
+    ERROR_STAGE_DISTANCE,
+    FIRST_STAGE_ODDS,
+    PULL_SHARPNESS_PER_M2,
+    STAGE_DISTANCE_BESIDE,
+)
 from service.core.skill.via_points import pulls_through, sharpness_between
 
 NO_PULLS = frozen(np.empty((0, 9)))  # without via-points of other names
-NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance
+NO_ERRORS = frozen(np.empty((0, 6)))  # to leave out the covariance; as rows and as a table
 RESTING_TEMPO = np.array([*STILL, 0.0])  # tempo of two hands that rest and have not begun
 
 
@@ -63,10 +69,9 @@ class Placed(Immutable):
     """Stages of a task at their via-points in a scene, with the primitive as plain arrays: K
     stages, R centres, M errors, X pulls.
 
-    * `rows` (R, 3 + 4 + 1): a centre's shares x (2,) of left and right hand, its stage, its weights
-      (4,), and its clock times the clock's weight.
-    * `errors` (M, 3 + 3): shares x (2,), stage, and the tool's error [m] in held-out
-      demonstrations.
+    * `centres`: the primitive's centres and weights as a table of `kmp.loops.mean`, see
+      `stages.tools_at`.
+    * `errors`: the tool's errors in held-out demonstrations as a table, see `stages.scatter`.
     * `pulls` (X, 9): hands (6,) [m] and weight (3,) [m] of the kernels by which other via-points
       move the tool, see `via_points.pulls_through`.
 
@@ -76,12 +81,12 @@ class Placed(Immutable):
 
     stages: Records  # (K,) of STAGE
     sizes: Records  # (1,) of PLACED
-    rows: Vector
+    centres: Vector
     errors: Vector
     pulls: Vector
 
     def __post_init__(self) -> None:
-        for part in (self.stages, self.sizes, self.rows, self.errors, self.pulls):
+        for part in (self.stages, self.sizes, self.centres, self.errors, self.pulls):
             frozen(part)
 
     @classmethod
@@ -96,22 +101,25 @@ class Placed(Immutable):
         unknown: Unknown | None = None,
     ) -> Placed:
         """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
-        from their segments, root mean square; `errors` (M, 6) those of the primitive. Its last
-        input is the `clock`, if there is one.
+        from their segments, root mean square; `errors` (M, 3 + 3) the tool's errors [m], after
+        the hands' shares and the stage. The primitive's last input is the `clock`, if there is one.
         """
         sizes, stages = structured(1, PLACED), task.stages(at, off)
         if unknown is not None:
             sizes["unknown_std"] = unknown.std_m
             scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
             stages["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
-        sizes["scale"], sizes["likeness"] = scale_of(primitive), likeness(primitive)
+        sizes["scale"], _ = primitive.kernel.coordinates(1)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
-        last, times = 2 + len(off), np.zeros(len(primitive.centres))
-        if clock is not None:
-            sizes["clock_weight"], times = clock.weight, primitive.centres[:, last]
-        along, stage = primitive.centres[:, :2], primitive.centres[:, 2:last].argmax(axis=1)
-        rows = np.column_stack([along, stage, primitive.weights.reshape(-1, OUTPUTS), times])
-        return cls(stages, sizes, rows, np.array(errors, order="C"), NO_PULLS)
+        inputs, count = primitive.centres, len(off)
+        if clock is None:
+            inputs = np.column_stack([inputs, np.zeros(len(inputs))])
+        else:
+            sizes["clock_weight"] = clock.weight
+        centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
+        apart = ERROR_STAGE_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
+        wrong = error_table(np.hstack([errors[:, :2], apart]), errors[:, 3:]) if len(errors) else NO_ERRORS
+        return cls(stages, sizes, centres, wrong, NO_PULLS)
 
     def pulled(self, pulls: Vector) -> Placed:
         """These stages with pulls (X, 9) that act in all of them."""
@@ -157,9 +165,10 @@ class Placed(Immutable):
         """Tool positions (K, 3) [m] for hands (6 or 24,) in all stages with at least
         LEAST_STAGE_PROBABILITY.
         """
-        out = np.empty((len(self.stages), 3))
-        tools_at(np.ascontiguousarray(hands), tempo, belief, self.stages, self.sizes, self.rows, pulls, out)
-        return out
+        out = np.empty((1, len(self.stages), 3))
+        now, at = np.array(hands[None], order="C"), np.array(tempo[None], order="C")
+        tools_at(now, at, belief, self.stages, self.sizes, self.centres, pulls, out)
+        return np.asarray(out[0])
 
     def gates_m(self, hands: Vector) -> Vector:
         """Distances (T,) [m] of hands (T, 6) from the task, see `stages.off_all`."""
@@ -181,18 +190,6 @@ def rows_of(clock: TaskClock, stages: Records) -> Vector:
     out = np.tile(clock.numbers, (len(stages), 1))
     out[:, 6:] = stages["begins"].reshape(-1, 6)
     return out
-
-
-def scale_of(primitive: KMP) -> float:
-    """Scale of the primitive's kernel exp(-scale |difference|²)."""
-    return float(primitive.kernel.coordinates(1)[0])
-
-
-def likeness(primitive: KMP) -> float:
-    """Factor of the kernel between two stages, exp(-2 scale STAGE_DISTANCE²): stages are inputs
-    STAGE_DISTANCE along axes of their own.
-    """
-    return math.exp(-2.0 * scale_of(primitive) * STAGE_DISTANCE**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,12 +283,12 @@ class StagedKMP:
             hands["is_turning"] = 1
             turning(seen.turns, seen.turn_lag_s, hands["turning"][0])
         errors = at.errors if known is None else NO_ERRORS
-        gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.rows, at.pulls, errors, out)
+        gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.centres, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
         at = self.placed
-        return elsewhere(now, stillness, period_s, belief, unprimed, at.stages, at.sizes, at.rows)
+        return elsewhere(now, stillness, period_s, belief, unprimed, at.stages, at.sizes, at.centres)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))

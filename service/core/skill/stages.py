@@ -16,6 +16,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.loops.kernel_row import add_weighted
+from kmp.loops.mean import add_table
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
 from service.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
@@ -24,14 +25,14 @@ from service.core.skill.tuning import (
     AMBIGUOUS_M,
     CALM_MPS,
     DIRECTION_SPEED_MPS,
-    ERROR_WIDTH,
+    ERROR_SCALE,
+    ERROR_STAGE_DISTANCE,
     FIRST_STAGE_ODDS,
     FULL_SEGMENT_M,
     LEAST_STAGE_PROBABILITY,
     LEAST_STD_M,
     MAX_SQUARED_DEVIATION,
     MAX_TARGET_MPS2,
-    OTHER_STAGE_ERROR_WEIGHT,
     PULL_SHARPNESS_PER_M2,
     REST_SHARPNESS,
     SAMPLE_CORRELATION_S,
@@ -40,6 +41,7 @@ from service.core.skill.tuning import (
     STAGE_ASTRAY_PER_S,
     STAGE_CHANGE_PER_S,
     STAGE_CYCLE_PER_S,
+    STAGE_DISTANCE,
     STAGE_END_M,
     SUPPORT_MASS,
     UNSURE_M,
@@ -50,6 +52,7 @@ from service.core.vectors import dot, norm, squared_distance
 MOST_STAGES = 64  # stages for which the state has room
 STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
 OUTPUTS = 4  # outputs of the primitive: the tool's share of its segment, and its offset x y z [m]
+PRODUCTS = 10  # 1, and the products e_i e_j of an error's components
 # One stage as compiled functions read it: segments of the left and the right hand and of the tool.
 STAGE = np.dtype(
     [
@@ -72,9 +75,8 @@ STAGE = np.dtype(
 PLACED = np.dtype(
     [
         ("scale", np.float64),  # scale of the kernel exp(-scale |difference|²)
-        ("likeness", np.float64),  # factor of the kernel for a centre of another stage
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
-        ("clock_weight", np.float64),  # as an input, a second in the stage counts as this share of it
+        ("clock_weight", np.float64),  # as an input, a second in the stage counts as this share of it; 0: no clock
         ("unknown_std", np.float64),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
         ("pulls", np.int64),  # number of pulls that act in all stages; they are the first rows
@@ -283,60 +285,59 @@ def add_followed(hands: Vector, share: float, stage: Record, out: Vector) -> Non
 
 
 @compiled
-def _tool_in(
-    hands: Vector, tempo: Vector, k: int, stages: Records, size: Record, rows: Vector, pulls: Vector, out: Vector
-) -> None:
-    """Tool position in stage k for hands (6 or 24,) with the `tempo` (3,), written to `out` (3,)
-    [m]. The last 18 of 24 numbers are the hands' rotation matrices. The tempo is the stillness of
-    both hands, and the clock [s] of the stage.
+def _tool_of(hands: Vector, share: float, offset: Vector, stage: Record, size: Record, pulls: Vector) -> Vector:
+    """Tool position (3,) [m] in a stage for hands (6 or 24,), of which the tool has covered a
+    `share` s, with an `offset` δ (3,) [m]:
 
-    With the inputs x (3,), the hands' shares of the stage and the clock times `clock_weight`, the
-    primitive gives the tool's share s and its offset δ (3,) [m] by equation (8) of Huang et al.
-    2019, over its R centres c_r with the weights W_r (4,):
-
-        (s, δ) = prior + Σ_r g_r exp(-scale |x - c_r|²) W_r,   g_r = 1 in stage k, else `likeness`
         tool = t + s u + δ
 
     t and u are the tool's first via-point and its segment. Added are the hands that the tool
     follows (`add_followed`) and the `pulls` (X, 9) of other via-points, those that act in all
-    stages and those of stage k (`via_points.pulls_through`).
+    stages and those of this stage (`via_points.pulls_through`).
     """
-    stage, found = stages[k], np.empty(OUTPUTS)
-    one, other = along_both(hands, tempo, stage)
-    found[:], time = size["prior"], size["clock_weight"] * tempo[2]
-    for r in range(len(rows)):
-        square = (one - rows[r, 0]) ** 2 + (other - rows[r, 1]) ** 2 + (time - rows[r, 3 + OUTPUTS]) ** 2
-        value = math.exp(-size["scale"] * square)
-        if rows[r, 2] != k:
-            value *= size["likeness"]
-        for o in range(OUTPUTS):
-            found[o] += value * rows[r, 3 + o]
-    share = found[0]
-    for i in range(3):
-        out[i] = stage["tool"][i] + share * stage["tool_way"][i] + found[1 + i]
+    out: Vector = stage["tool"] + share * stage["tool_way"] + offset
     add_followed(hands, min(max(share, 0.0), 1.0), stage, out)
     if len(pulls):
         add_weighted(hands[:6], pulls[: size["pulls"]], PULL_SHARPNESS_PER_M2, out)
         add_weighted(hands[:6], pulls[stage["pulled"][0] : stage["pulled"][1]], stage["sharpness"], out)
+    return out
 
 
 @compiled
 def tools_at(
     hands: Vector,
-    tempo: Vector,
+    tempos: Vector,
     belief: Vector,
     stages: Records,
     sizes: Records,
-    rows: Vector,
+    centres: Vector,
     pulls: Vector,
     out: Vector,
 ) -> None:
-    """Tool positions in all stages with at least LEAST_STAGE_PROBABILITY, by `_tool_in`, written to
-    `out` (K, 3). The rows of other stages are left as they are.
+    """Tool positions [m] for hands (M, 6 or 24) with the `tempos` (M, 3) in all stages with at
+    least LEAST_STAGE_PROBABILITY, written to `out` (M, K, 3). Those in other stages are left as
+    they are. The last 18 of 24 numbers are the hands' rotation matrices. A tempo is the stillness
+    of both hands, and the clock [s] of the stage.
+
+    The inputs x (2 + K + 1,) are the hands' shares of the stage, STAGE_DISTANCE at the stage's
+    number, and the clock times `clock_weight`. The primitive gives the tool's share s and its
+    offset δ (3,) [m] by equation (8) of Huang et al. 2019, over its `centres` c_r with the weights
+    W_r (4,), a table as in `kmp.loops.mean`:
+
+        (s, δ) = prior + Σ_r exp(-scale |x - c_r|²) W_r
     """
-    for k in range(len(stages)):
+    size, count, padded = sizes[0], len(stages), centres.shape[1]
+    x, found, values, room = np.empty(3 + count), np.empty(OUTPUTS), np.empty(padded), np.empty(padded)
+    for k in range(count):
         if belief[k] >= LEAST_STAGE_PROBABILITY:
-            _tool_in(hands, tempo, k, stages, sizes[0], rows, pulls, out[k])
+            x[:] = 0.0
+            x[2 + k] = STAGE_DISTANCE
+            for m in range(len(hands)):
+                x[0], x[1] = along_both(hands[m], tempos[m], stages[k])
+                x[2 + count] = size["clock_weight"] * tempos[m, 2]
+                found[:] = size["prior"]
+                add_table(x, centres, size["scale"], values, room, found)
+                out[m, k] = _tool_of(hands[m], found[0], found[1:], stages[k], size, pulls)
 
 
 @compiled
@@ -430,12 +431,13 @@ def scatter(
 
         C = Σ_k p_k ((t_k - t)(t_k - t)ᵀ + E_k + P_k) / Σ_k p_k + (std² + LEAST_STD_M²) I
         E_k = (ν σ² I + Σ_m g_km e_m e_mᵀ) / (ν + Σ_m g_km),   ν = SUPPORT_MASS
-        g_km = exp(-½ |x_k - x_m|² / ERROR_WIDTH²), times OTHER_STAGE_ERROR_WEIGHT in another stage
+        g_km = exp(-ERROR_SCALE |x_k - x_m|²)
 
-    t_k are the stages' tool positions (K, 3) with the mean t; x_k are the hands' shares (2,) of
-    stage k. `errors` (M, 6) are rows of x_m (2), stage and the tool's error e_m (3) [m] in held-out
-    demonstrations. Away from all of them, E_k grows to σ², σ = `unknown_std`; if σ is 0, ν is 0.
-    `std` [m] is the standard deviation of the via-points.
+    t_k are the stages' tool positions (K, 3) with the mean t; x_k (2 + K,) are the hands' shares of
+    stage k, and ERROR_STAGE_DISTANCE at the stage's number. `errors` is the table of x_m
+    with the products of the tool's errors e_m in held-out demonstrations (`support.error_table`).
+    Away from all of them, E_k grows to σ², σ = `unknown_std`; if σ is 0, ν is 0. `std` [m] is the
+    standard deviation of the via-points.
 
     P_k = (1 - s)² P_0 + s² P_1 for the tool's share s of its segment, with the covariances P_0 and
     P_1 of the via-points at its ends in the demonstrations; 0 for a via-point of this scene.
@@ -444,26 +446,22 @@ def scatter(
     """
     mass = SUPPORT_MASS if size["unknown_std"] > 0.0 else 0.0
     out[:] = 0.0
-    mean, weights, in_all = np.empty(3), np.empty(len(errors)), 0.0
+    mean, in_all, count, padded = np.empty(3), 0.0, len(stages), errors.shape[1]
+    x, near, values, room = np.empty(2 + count), np.empty(PRODUCTS), np.empty(padded), np.empty(padded)
     expected(belief, tools, mean)
-    for k in range(len(stages)):
+    for k in range(count):
         if belief[k] < LEAST_STAGE_PROBABILITY:
             continue
         in_all += belief[k]
-        one, other = along_both(hands, still, stages[k])
-        total = 1e-9 + mass
-        for m in range(len(errors)):
-            square = (one - errors[m, 0]) ** 2 + (other - errors[m, 1]) ** 2
-            weights[m] = math.exp(-0.5 * square / ERROR_WIDTH**2) * (
-                1.0 if errors[m, 2] == k else OTHER_STAGE_ERROR_WEIGHT
-            )
-            total += weights[m]
+        x[:] = near[:] = 0.0
+        x[0], x[1] = along_both(hands, still, stages[k])
+        x[2 + k] = ERROR_STAGE_DISTANCE
+        add_table(x, errors, ERROR_SCALE, values, room, near)
+        total = 1e-9 + mass + near[0]
         share = _tool_share(tools[k], stages[k]) if mass else 0.0
         for i in range(3):
             for j in range(i, 3):
-                found = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j])
-                for m in range(len(errors)):
-                    found += weights[m] * errors[m, 3 + i] * errors[m, 3 + j] / total
+                found = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j]) + near[1 + 3 * i + j] / total
                 if mass:
                     found += mass * size["unknown_std"] ** 2 / total if i == j else 0.0
                     begin, end = stages[k]["scatter"][0, i, j], stages[k]["scatter"][1, i, j]
@@ -485,7 +483,7 @@ def elsewhere(
     unprimed: Vector,
     stages: Records,
     sizes: Records,
-    rows: Vector,
+    centres: Vector,
 ) -> float:
     """Probability that the task did not begin at its first stage, and the tool belongs more than
     UNSURE_M from where the most probable stage k has it:
@@ -508,14 +506,14 @@ def elsewhere(
     if apart < LEAST_STAGE_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
-    either, tools, tempo = np.empty(count), np.empty((count, 3)), np.zeros(3)
-    tempo[:2] = still
+    either, tools, tempos = np.empty(count), np.empty((1, count, 3)), np.zeros((1, 3))
+    tempos[0, :2] = still
     for k in range(count):
         either[k] = max(unprimed[k], 1.0 if k == most else 0.0)
-    tools_at(now[0], tempo, either, stages, sizes, rows, np.empty((0, 9)), tools)
+    tools_at(now[:1], tempos, either, stages, sizes, centres, np.empty((0, 9)), tools)
     out = 0.0
     for k in range(count):
-        if unprimed[k] >= LEAST_STAGE_PROBABILITY and squared_distance(tools[k], tools[most]) > UNSURE_M**2:
+        if unprimed[k] >= LEAST_STAGE_PROBABILITY and squared_distance(tools[0, k], tools[0, most]) > UNSURE_M**2:
             out += unprimed[k]
     return out
 
@@ -526,7 +524,7 @@ def predicted(
     belief: Vector,
     stages: Records,
     sizes: Records,
-    rows: Vector,
+    centres: Vector,
     pulls: Vector,
     errors: Vector,
     out: Vector,
@@ -545,10 +543,9 @@ def predicted(
     Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
     the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
-    one, steps = seen[0], np.empty((3, 3))
+    one, steps, clock = seen[0], np.empty((3, 3)), seen[0]["clock"]
     hands = np.empty((3, 6 + 18 * one["is_turning"]))
-    tempo, tools, clock = np.empty(3), np.empty((3, len(stages), 3)), one["clock"]
-    tempo[:2] = one["stillness"]
+    tempos, tools = np.empty((3, 3)), np.empty((3, len(stages), 3))
     if one["period_s"] > 0.0:
         recognise(belief, one["now"], one["period_s"], stages, FIRST_STAGE_ODDS)
     _around(one["moving"], hands)
@@ -556,8 +553,10 @@ def predicted(
         _turned_around(one["turning"], hands)
     for n in range(3):
         ahead_s = (n - 1) * MOTION_STEP_S
-        tempo[2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
-        tools_at(hands[n], tempo, belief, stages, sizes, rows, pulls, tools[n])
+        tempos[n, :2] = one["stillness"]
+        tempos[n, 2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
+    tools_at(hands, tempos, belief, stages, sizes, centres, pulls, tools)
+    for n in range(3):
         expected(belief, tools[n], steps[n])
     for i in range(3):
         acceleration = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
@@ -565,8 +564,8 @@ def predicted(
         out[1, i] = (steps[2, i] - steps[0, i]) / (2.0 * MOTION_STEP_S)
         out[2, i] = min(max(acceleration, -MAX_TARGET_MPS2), MAX_TARGET_MPS2)
     out[3:] = 0.0
-    if len(errors):
-        scatter(hands[1], tempo, belief, stages, tools[1], errors, sizes[0], out[3:])
+    if errors.size:
+        scatter(hands[1], tempos[1], belief, stages, tools[1], errors, sizes[0], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
     return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])

@@ -14,6 +14,7 @@ import numpy as np
 from kmp import KMP
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
+from kmp.loops.mean import add_table, table_of
 from service.core.frame import Vector
 from service.core.numerics import PROBABILITY_ROUND_TO
 from service.core.skill.model import LEVELS
@@ -26,19 +27,21 @@ SURVIVAL = -np.log1p(-np.array(LEVELS))  # -log of the share of errors beyond ea
 class LocalErrors(Immutable):
     """Errors e_m of held-out demonstrations at inputs x_m of a primitive.
 
-    * `inputs` (I, M): one row for each input.
+    * `inputs` (M, I).
     * `errors` (M, 3) [m].
     * `stretch` (I,): factors c_i of the kernel exp(-Σ_i (c_i (x_i - x_mi))²).
+    * `table`: both, as in `error_table`.
     * `unknown_std_m`: standard deviation of the tool on each axis where no demonstration was.
     """
 
     inputs: Vector
     errors: Vector
     stretch: Vector
+    table: Vector
     unknown_std_m: float
 
     def __post_init__(self) -> None:
-        for part in (self.inputs, self.errors, self.stretch):
+        for part in (self.inputs, self.errors, self.stretch, self.table):
             frozen(part)
 
     @classmethod
@@ -48,48 +51,43 @@ class LocalErrors(Immutable):
         """
         scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
         factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
-        return cls(np.array(inputs.T, order="C"), np.array(errors, order="C"), factors, unknown_std_m)
+        table = error_table(inputs * factors, errors)
+        return cls(np.array(inputs, order="C"), np.array(errors, order="C"), factors, table, unknown_std_m)
 
     def covariances(self, inputs: Vector) -> Vector:
         """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
         out = np.empty((len(inputs), 3, 3))
         for at, found in zip(np.array(inputs, order="C"), out, strict=True):
-            local_scatter(at, self.stretch, self.inputs, self.errors, self.unknown_std_m, found)
+            local_scatter(at, self.stretch, self.table, self.unknown_std_m, found)
         return out
 
 
+def error_table(inputs: Vector, errors: Vector) -> Vector:
+    """Errors e_m (M, 3) at inputs x_m (M, I) as a table of `kmp.loops.mean`, with the weights 1 and
+    the products of e_m e_mᵀ, row by row.
+    """
+    products = (errors[:, :, None] * errors[:, None, :]).reshape(-1, 9)
+    return table_of(inputs, np.hstack([np.ones((len(errors), 1)), products]))
+
+
 @compiled
-def local_scatter(
-    at: Vector, stretch: Vector, inputs: Vector, errors: Vector, unknown_std_m: float, out: Vector
-) -> None:
+def local_scatter(at: Vector, stretch: Vector, table: Vector, unknown_std_m: float, out: Vector) -> None:
     """Covariance C (3, 3) [m²] of the tool at an input x (I,), written to `out`:
 
         C = (ν σ² I + Σ_m g_m e_m e_mᵀ) / (ν + Σ_m g_m) + LEAST_STD_M² I
         g_m = exp(-Σ_i (c_i (x_i - x_mi))²),   ν = SUPPORT_MASS,   σ = `unknown_std_m`
 
-    So C is the scatter of the errors e_m (M, 3) at similar inputs x_m (I, M), and grows to σ² away
-    from all of them. It is the posterior mean of a variance whose prior σ² weighs as much as ν
-    errors.
+    So C is the scatter of the errors e_m at similar inputs x_m, and grows to σ² away from all of
+    them. It is the posterior mean of a variance whose prior σ² weighs as much as ν errors. `table`
+    is the `error_table` of c_i x_mi.
     """
-    count = errors.shape[0]
-    squares = np.zeros(count)
-    for i in range(len(at)):
-        for m in range(count):
-            squares[m] += (stretch[i] * (at[i] - inputs[i, m])) ** 2
-    out[:] = 0.0
-    total = SUPPORT_MASS
-    for m in range(count):
-        weight = math.exp(-squares[m])
-        total += weight
-        for i in range(3):
-            for j in range(i, 3):
-                out[i, j] += weight * errors[m, i] * errors[m, j]
+    near, padded = np.zeros(1 + out.size), table.shape[1]
+    add_table(at * stretch, table, 1.0, np.empty(padded), np.empty(padded), near)
+    total = SUPPORT_MASS + near[0]
     for i in range(3):
-        out[i, i] += SUPPORT_MASS * unknown_std_m**2
-        for j in range(i, 3):
-            out[i, j] /= total
-            out[j, i] = out[i, j]
-        out[i, i] += LEAST_STD_M**2
+        for j in range(3):
+            out[i, j] = near[1 + 3 * i + j] / total
+        out[i, i] += SUPPORT_MASS * unknown_std_m**2 / total + LEAST_STD_M**2
 
 
 @compiled

@@ -7,6 +7,8 @@ line follows from others.
 
 from __future__ import annotations
 
+import math
+
 from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS, STILLNESS_LOWPASS_S
 
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
@@ -48,7 +50,10 @@ AMBIGUOUS_S = 1.5 * SAMPLE_CORRELATION_S  # shorter ambiguity is a transition be
 ERROR_WIDTH = 0.2  # width, in the inputs, of the neighbourhood in which errors are averaged
 # 0.01 to 0.5. More: regions grow sooner away from what was shown. Less: they grow later.
 SUPPORT_MASS = 0.1  # a place is supported where errors of demonstrations weigh more than this
-OTHER_STAGE_ERROR_WEIGHT = 0.5 * SUPPORT_MASS  # weight of an error in another stage: one alone supports no place
+ERROR_SCALE = 0.5 / ERROR_WIDTH**2  # an error at the distance d in the inputs weighs exp(-ERROR_SCALE d²)
+# Between stages as inputs: an error in another stage weighs half of SUPPORT_MASS, so that it alone
+# supports no place.
+ERROR_STAGE_DISTANCE = ERROR_WIDTH * math.sqrt(-math.log(0.5 * SUPPORT_MASS))
 # 1 to 16. More: errors are local. Less: errors are averaged wider.
 SUPPORT_SHARPNESS = 4.0  # sharpness of the kernel of errors / of the primitive's kernel, over the hands' inputs
 # 1e-3 to 0.01. More: the region is larger. Less: the region is smaller.
