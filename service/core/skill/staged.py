@@ -20,13 +20,11 @@ from service.contract.requests import ViaPoint
 from service.core.frame import Records, Vector, structured
 from service.core.intake.hand_estimator import STILL
 from service.core.numerics import BELIEF_PERIODS, MOTION_STEP_S
-from service.core.skill.memory import turning
 from service.core.skill.model import COVARIANCE_ROUND_TO, Arrays, Motion, Seen
 from service.core.skill.stages import (
     MOST_STAGES,
     OUTPUTS,
     PLACED,
-    SEEN,
     along_both,
     elsewhere,
     expected,
@@ -276,14 +274,9 @@ class StagedKMP:
         """Motion of the tool: equation (8) of Huang et al. 2019, differences along the hands'
         motion, and the covariance of errors in held-out demonstrations, see `stages.predicted`.
         """
-        at, out, hands = self.placed, np.empty((6, 3)), np.zeros(1, SEEN)
-        hands["moving"], hands["now"] = seen.moving, seen.now
-        hands["stillness"], hands["period_s"], hands["clock"] = seen.stillness, seen.period_s, seen.clock[:3]
-        if self.turned and len(seen.turns):
-            hands["is_turning"] = 1
-            turning(seen.turns, seen.turn_lag_s, hands["turning"][0])
+        at, out = self.placed, np.empty((6, 3))
         errors = at.errors if known is None else NO_ERRORS
-        gate_m, ambiguity = predicted(hands, seen.belief, at.stages, at.sizes, at.centres, at.pulls, errors, out)
+        gate_m, ambiguity = predicted(seen, self.turned, at.stages, at.sizes, at.centres, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:

@@ -20,7 +20,8 @@ from kmp.loops.mean import add_table
 from service.core.frame import Record, Records, Vector
 from service.core.geometry import ROUND_TO, round_to
 from service.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
-from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO
+from service.core.skill.memory import turning
+from service.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Seen
 from service.core.skill.tuning import (
     AMBIGUOUS_M,
     CALM_MPS,
@@ -80,18 +81,6 @@ PLACED = np.dtype(
         ("unknown_std", np.float64),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
         ("pulls", np.int64),  # number of pulls that act in all stages; they are the first rows
-    ]
-)
-# The hands' motion as compiled functions read it: see `model.Seen`.
-SEEN = np.dtype(
-    [
-        ("moving", np.float64, (3, 6)),
-        ("now", np.float64, (3, 6)),
-        ("stillness", np.float64, (2,)),
-        ("period_s", np.float64),
-        ("turning", np.float64, (3, 18)),  # both hands' rotation matrices, their rate and acceleration
-        ("is_turning", np.int64),  # 1: these are known
-        ("clock", np.float64, (3,)),
     ]
 )
 
@@ -520,8 +509,8 @@ def elsewhere(
 
 @compiled
 def predicted(
-    seen: Records,
-    belief: Vector,
+    seen: Seen,
+    turned: bool,
     stages: Records,
     sizes: Records,
     centres: Vector,
@@ -529,9 +518,9 @@ def predicted(
     errors: Vector,
     out: Vector,
 ) -> tuple[float, float]:
-    """Prediction of the tool for `seen` (1,) of SEEN: the belief is updated in place by the hands'
-    motion `now`, `period_s` after its last update, and the tool is predicted for the motion
-    `moving`.
+    """Prediction of the tool for the hands `seen`: the belief is updated in place by their motion
+    `now`, `period_s` after its last update, and the tool is predicted for the motion `moving`, with
+    their orientation if the tool is `turned` with them and it is known.
 
     Written to `out` (6, 3), rounded: position, velocity, acceleration, and the covariance (3, 3) of
     `scatter`, which is zero without `errors`. With the expected positions t_-, t_0, t_+ at the
@@ -543,17 +532,19 @@ def predicted(
     Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
     the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
-    one, steps, clock = seen[0], np.empty((3, 3)), seen[0]["clock"]
-    hands = np.empty((3, 6 + 18 * one["is_turning"]))
-    tempos, tools = np.empty((3, 3)), np.empty((3, len(stages), 3))
-    if one["period_s"] > 0.0:
-        recognise(belief, one["now"], one["period_s"], stages, FIRST_STAGE_ODDS)
-    _around(one["moving"], hands)
-    if one["is_turning"]:
-        _turned_around(one["turning"], hands)
+    belief, clock, steps, tempos = seen.belief, seen.clock, np.empty((3, 3)), np.empty((3, 3))
+    entries = seen.turns.shape[1] if turned and len(seen.turns) else 0
+    hands, tools = np.empty((3, 6 + entries)), np.empty((3, len(stages), 3))
+    if seen.period_s > 0.0:
+        recognise(belief, seen.now, seen.period_s, stages, FIRST_STAGE_ODDS)
+    _around(seen.moving, hands)
+    if entries:
+        rates = np.empty((3, entries))
+        turning(seen.turns, seen.turn_lag_s, rates)
+        _turned_around(rates, hands)
     for n in range(3):
         ahead_s = (n - 1) * MOTION_STEP_S
-        tempos[n, :2] = one["stillness"]
+        tempos[n, :2] = seen.stillness
         tempos[n, 2] = clock[0] + ahead_s * clock[1] + 0.5 * ahead_s**2 * clock[2]
     tools_at(hands, tempos, belief, stages, sizes, centres, pulls, tools)
     for n in range(3):
@@ -568,4 +559,4 @@ def predicted(
         scatter(hands[1], tempos[1], belief, stages, tools[1], errors, sizes[0], out[3:])
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
-    return off_all(one["now"][0], stages), _ambiguity(belief, tools[1])
+    return off_all(seen.now[0], stages), _ambiguity(belief, tools[1])
