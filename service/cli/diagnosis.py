@@ -13,7 +13,7 @@ import msgspec
 
 from service.cli.status import AHEAD_MS, disk, hours_until_full
 from service.contract.channels import BY_KEY, key
-from service.contract.evidence import Evidence, explained
+from service.contract.evidence import Evidence, explained, two_places
 from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
@@ -241,6 +241,9 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
             level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
             advice = (_unit_advice(source) or source.advice if cause == source.cause else "") or what_to_do(cause)
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
+    if source.apart_mm:
+        wanted = f"one publisher of {key(now.cell, KEYS[name])}"
+        yield wrong(what, two_places(source), wanted, what_to_do(Condition.TWO_PLACES))
     is_noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM
     if share > REJECTED_SHARE or is_noisy:
         seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE, SCATTER_MM)

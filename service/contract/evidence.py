@@ -226,6 +226,11 @@ def _contest(seen: Evidence) -> str:
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
 
 
+def two_places(source: Source) -> str:
+    """What the samples of a hand look like that two trackers publish, while it rests."""
+    return f"at rest, its samples alternate between two places {source.apart_mm:g} mm apart"
+
+
 def _joint_error(seen: Evidence) -> str:
     """The largest joint error at the fault, and the worst joint now."""
     if seen.error_rad is None or seen.worst_joint is None:

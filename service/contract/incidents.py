@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS",
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES",
 )
 
 
@@ -183,6 +183,11 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.OFF_TARGET, None, "tool off its target",
             "the tool has been more than 5 cm from its target for some time",
             "check that the arm's driver follows commands, and as fast"),
+        Incident(Condition.TWO_PLACES, None, "hand at two places",
+            "the samples of a hand that rests alternate between two places, some millimetres apart, and the tool errs "
+            "by as much",
+            "two trackers may publish this hand: stop one; if there is only one, see whether it alternates between two "
+            "views"),
         Incident(Condition.Y_UP, None, "tracker's axes",
             "y of the tracker seems to point up; in frame `base`, z does",
             "turn the tracker's frame by `base_from_tracker` under [hands]"),

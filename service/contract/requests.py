@@ -234,6 +234,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     advice: str = ""  # what to do about that rejection
     contested: float = 0.0  # share of the last second's samples that contradict the rest
     scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
+    apart_mm: float = 0.0  # distance of two places between which a resting hand's samples alternate; 0: they do not
 
 
 ANY_DIRECTION, ALONG_TASK = "in any direction", "along the task"

@@ -10,14 +10,17 @@ from collections import deque
 from collections.abc import Iterator
 from statistics import median
 
-from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
-from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, word
+import numpy as np
+
+from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
+from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, what_to_do, word
 from service.contract.joint_states import measured
 from service.contract.messages import PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
-from service.core.frame import Record
+from service.core.frame import Record, Vector
+from service.core.intake import KEPT
 from service.core.intake.far_away import too_far
 from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
@@ -27,6 +30,13 @@ from service.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
 COUNTS_EVERY_S = 10.0  # interval of the log lines that count further rejections
+# Two trackers of a hand that rests: its samples alternate between two places. The distance between
+# the two halves of a normal distribution is 2.7 times their standard deviation, of an even one 3.5
+# times, and of a tremor 4.1 times; a tremor, or a hand that has moved, changes sides more rarely.
+LEAST_APART_M = 0.003  # smaller distances are the steps of a coarse tracker
+APART_STDS = 4.5  # least distance of the places / standard deviation at one of them
+ALTERNATING_SHARE = 0.35  # least share of the samples that follow one at the other place
+APART_FOR_S = 3.0  # for so long, several times as long as the retained samples, chance does not last
 KEY_OF_SOURCE = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
 
 
@@ -40,6 +50,8 @@ class _History:
         self.logged: dict[str, int] = {}
         self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
         self.cause, self.refused_s = "", -math.inf
+        self.apart: deque[tuple[float, float]] = deque()
+        self.told_apart = False
 
 
 class InputMonitor:
@@ -96,10 +108,22 @@ class InputMonitor:
             refused="" if newest is None else newest.why,
             advice="" if newest is None else newest.what_to_do,
             contested=round(float(state["contested"][index]), 3),
+            apart_mm=self._apart_mm(source, state, now_s),
             scatter_mm=None
             if source == "arm" or seen < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
         )
+
+    def _apart_mm(self, source: str, state: Record, now_s: float) -> float:
+        """Distance [mm] of two places between which a hand mostly alternated lately; 0: none."""
+        if source == "arm":
+            return 0.0
+        side, apart = SOURCES.index(source), self._histories[source].apart
+        kept = (int(state["kept_newest"][side]) - np.arange(int(state["kept"][side]))) % KEPT
+        apart.append((now_s, apart_m(state["kept_positions"][side][kept])))
+        while apart[0][0] < now_s - APART_FOR_S:
+            apart.popleft()
+        return round(1e3 * median(m for _, m in apart), 1) if now_s - apart[0][0] > 0.9 * APART_FOR_S else 0.0
 
     def clutch(self, state: Record) -> str:
         """The problem with the clutch's messages; empty if there is none, or no clutch."""
@@ -117,7 +141,11 @@ class InputMonitor:
         """Lines for the log: the first rejection of each cause at once, then counts."""
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
-            logged, found, name = self._histories[source].logged, self._histories[source].found, SOURCE_NAMES[source]
+            history, name = self._histories[source], SOURCE_NAMES[source]
+            logged, found = history.logged, history.found
+            if now.apart_mm and not history.told_apart:
+                history.told_apart = True
+                yield f"{name}: {two_places(now)}: {what_to_do(Condition.TWO_PLACES)}"
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
                 yield f"{name}: rejected as {cause}{in_full(*found[cause])}"
@@ -128,6 +156,25 @@ class InputMonitor:
                 yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {which}"
         if counts:
             self._counted_s = now_s
+
+
+def apart_m(positions: Vector) -> float:
+    """Distance [m] of two places between which successive positions (M, 3) [m] alternate; 0 if they
+    do not.
+
+    The places are the means of the positions on each side of the mean along their principal axis.
+    """
+    if len(positions) < KEPT // 2:
+        return 0.0
+    off = positions - positions.mean(axis=0)
+    along = off @ np.linalg.svd(off, full_matrices=False)[2][0]
+    there = along > 0.0
+    if there.all() or not there.any():
+        return 0.0
+    apart = float(along[there].mean() - along[~there].mean())
+    spread = math.sqrt((along[there].var() * there.sum() + along[~there].var() * (~there).sum()) / len(along))
+    alternate = np.count_nonzero(there[1:] != there[:-1]) >= ALTERNATING_SHARE * len(along)
+    return apart if alternate and apart > max(LEAST_APART_M, APART_STDS * spread) else 0.0
 
 
 def _too_far(sample: PoseStamped, settings: Settings) -> str:

@@ -53,7 +53,6 @@ from service.core.vectors import dot, norm, squared_distance
 MOST_STAGES = 64  # stages for which the state has room
 STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
 OUTPUTS = 4  # outputs of the primitive: the tool's share of its segment, and its offset x y z [m]
-PRODUCTS = 10  # 1, and the products e_i e_j of an error's components
 # One stage as compiled functions read it: segments of the left and the right hand and of the tool.
 STAGE = np.dtype(
     [
@@ -436,7 +435,7 @@ def scatter(
     mass = SUPPORT_MASS if size["unknown_std"] > 0.0 else 0.0
     out[:] = 0.0
     mean, in_all, count, padded = np.empty(3), 0.0, len(stages), errors.shape[1]
-    x, near, values, room = np.empty(2 + count), np.empty(PRODUCTS), np.empty(padded), np.empty(padded)
+    x, near, values, room = np.empty(2 + count), np.empty(1 + out.size), np.empty(padded), np.empty(padded)
     expected(belief, tools, mean)
     for k in range(count):
         if belief[k] < LEAST_STAGE_PROBABILITY:
