@@ -30,7 +30,7 @@ from service.core.skill.unseen import deviation_m
 from service.settings.config import Settings
 
 FLAT: dict[str, Any] = {"kernel": GaussianKernel(1.0), "lambda_mean": 1.0}
-FOLLOWED_TICKS = 30  # ticks of the rehearsal with each skill, once the arm's posture is trusted
+FOLLOWED_TICKS = 20  # ticks of the rehearsal with each skill, once the arm's posture is trusted
 SAMPLE_EVERY = 5  # ticks between two samples of the hands
 
 
@@ -81,11 +81,10 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
     sight of one, and hold.
     """
     controller = Controller(settings, skill, urdf=urdf)
-    names = settings.joints.names
-    change = still_ticks(settings) + FOLLOWED_TICKS
-    count = change + FOLLOWED_TICKS
+    names, trusted = settings.joints.names, still_ticks(settings)
+    change, count = trusted + FOLLOWED_TICKS, trusted + 2 * FOLLOWED_TICKS
     controller.step(Tick(0))
-    for index in range(1, count):
+    for index in (*range(1, trusted, SAMPLE_EVERY), *range(trusted, count)):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 1 else []
