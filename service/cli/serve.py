@@ -58,13 +58,12 @@ def _run(args: argparse.Namespace) -> int:
     if folder is not None or args.live is not None:
         child.preload("service.scribe.process")  # in parallel to the imports of this process
     with starting(settings) as start:
-        gc.disable()  # imports leave no garbage, and its collection would take a tenth of their time
+        gc.disable()  # a start leaves no garbage unless it compiles, and collections would take a tenth of its time
         with ahead_of_others():
             from service.daemon import daemon  # a slow import, during which `start` answers requests
             from service.scribe.scribe import Scribe
 
         gc.freeze()  # no later collection visits what was imported
-        gc.enable()
 
         def announce(running: daemon.Daemon) -> None:
             where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"

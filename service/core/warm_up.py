@@ -30,7 +30,7 @@ from service.core.skill.unseen import deviation_m
 from service.settings.config import Settings
 
 FLAT: dict[str, Any] = {"kernel": GaussianKernel(1.0), "lambda_mean": 1.0}
-FOLLOWED_TICKS = 30  # ticks of the rehearsal, once the arm's posture is trusted
+FOLLOWED_TICKS = 20  # ticks of the rehearsal with each skill, once the arm's posture is trusted
 SAMPLE_EVERY = 5  # ticks between two samples of the hands
 
 
@@ -56,8 +56,7 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     other.predict(*np.zeros((3, 2, 3)))
     other.model.mean(np.zeros((1, 6)))
     _rarely(settings, urdf)
-    for one in (skill, plain):
-        _follow(msgspec.structs.replace(settings, arm=arm), one, urdf)
+    _follow(msgspec.structs.replace(settings, arm=arm), skill, plain, urdf)
 
 
 def _rarely(settings: Settings, urdf: str) -> None:
@@ -77,18 +76,21 @@ def _rarely(settings: Settings, urdf: str) -> None:
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 
-def _follow(settings: Settings, skill: Skill, urdf: str) -> None:
-    """Wait for hands, follow two resting ones for FOLLOWED_TICKS, lose sight of one, and hold."""
+def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
+    """Wait for hands, follow two resting ones for FOLLOWED_TICKS with each of two skills, lose
+    sight of one, and hold.
+    """
     controller = Controller(settings, skill, urdf=urdf)
-    names = settings.joints.names
-    count = still_ticks(settings) + FOLLOWED_TICKS
+    names, trusted = settings.joints.names, still_ticks(settings)
+    change, count = trusted + FOLLOWED_TICKS, trusted + 2 * FOLLOWED_TICKS
     controller.step(Tick(0))
-    for index in range(1, count):
+    for index in (*range(1, trusted, SAMPLE_EVERY), *range(trusted, count)):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 1 else []
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
-        controller.step(Tick(index, (*hands, measured)))
+        adopted = [Event("skill", b"", other)] if index == change else []
+        controller.step(Tick(index, (*adopted, *hands, measured)))
     deviation_m(as_array(controller.state), 0, settings.period_s)  # runs only for a hand out of sight
     controller.step(Tick(count, (order("hold"),)))
 

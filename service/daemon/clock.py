@@ -102,10 +102,11 @@ class Granted(NamedTuple):
 def ask_for_real_time() -> Granted:
     """Request real-time scheduling for this thread and locked memory, and return what was granted.
 
-    Existing objects are exempted from garbage collection in any case.
+    Existing objects are exempted from garbage collection in any case, and it is enabled.
     """
     gc.collect()
     gc.freeze()
+    gc.enable()
     sys.setswitchinterval(0.0005)
     return Granted(_scheduled(), _locked())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
 import logging
 import math
@@ -87,6 +88,7 @@ class Startup:
 
         class Compiling(event.Listener):  # type: ignore[misc]
             def on_start(self, event: event.Event) -> None:
+                gc.enable()  # compilations leave garbage
                 function = event.data["dispatcher"].py_func
                 name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
                 compiled.append(name if f"{function.__module__}.".startswith(LOOPED) else "")

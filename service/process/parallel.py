@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from typing import Any, TypeVar
 
 from service.contract.explain import ExplainedError, in_words
@@ -40,7 +40,7 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
         raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running scheduler's address needed") from None
     try:
         yield from parallel(delayed(_alone)(work, item) for item in items)
-    except BrokenProcessPool:
+    except BrokenExecutor:
         raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
 
 

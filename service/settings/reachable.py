@@ -187,25 +187,27 @@ def _placed(
     """The tool's positions and the directions of its +z (N, 3), and each joint's origin and axis
     with the joints before it at 0.
     """
-    count = len(postures)
-    turn, at = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    rest_turn, rest_at, axes, number = np.eye(3), np.zeros(3), [], 0
-    for joint in chain:
-        own = Rotation.from_quat(joint.rotation).as_matrix()
-        at, turn = at + turn @ np.array(joint.translation), turn @ own
-        rest_at, rest_turn = rest_at + rest_turn @ np.array(joint.translation), rest_turn @ own
-        if joint.kind == "fixed":
-            continue
-        axis = np.array(joint.axis)
-        axes.append((rest_at, rest_turn @ axis))
-        q = postures[:, number]
-        number += 1
-        if joint.kind == "prismatic":
-            at = at + (turn @ axis) * q[:, None]
-        else:
-            turn = turn @ Rotation.from_rotvec(q[:, None] * axis).as_matrix()
     x, y, z, *quaternion = plate_from_tool
-    return at + turn @ np.array([x, y, z]), (turn @ Rotation.from_quat(quaternion).as_matrix())[:, :, 2], axes
+    toward = Rotation.from_quat(quaternion).as_matrix()[:, 2]
+    at, along = np.tile((x, y, z), (len(postures), 1)), np.tile(toward, (len(postures), 1))
+    columns = iter(postures.T[::-1, :, None])
+    for joint in reversed(chain):  # from the plate to the root
+        axis = np.array(joint.axis)
+        if joint.kind == "prismatic":
+            at = at + next(columns) * axis
+        elif joint.kind != "fixed":  # R(q) v = v + sin q (a x v) + (1 - cos q) a x (a x v)
+            cross, q = np.cross(axis, np.eye(3)), next(columns)
+            first, second = np.sin(q), 1.0 - np.cos(q)
+            at, along = (v + first * (v @ cross) + second * (v @ (cross @ cross)) for v in (at, along))
+        own = Rotation.from_quat(joint.rotation).as_matrix().T
+        at, along = at @ own + joint.translation, along @ own
+    rest_turn, rest_at, axes = np.eye(3), np.zeros(3), []
+    for joint in chain:
+        rest_at = rest_at + rest_turn @ np.array(joint.translation)
+        rest_turn = rest_turn @ Rotation.from_quat(joint.rotation).as_matrix()
+        if joint.kind != "fixed":
+            axes.append((rest_at, rest_turn @ np.array(joint.axis)))
+    return at, along, axes
 
 
 def _shoulder(axes: Sequence[tuple[Vectors, Vectors]]) -> Vectors:

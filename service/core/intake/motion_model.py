@@ -58,9 +58,10 @@ def models(period_s: float, count: int) -> Records:
     kept_on_s: Vector = np.minimum(times_s, VELOCITY_KEPT_S)
     for name, values in model(times_s).items():
         out[name] = values
-    out["onward"] = model(times_s - kept_on_s)["transition"][:, :MODES]
-    for mode, fades in enumerate(MODE_ACCELERATION_REVERSIONS_PER_S):
-        out["onward"][:, mode] = out["onward"][:, mode] @ _over(_motion(0.0, fades), kept_on_s)[0]
+    for mode in (REACH, CHANGE):
+        fades = MODE_ACCELERATION_REVERSIONS_PER_S[mode]
+        ending = _over(_motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], fades), times_s - kept_on_s)[0]
+        out["onward"][:, mode] = ending @ _over(_motion(0.0, fades), kept_on_s)[0]
     out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
