@@ -67,7 +67,7 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
 
 
 class Overheard(AbstractContextManager["Overheard"]):
-    """Collect the keys that match some expressions and on which something is published; a context
+    """The keys on which something is published, of those that match some expressions; a context
     manager.
     """
 
