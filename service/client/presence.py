@@ -40,7 +40,7 @@ def why_silent(session: zenoh.Session, cell: str) -> str:
     none.
     """
     if living(session, cell):
-        return "its daemon is alive, but starts, ends, is too busy, or denies access: try again"
+        return "its daemon is alive, but it is starting or ending, too busy, or denies access: try again"
     return "is the daemon running there, and is the cell's name right?"
 
 
