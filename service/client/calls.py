@@ -34,7 +34,7 @@ class Client:
         self._timeout_s = timeout_s
 
     def hold(self, by: str = "") -> Reply:
-        """Stop the arm, which then holds; returns once that is in force. `by` names who holds it."""
+        """Stop the arm, which then holds; returns once that is in force. `by` names its holder."""
         return self._typed("hold", {"by": by} if by else None, Reply)
 
     def resume(self, by: str = "") -> Reply:
