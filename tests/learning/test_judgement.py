@@ -66,7 +66,7 @@ def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, 
         (lambda d: [d[0], d[0], *d[1:]], "demonstration 2 repeats demonstration 1, and is left out"),
         (lambda d: [d[0], d[0].every(2), *d[1:]], "demonstration 2 repeats demonstration 1"),
         (lambda d: [one._replace(frame="camera") for one in d], "in frame 'camera': it is taken to be 'base'"),
-        (lambda d: d[:2], "5 advised"),
+        (lambda d: d[:2], "5 or more advised"),
     ],
     ids=["repeated", "repeated at another rate", "another frame", "two"],
 )
