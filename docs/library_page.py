@@ -35,20 +35,32 @@ CLIENT = """# The Python client
 
 <!-- Written by `python docs/library_page.py` from the docstrings in service/client: change it there. -->
 
-This page lists what a program in Python needs to talk to a running daemon. All names are those of
-`import thirdhand`; inside the project the same names are those of `import service.client`. The
-programs in [examples](../examples) use them, and the [wire](wire.md) describes the messages behind
-them.
+This page lists what a program in Python needs to talk to a running daemon. Most programs need only
+a connection:
 
-A program on another machine needs only the client: `pip install ./service/client` in a clone
-installs the distribution `thirdhand-client`, for Python 3.10 or later on Linux, macOS and Windows,
-with `eclipse-zenoh` and `msgspec`. `pip wheel --no-deps ./service/client` builds its wheel. It may
-be installed beside `thirdhand`: the two share no file, and the service's own client is then
-imported. There, Python finds the package `service` only after `import thirdhand`. Rename a package
-of your own if it has this name.
+```python
+import thirdhand
+
+with thirdhand.connect() as cell:  # address, cell and certificate as for the commands
+    print(cell.wait_until_ready().mode)
+    cell.hold()
+    for pose in cell.watch("tool/target"):
+        print(pose.position)
+```
+
+All names are those of `import thirdhand`; the project itself has the same names in
+`service.client`. The programs in [examples](../examples) use them, and [the wire](wire.md)
+describes the messages behind them.
 
 Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
 radians, or in metres if they slide.
+
+A program on another machine needs only the client. In a clone, `pip install ./service/client`
+installs the distribution `thirdhand-client`, for Python 3.10 or later on Linux, macOS and Windows,
+with `eclipse-zenoh` and `msgspec`. `pip wheel --no-deps ./service/client` builds its wheel. If
+`thirdhand` is installed too, its own client is imported; the two share no file. With the client
+alone, Python finds the package `service` only after `import thirdhand`, and a package of your own
+must not have this name.
 
 ![The frames of a cell: base, plate, tool, tracker and both hands](frames.png)"""
 KMP_GROUPS = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import ARM_HELP, option, within
+from service.cli.usage import option, within
 from service.contract.records import SIDES
 
 ABOUT_CALIBRATE = (
@@ -21,7 +21,10 @@ MAX_ACCEPTED_MM = 200.0
 
 def add_options(c: argparse.ArgumentParser) -> None:
     """Add the command's own options."""
-    config = f"the settings that the daemon runs with: {ARM_HELP}; a file is changed, and the earlier one is kept"
+    config = (
+        "the settings that the daemon runs with: a FILE.toml of one cell, which is changed (the earlier one is kept), "
+        "or wam, franka or ur5"
+    )
     option(c, "--config", "CELL", config)
     how = c.add_mutually_exclusive_group()
     held = "the hand holds the tool while you lead the arm (the default)"

@@ -23,9 +23,9 @@ Answer = TypeVar("Answer")
 class Client:
     """Requests to a running daemon as calls.
 
-    Each raises RefusedError with the daemon's message, UnreachableError if no daemon answers, or
-    its subclass StartingError if the daemon reports the progress of its start. Replies that a Zenoh
-    storage kept are ignored: only those of a live daemon are returned.
+    Each raises RefusedError with the daemon's message, UnreachableError if no daemon answers within
+    `timeout_s` [s], or its subclass StartingError while the daemon starts. Old replies from a Zenoh
+    storage are ignored: only those of a live daemon are returned.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
@@ -34,12 +34,12 @@ class Client:
         self._timeout_s = timeout_s
 
     def hold(self, by: str = "") -> Reply:
-        """Stop the arm, which then holds; returns once that is in force. `by` names the holder."""
+        """Stop the arm, which then holds; returns once that is in force. `by` names its holder."""
         return self._typed("hold", {"by": by} if by else None, Reply)
 
     def resume(self, by: str = "") -> Reply:
-        """End an operator's hold; returns once that is in force. With a name, it is refused while
-        anybody else holds.
+        """End an operator's hold; returns once that is in force. Without a name, it ends the holds
+        of all; with a name, it is refused while anybody else holds.
         """
         return self._typed("resume", {"by": by} if by else None, Reply)
 
@@ -62,7 +62,7 @@ class Client:
     def add(self, points: Iterable[ViaPoint], *, tolerance: float = requests.TOLERANCE_M) -> Reply:
         """Teach via-points, all or nothing; returns once they are in force.
 
-        Learned points nearer than `tolerance` [m] to one are replaced.
+        They replace learned points of the skill that are nearer than `tolerance` [m].
         """
         return self._typed("via_points", requests.Add(tuple(points), tolerance), Reply)
 
@@ -77,11 +77,11 @@ class Client:
     def correct(
         self, tool: Vector3 | None = None, *, hands: Literal["held", "now"] = "held", turned: bool = False
     ) -> Reply:
-        """Correct the tool in a hold: it belongs where the arm was led by hand or, if given, at
-        `tool` [m]; returns once that is in force.
+        """Correct the tool in a hold: it belongs at `tool` [m], None: where the arm was led by
+        hand. Returns once that is in force.
 
-        It holds for the `hands` at which the hold began (`held`), or for those of this moment
-        (`now`). If `turned`, the orientation of the led tool is corrected too.
+        The correction belongs to the `hands` at which the hold began (`held`), or to those of this
+        moment (`now`). If `turned`, the orientation of the led tool is corrected too.
         """
         return self._typed("correct", requests.Correct(tool, hands, turned), Reply)
 

@@ -63,7 +63,8 @@ def client_settings(
 ) -> ClientSettings:
     """The settings of a client. An argument that is None is taken from $THIRDHAND_CONNECT
     (endpoints separated by commas), $THIRDHAND_CELL, $THIRDHAND_CERTIFICATE or
-    $THIRDHAND_ZENOH_CONFIG, else from the file CLIENT_FILE, else it has its default.
+    $THIRDHAND_ZENOH_CONFIG, else from the file thirdhand/client.toml in $XDG_CONFIG_HOME, by
+    default ~/.config, else it has its default.
 
     Raises SettingsError, which names the wrong file, variable or option.
     """

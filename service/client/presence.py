@@ -40,7 +40,7 @@ def why_silent(session: zenoh.Session, cell: str) -> str:
     none.
     """
     if living(session, cell):
-        return "its daemon is alive, but it is starting or ending, or it denies access: try again"
+        return "its daemon is alive, but it is starting or ending, too busy, or denies access: try again"
     return "is the daemon running there, and is the cell's name right?"
 
 
@@ -67,7 +67,7 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
 
 
 class Overheard(AbstractContextManager["Overheard"]):
-    """Collect the keys that match some expressions and on which something is published; a context
+    """The keys on which something is published, of those that match some expressions; a context
     manager.
     """
 

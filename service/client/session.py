@@ -61,7 +61,7 @@ def open_session(
     call fails immediately if the system reports that nothing listens.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
-    begin with `tls/`. If `certificate` or `zenoh_config` is None, $THIRDHAND_CERTIFICATE or
+    begin with `tls/`; None: $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`,
     $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError.
     """
     for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
@@ -85,7 +85,7 @@ def open_session(
         "plugins_loading/enabled": False,
         "namespace": None,  # the contract's keys are absolute
         "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
-        **_tls(certificate or os.environ.get("THIRDHAND_CERTIFICATE")),
+        **_tls(os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate),
         **(more or {}),
     }
 

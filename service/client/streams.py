@@ -216,12 +216,12 @@ class Watch(_Received, Iterator[Any]):
     `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
     of SceneObject, `clutch` a bool, `gripper/wish` a closure from 0 to 1, and `status` a Status.
 
-    It waits for the next message. It yields None after `timeout_s` [s] without one; if `timeout_s`
-    is None, it waits on. It ends once it, or its connection, is closed. A slow loop gets the newest
-    256 messages; `lost` counts the others, and those that the network dropped, and one message on
-    standard error reports the first of them. Messages that cannot be decoded are skipped:
-    `rejected` counts them, and `reason` is the cause of the last one. Raises ValueError for a
-    channel that carries no messages.
+    It waits for the next message, and yields None after each `timeout_s` [s] without one; None: it
+    waits on. It ends once it, or its connection, is closed. A slow loop gets the newest 256
+    messages. `lost` counts the others and those that the network dropped; the first loss is also
+    reported on standard error. Messages that cannot be decoded are skipped: `rejected` counts them,
+    and `reason` is the cause of the last one. Raises ValueError for a channel that carries no
+    messages.
     """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None) -> None:
@@ -278,7 +278,7 @@ class Follower(_Received):
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
         """The newest command that was not returned before; None after `timeout_s` [s] without a
-        command, whereupon the arm must brake.
+        command: the arm must then brake.
         """
         with self._came:
             self._came.wait_for(lambda: self._queue, timeout_s)

@@ -107,8 +107,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
     ),
     "The arm stops now and then, and continues by itself": (
         Incident(Reason.STALE_HAND, Mode.HOLD, "hand out of sight",
-            "no sample of the hands was accepted for {hands.stale_ms ms}; one hand alone, where the target does not "
-            "depend on it, may be missing for {hands.unseen_ms ms}",
+            "no sample of the hands was accepted for {hands.stale_ms ms}, or up to `[hands] stale_max_ms` if they "
+            "arrive in bursts; one hand alone, where the target does not depend on it, may be missing for "
+            "{hands.unseen_ms ms}",
             "look at the tracker; if a counter under `rejected` grows, samples arrive but are rejected; a hand that "
             "the skill does not need is waited for only 5 s"),
         Incident(Reason.FAR_FROM_DEMONSTRATIONS, Mode.HOLD, "hands far from the demonstrations",
@@ -127,8 +128,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the hands fit two stages of the task, with the tool at different positions",
             "continue, as the hands will show which stage it is; or name it by `thirdhand stage NAME`"),
         Incident(Condition.HANDS_TOO_RARE, None, "hands arrive too rarely",
-            "more than {hands.stale_ms ms} pass between samples of a hand",
-            "publish hands more often, or raise `[hands] stale_ms`"),
+            "more than {hands.stale_ms ms}, or `[hands] stale_max_ms` if longer, pass between samples of a hand",
+            "publish hands more often, or raise `[hands] stale_ms`; or `[hands] stale_max_ms` if they come in bursts"),
         Incident(Condition.JOINTS_TOO_RARE, None, "joint states arrive too rarely",
             "more than {arm.silent_ms ms} pass between joint states",
             "publish `joints/state` more often, or raise `[arm] silent_ms`"),

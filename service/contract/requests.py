@@ -171,10 +171,10 @@ class Correction(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The answer to a request: the tick from which it holds, and the via-points in force.
+    """The answer to a request: the tick from which it is in force, and the via-points in force.
 
-    `warnings` say which of them are missed by more than 5 mm, and which others were moved by more.
-    The answer to hold, resume and reset has the resulting mode, its reason, and a note if there was
+    `warnings` name those that are missed by more than 5 mm, and others that moved by more. The
+    answer to hold, resume and reset has the resulting mode, its reason, and a note if there was
     nothing to do.
     """
 

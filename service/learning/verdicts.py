@@ -114,19 +114,19 @@ RULES = (
     ),
     Rule(
         lambda s: len(s.figures.demonstrations) < 3,
-        f"{{count}} demonstration(s) tell little of how sure the skill may be; {ADVISED} advised",
+        f"{{count}} demonstration(s) are too few to estimate the skill's errors; {ADVISED} or more advised",
         severity=lambda s: "unsafe" if len(s.figures.demonstrations) > 1 and s.all.error_mm > NOTED_MM else "warning",
         remedy=", as they miss each other by {s.all.error_mm:.0f} mm: record more",
     ),
     Rule(
         lambda s: s.gate.floored or s.all.error_mm < 1000 * NOISE_M,
-        "the demonstrations are more exact than any tracker: were they made, not taken? The gate allows for a "
-        "tracker's noise, and is {s.figures.gate_mm:.1f} mm",
+        "the demonstrations have less noise than any tracker: were they computed? The gate allows for a tracker's "
+        "noise, and is {s.figures.gate_mm:.1f} mm",
     ),
     Rule(
         _is_unexplained,
-        "the hands predict too little of the tool: {s.figures.explained:.0f} % of its variance in held-out "
-        f"demonstrations, at least {EXPLAINED:.0f} % needed; they are missed by {{s.all.error_mm:.0f}} mm",
+        "the hands explain too little of the tool's motion: {s.figures.explained:.0f} % of its variance in held-out "
+        f"demonstrations, at least {EXPLAINED:.0f} % needed; the error is {{s.all.error_mm:.0f}} mm",
         severity=lambda s: "unsafe",
         remedy=": name the via-points of the task (record --places, learn --places), let the hands lead the tool in "
         "each demonstration, or record more that are alike",
@@ -139,18 +139,18 @@ RULES = (
     ),
     Rule(
         lambda s: _is_better(s) and not _is_timetable(s),
-        "{s.part}, held-out demonstrations are missed by less: {s.value:.0f} mm, not {s.all.error_mm:.0f}",
+        "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not {s.all.error_mm:.0f}",
         of="baselines",
     ),
     Rule(
         _is_timetable,
-        "the task is a timetable: where the tool was after as much time misses it by {s.value:.0f} mm, by the hands "
-        "it is missed by {s.all.error_mm:.0f}",
+        "the task is a timetable: the elapsed time predicts the tool with an error of {s.value:.0f} mm, the hands "
+        "with {s.all.error_mm:.0f} mm",
         of="baselines",
     ),
     Rule(
         lambda s: len(s.figures.demonstrations) > 2 and s.value > max(OUTLIER_TIMES * s.median_mm, OUTLIER_MM),
-        "{s.part} is unlike the others: missed by {s.value:.0f} mm, they by {s.median_mm:.0f}",
+        "{s.part} differs from the others: its error is {s.value:.0f} mm, the median {s.median_mm:.0f} mm",
         of="demonstrations",
     ),
     Rule(
@@ -170,7 +170,7 @@ RULES = (
     ),
     Rule(
         lambda s: s.all.held > HELD,
-        "the gate, kept low by {cause}, holds {s.all.held:.0f} % of what was demonstrated",
+        "the gate holds {s.all.held:.0f} % of what was demonstrated, and cannot be higher: {cause}",
     ),
     Rule(
         lambda s: s.value < CAUGHT_RESIDUAL,
@@ -203,7 +203,7 @@ def verdicts(subject: Subject) -> Iterator[Verdict]:
     words = {
         "count": len(subject.figures.demonstrations),
         "frames": ", ".join(map(repr, subject.frames)),
-        "cause": "its ceiling" if subject.gate.capped else "nonsense beyond it",
+        "cause": "it is at its upper limit" if subject.gate.capped else "wrong hands would pass",
     }
     for rule in RULES:
         for part, value in subject.parts(rule.of).items():

@@ -33,8 +33,8 @@ Episode = dict[str, NDArray[np.float32 | np.int64]]
 def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
     """The parts of a recording without gaps in which commands were sent and both hands had been
     seen: the `FEATURES` by name, a row every 1/fps s, from the newest tick. With them `times_ns`
-    (N,), `action.gripper` (N,), the closure, -1 where it is not decided, and `observation.stage`
-    (N,), the number of the most probable stage, -1 without one.
+    (N,), `action.gripper` (N,), the predicted closure, -1 if the skill has no gripper, and
+    `observation.stage` (N,), the number of the most probable stage, -1 without one.
 
     Joints are those of the newest joint state; before the first one, the previous command.
     """

@@ -50,6 +50,15 @@ def test_an_option_goes_before_the_environment_the_file_and_the_default(
     assert (found.cell, found.connect, found.certificate) == ("said", ("tcp/127.0.0.1:4",), "mine")
 
 
+def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(tmp_path / "secrets"))
+    open_session(listen=["tcp/127.0.0.1:0"], certificate=Settings().network.certificate).close()
+    with pytest.raises(UnreachableError, match=r"cannot read .*secrets/certificate\.pem"):
+        open_session(listen=["tcp/127.0.0.1:0"])
+
+
 def test_without_the_variable_the_file_is_in_the_users_configuration(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,7 +66,7 @@ def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, 
         (lambda d: [d[0], d[0], *d[1:]], "demonstration 2 repeats demonstration 1, and is left out"),
         (lambda d: [d[0], d[0].every(2), *d[1:]], "demonstration 2 repeats demonstration 1"),
         (lambda d: [one._replace(frame="camera") for one in d], "in frame 'camera': it is taken to be 'base'"),
-        (lambda d: d[:2], "5 advised"),
+        (lambda d: d[:2], "5 or more advised"),
     ],
     ids=["repeated", "repeated at another rate", "another frame", "two"],
 )
@@ -125,7 +125,7 @@ def test_the_error_at_the_moment_stands_in_the_table_where_it_is_another(good: l
         rows = [msgspec.structs.replace(row, moment_mm=row.error_mm + more_mm) for row in found.demonstrations]
         total = msgspec.structs.replace(found.all, moment_mm=found.all.error_mm)
         head, first, *_ = table(msgspec.structs.replace(found, demonstrations=tuple(rows), all=total)).splitlines()
-        assert ("at the moment" in head) == bool(more_mm)
+        assert ("of blocks" in head) == bool(more_mm)
         told = (rows[0].error_mm, rows[0].worst_mm, *[rows[0].moment_mm] * bool(more_mm), rows[0].predicted_mm)
         assert first.split()[1 : 2 * len(told) : 2] == [f"{mm:.0f}" for mm in told]
 

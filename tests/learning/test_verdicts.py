@@ -46,7 +46,7 @@ def test_good_figures_are_remarked_on_by_nobody() -> None:
         ({"error_mm": 126.0, "explained": 78.0}, "residual", "missed by 126 mm"),
         ({"error_mm": 150.0, "explained": 15.0}, "unsafe", "15 % of its variance in held-out"),
         ({"error_mm": 30.0, "explained": 15.0}, "", ""),
-        ({"takes": 2}, "warning", "2 demonstration(s) tell little"),
+        ({"takes": 2}, "warning", "2 demonstration(s) are too few"),
         ({"takes": 2, "error_mm": 93.0}, "unsafe", "as they miss each other by 93 mm: record more"),
         ({"ambiguous": 8.0}, "warning", "8 % of the samples contradict others"),
         ({"ambiguous": 12.0}, "residual", "12 % of the samples contradict others"),
