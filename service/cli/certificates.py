@@ -239,7 +239,5 @@ def _save(path: Path, data: bytes) -> None:
 
 def _replace(path: Path, data: bytes) -> None:
     """Replace a file at once, so that a program which starts now reads the old or the new one."""
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    _save(new, data)
-    new.replace(path)
+    with whole(path) as part:
+        _save(part, data)

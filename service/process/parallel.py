@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -57,8 +56,9 @@ def _connect_to_ray(address: str) -> None:
     import ray
     from ray.util.joblib import register_ray
 
-    if found := re.search(r"([^/:]+):(\d+)$", address):  # where nothing listens, Ray would wait for minutes
-        socket.create_connection((found[1], int(found[2])), timeout=CONNECT_TIMEOUT_S).close()
+    host, _, port = address.rpartition(":")
+    if port.isdecimal():  # where nothing listens, Ray would wait for minutes
+        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
     register_ray()
     ray.init(address=address, log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
 

@@ -26,6 +26,12 @@ def test_a_file_and_a_folder_appear_once_they_are_complete(tmp_path: Path) -> No
     assert [path.name for path in sorted(tmp_path.rglob("*"))] == ["a.txt", "data", "meta", "link"]
 
 
+def _write_half(path: Path, error: BaseException) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("half")
+    raise error
+
+
 @pytest.mark.parametrize("error", [OSError(28, "Detail: [errno 28]"), KeyboardInterrupt()], ids=["full", "interrupt"])
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_a_failure_leaves_nothing_and_names_the_path(kind: str, error: BaseException, tmp_path: Path) -> None:
@@ -33,9 +39,7 @@ def test_a_failure_leaves_nothing_and_names_the_path(kind: str, error: BaseExcep
     (tmp_path / ".new.part").mkdir()  # of a process that was killed
     for name in ("new", "earlier"):
         with pytest.raises(type(error)) as raised, whole(tmp_path / name) as part:
-            (part if kind == "file" else part / "inside").parent.mkdir(exist_ok=True)
-            (part if kind == "file" else part / "inside").write_text("half")
-            raise error
+            _write_half(part if kind == "file" else part / "inside", error)
         if isinstance(error, OSError):
             found = OSError(28, os.strerror(28), str(tmp_path / name))
             assert str(raised.value) == str(found)
