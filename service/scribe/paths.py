@@ -100,7 +100,8 @@ class RecordingPaths:
         ):
             found = self._found(suffix) if self._folder is not None and (keep_mb or keep_hours) else []
             total = sum(size for _, size, _ in found)
-            ages_s = _ages_s([changed for *_, changed in found], keep_hours * 1800)
+            longest_gap_s = keep_hours * 1800 + files.segment_minutes * 60
+            ages_s = _ages_s([changed for *_, changed in found], longest_gap_s)
             for (path, size, _), age_s in zip(found, ages_s, strict=True):
                 too_old = keep_hours and age_s > keep_hours * 3600
                 too_much = keep_mb and total > keep_mb * MB
