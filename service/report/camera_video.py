@@ -129,7 +129,9 @@ def write_videos(
             for key in [key for key in videos if key not in seen or videos[key].rows]:
                 video = videos.pop(key)
                 video.container.close()
-                video.path.unlink()
+                video.path.unlink(missing_ok=True)
+                if video.has_damaged:
+                    say(f"images of {key} cannot be decoded; it has no video")
         for key, video in videos.items():
             if video.has_damaged:
                 say(f"images of {key} cannot be decoded; in their place, its video has those beside them")
