@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.settings.arm_description import description
 from service.settings.config import load
-from service.settings.file_content import SettingsError
+from service.settings.file_content import whole
 from service.settings.mesh_cover import unfound
 
 DEGREES = 7.0  # [rad] larger limits of a revolute joint are probably in degrees
@@ -43,18 +44,18 @@ def arm(args: argparse.Namespace) -> int:
     )
     if proposal.text and standing.exists():
         raise ExistsError(f"{standing} exists already: name another cell by --output, or remove it")
-    if proposal.text:
-        standing.write_text(proposal.text, encoding="utf-8")
-    urdf = standing if proposal.text else args.urdf
-    cell.write_text(written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8")
-    try:
-        load(cell)
-    except SettingsError:
-        cell.unlink()
+    with contextlib.ExitStack() as undo:
+        for file in (cell, picture, *([standing] if proposal.text else [])):
+            undo.callback(file.unlink, missing_ok=True)
         if proposal.text:
-            standing.unlink()
-        raise
-    draw(proposal, picture)
+            with whole(standing) as part:
+                part.write_text(proposal.text, encoding="utf-8")
+        urdf = standing if proposal.text else args.urdf
+        with whole(cell) as part:
+            part.write_text(written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8")
+        load(cell)
+        draw(proposal, picture)
+        undo.pop_all()
     print(text(proposal, args.urdf))
     print(f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}")
     print(f"next:    thirdhand {'serve --config' if proposal.unmet else 'demo --arm'} {cell}")

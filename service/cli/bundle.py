@@ -9,7 +9,6 @@ import os
 import re
 import subprocess
 import tarfile
-import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -26,6 +25,7 @@ from service.files.mcap_file import machine
 from service.files.shipped import cell_of
 from service.scribe.paths import MB, named_after, stem_of
 from service.settings.config import Settings, without_secrets
+from service.settings.file_content import whole
 
 LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
 _KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL)
@@ -55,7 +55,9 @@ def bundle(args: argparse.Namespace) -> int:
     recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
     about = "".join(f"{name}: {len(text.splitlines())} lines\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
-    about += "" if found else "no recordings: --config names the cell's settings, and these the folder of recordings\n"
+    if not found:
+        none = f"in {folder}" if folder else "--config names the cell's settings, and these the folder of recordings"
+        about += f"no recordings of cell {args.cell}: {none}\n"
     texts["README.txt"] = HEAD + about
     _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
     print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")
@@ -94,16 +96,12 @@ def _log(args: argparse.Namespace) -> str:
 
 def _write(path: Path, texts: dict[str, str], recordings: list[Path]) -> None:
     """Write the archive whole or not at all; a recording that still grows is cut."""
-    descriptor, draft = tempfile.mkstemp(dir=path.parent, suffix=".part")  # private to its user
-    try:
-        with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive:
+    with whole(path) as part:
+        private = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with open(private, "wb") as file, tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive:
             for name, text in texts.items():
                 entry, content = tarfile.TarInfo(name), text.encode()
                 entry.size, entry.mtime = len(content), time.time()
                 archive.addfile(entry, io.BytesIO(content))
             for recording in recordings:
                 archive.add(recording, f"recordings/{recording.name}")
-        os.replace(draft, path)
-    except BaseException:
-        os.unlink(draft)
-        raise

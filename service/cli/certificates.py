@@ -21,6 +21,7 @@ from service.cli.usage import UsageError
 from service.client import AUTHORITY, CERTIFICATE, KEY
 from service.contract.explain import ExplainedError, in_words
 from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
+from service.settings.file_content import whole
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"
@@ -46,21 +47,22 @@ def certificates(args: argparse.Namespace) -> int:
         if args.role or args.host:
             raise UsageError("--renew keeps names, roles and hosts: without --role and --host")
         return _renew(folder, args.days)
-    if args.role:
-        authority, key = _authority_in(folder)
-        made = [_free_name(folder, args.role, args.name)]
-        about = [f"{made[0]}, of role {args.role}"]
-    else:
-        if folder.exists() and any(folder.iterdir()):
-            raise ExplainedError(
-                f"{folder} is not empty, and certificates are not overwritten: a new or empty folder needed; "
-                "--role makes one more certificate by the authority in a folder"
-            )
-        authority, key = _new_authority(folder, args.days)
-        made = [DAEMON, *ROLES]
-        about = [f"for the daemon, as {', '.join(hosts)}", *(f"its holder {role.about}" for role in ROLES.values())]
-    for name, what in zip(made, about, strict=True):
-        until = _write(folder / name, authority, key, hosts=hosts, days=args.days)
+    if not args.role and folder.exists() and any(folder.iterdir()):
+        raise ExplainedError(
+            f"{folder} is not empty, and certificates are not overwritten: a new or empty folder needed; "
+            "--role makes one more certificate by the authority in a folder"
+        )
+    with whole(folder) as part:  # a folder that exists is written directly
+        if args.role:
+            authority, key = _authority_in(folder)
+            made = [_free_name(folder, args.role, args.name)]
+            about = [f"{made[0]}, of role {args.role}"]
+        else:
+            authority, key = _new_authority(part, args.days)
+            made = [DAEMON, *ROLES]
+            about = [f"for the daemon, as {', '.join(hosts)}", *(f"its holder {role.about}" for role in ROLES.values())]
+        ends = [_write(part / name, authority, key, hosts=hosts, days=args.days) for name in made]
+    for name, what, until in zip(made, about, ends, strict=True):
         print(f"{folder / name}: {what}; valid until {until:%Y-%m-%d}")
     print(f"{folder / AUTHORITY_KEY}: this key makes further certificates; keep it in a safe place")
     return 0
@@ -163,9 +165,10 @@ def _write(
     )
     if serves:
         builder = builder.add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
-    _save(folder / KEY, _pem(own))
-    _save(folder / CERTIFICATE, _public(builder.sign(key, hashes.SHA256())))
-    _save(folder / AUTHORITY, _public(authority))
+    with whole(folder) as part:
+        _save(part / KEY, _pem(own))
+        _save(part / CERTIFICATE, _public(builder.sign(key, hashes.SHA256())))
+        _save(part / AUTHORITY, _public(authority))
     return until
 
 
@@ -236,7 +239,5 @@ def _save(path: Path, data: bytes) -> None:
 
 def _replace(path: Path, data: bytes) -> None:
     """Replace a file at once, so that a program which starts now reads the old or the new one."""
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    _save(new, data)
-    new.replace(path)
+    with whole(path) as part:
+        _save(part, data)

@@ -8,6 +8,7 @@ from pathlib import Path
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.process.progress import say
+from service.settings.file_content import whole
 
 
 def completion(args: argparse.Namespace) -> int:
@@ -23,7 +24,8 @@ def completion(args: argparse.Namespace) -> int:
         path: Path = args.output.expanduser()
         path.parent.mkdir(parents=True, exist_ok=True)
         check_writable(path)
-        path.write_text(script, encoding="utf-8")
+        with whole(path) as part:
+            part.write_text(script, encoding="utf-8")
         say(f"{path} written; the next shell uses it")
     else:
         print(script)

@@ -37,6 +37,7 @@ from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
+from service.settings.file_content import whole
 
 COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 
@@ -194,7 +195,8 @@ def learn(args: argparse.Namespace) -> int:
         draw(evidence[0], args.plot)
     if figures.unsafe:
         raise ExplainedError(f"{args.output} was not written: {'; '.join(figures.unsafe)}")
-    args.output.write_bytes(skill.file)
+    with whole(args.output) as part:
+        part.write_bytes(skill.file)
     primitive = skill.model.primitive
     over = " over a mean that is linear in the hands" * isinstance(primitive.prior_mean, AffineMean)
     print(

@@ -24,6 +24,7 @@ from service.process.progress import progress
 from service.report.columns import KEPT
 from service.report.report import Report, reported
 from service.report.tables import Table, comparison, names_of, summary, tables
+from service.settings.file_content import whole
 
 BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
@@ -54,13 +55,14 @@ def report(args: argparse.Namespace) -> int:
 
         columns = [one.columns for one in reports]
         task = args.task or ", ".join({one.skill.name: one.tick for found in columns for one in found.skills})
-        parts, rows = lerobot.write(columns, args.lerobot, fps=args.fps, task=task)
+        with whole(args.lerobot) as part:
+            parts, rows = lerobot.write(columns, part, fps=args.fps, task=task)
         console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
     if args.html and reports:
         from service.report.page import page  # its import is slow
 
-        with progress("drawing", unit="recordings", total=len(reports)) as done:
-            args.html.write_text(page(reports, progress=done), encoding="utf-8")
+        with progress("drawing", unit="recordings", total=len(reports)) as done, whole(args.html) as part:
+            part.write_text(page(reports, progress=done), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
     return 0 if len(reports) == len(args.files) else 1
 
@@ -130,7 +132,7 @@ def write_csv(reports: Sequence[Report], folder: Path) -> None:
 
 
 def _write(path: Path, table: Table) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(table.heads)
         writer.writerows(table.rows)
@@ -147,4 +149,5 @@ def _write_ticks(path: Path, one: Report) -> None:
         heads += [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]
         formats += ["%d" if is_whole else "%.7g"] * count
         columns.append(column.astype(np.float64))
-    np.savetxt(path, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(heads), comments="")
+    with whole(path) as part:
+        np.savetxt(part, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(heads), comments="")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import shutil
@@ -77,7 +78,9 @@ def _folder(folder: Path) -> str:
     found = existing_folder(folder)
     if not found.is_dir():
         raise ExplainedError(f"{folder}: {found} is not a folder")
-    if not os.access(found, os.W_OK | os.X_OK, effective_ids=True):
+    if os.statvfs(found).f_flag & os.ST_RDONLY:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(found))
+    if not os.access(found, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
         raise ExplainedError(f"{folder}: {found} cannot be written by user {os.geteuid()}; its owner can allow that")
     return f"{folder} can be {'written' if found == folder.absolute() else 'made'}"
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import errno
 import os
 import re
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,7 +21,7 @@ from service.client import ClientSettings, UnreachableError, client_settings, op
 from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from service.contract.explain import in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
-from service.process.parallel import DASK
+from service.process.parallel import CLUSTERS
 from service.settings.config import RATES_HZ
 from service.settings.file_content import UnusableError, content
 
@@ -79,9 +81,11 @@ def endpoint(given: str) -> str:
 
 def workers(given: str) -> str:
     """Read workers from the command line, as `spread` takes them."""
-    if re.fullmatch(rf"[1-9]\d{{0,3}}|{DASK}\S+", given):
+    if re.fullmatch(rf"[1-9]\d{{0,3}}|({'|'.join(CLUSTERS)}):\S+", given):
         return given
-    raise argparse.ArgumentTypeError(f"{given} given; a number of processes, or {DASK}tcp://HOST:8786 needed")
+    raise argparse.ArgumentTypeError(
+        f"{given} given; a number of processes, dask:tcp://HOST:8786 or ray:HOST:6379 needed"
+    )
 
 
 TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
@@ -94,8 +98,8 @@ TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions tha
 }
 
 WORKERS_HELP = (
-    "share several files out to this number of processes, or to the Dask cluster whose scheduler is at dask:ADDRESS; "
-    "the output is the same (default: one after the other)"
+    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of the scheduler) or "
+    "ray:ADDRESS; the output is the same (default: one after the other)"
 )
 ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
 
@@ -122,15 +126,20 @@ def check_writable(path: Path, suffix: str = "") -> None:
     """Raise UsageError if no file of this suffix can be written at a path; for a check before long
     work.
     """
-    folder = path.parent
+    folder = Path(os.path.realpath(path)).parent  # of the file that a link leads to
     if path.is_dir():
         raise UsageError(f"{path} is a folder; the name of a file needed")
     if suffix and path.suffix.lower() != suffix:
         raise UsageError(f"{path}: a name that ends in {suffix} needed, like {path.with_suffix(suffix).name}")
     if not folder.is_dir():
         raise UsageError(f"{path}: there is no folder {folder}")
-    if not os.access(path if path.exists() else folder, os.W_OK):
-        raise UsageError(f"{path} cannot be written: permission denied")
+    try:
+        if path.is_file() or not path.exists():  # else it is a device or a pipe
+            tempfile.TemporaryFile(dir=folder).close()
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {in_words(error, named=False)}") from None
 
 
 def reaching(args: argparse.Namespace) -> ClientSettings:

@@ -80,8 +80,10 @@ def view(args: argparse.Namespace) -> int:
 
 def _kind(path: Path) -> bytes:
     """First bytes of a file that can be shown: RRD_MAGIC or MCAP0_MAGIC. Raises ExplainedError."""
-    if not path.exists():
-        raise ExplainedError(f"no such file: {path}")
+    try:
+        path.stat()  # reports a link that leads to itself
+    except (FileNotFoundError, NotADirectoryError):
+        raise ExplainedError(f"no such file: {path}") from None
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     if not path.is_file():  # reading a pipe could wait forever

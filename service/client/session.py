@@ -7,6 +7,7 @@ import json
 import os
 import re
 import socket
+import ssl
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -159,8 +160,8 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
         return (
             f"nobody answers at {', '.join(connect)}: "
             "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
-            + " Is your certificate, if you gave one, from the daemon's authority, and is the daemon's own valid?"
-            * secured
+            + " Is your certificate, if you gave one, from the daemon's authority, and is the daemon's own valid, and "
+            "for this name or address?" * secured
         )
     found = re.search(r"\(os error (\d+)\)", reason)
     words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
@@ -202,6 +203,10 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
             raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
     check_dates(own)
     check_dates(authority)
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(own, key, password="none")
+    except ssl.SSLError:
+        raise UnreachableError(f"{key} is not the key of {own}: that key, without a password, needed") from None
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
@@ -235,13 +240,14 @@ def check_dates(path: Path) -> datetime.datetime | None:
 
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
-    except ValueError as error:
-        raise UnreachableError(f"{path} does not hold a certificate: {error}") from None
+    except ValueError:
+        raise UnreachableError(f"{path} does not hold a certificate, as `thirdhand certificates` makes them") from None
     begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     now = datetime.datetime.now(datetime.timezone.utc)  # noqa: UP017, as the client runs on Python 3.10 too
     if now > end:
         raise UnreachableError(
-            f"{path} expired on {end:%Y-%m-%d %H:%M} UTC: a new certificate needed, by `thirdhand certificates`"
+            f"{path} expired on {end:%Y-%m-%d %H:%M} UTC: a new certificate needed, by `thirdhand certificates`; the "
+            f"clock here shows {now:%Y-%m-%d %H:%M}"
         )
     if now < begin:
         raise UnreachableError(

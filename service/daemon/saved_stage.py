@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import time
-from pathlib import Path
 
 from service.core.skill.skill import Skill
 from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 from service.settings.config import Settings
+from service.settings.file_content import whole
 
 MAX_RESTART_S = 600.0  # after a longer pause the task begins again, at the stage where the hands are
 MIN_BELIEF = 0.5  # a less probable stage is not saved
@@ -38,7 +37,6 @@ class SavedStage:
         if not stage or belief < MIN_BELIEF or stage[0] == self._kept:
             return
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        draft: Path = self._path.with_suffix(f".{os.getpid()}.new")
-        draft.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": stage[0]}))
-        draft.replace(self._path)
+        with whole(self._path) as draft:
+            draft.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": stage[0]}))
         self._kept = stage[0]

@@ -19,6 +19,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 from service.core.frame import definitions
+from service.settings.file_content import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
 _BYTES = "application/octet-stream"
@@ -184,15 +185,13 @@ class McapFile:
 @contextlib.contextmanager
 def whole_file(path: Path, *, joints: int) -> Iterator[McapFile]:
     """A context with an MCAP file that is moved to `path` once it is complete."""
-    part = path.with_name(f".{path.name}.part")
-    file = McapFile(part, joints=joints)
-    try:
-        yield file
-        file.close()
-        part.replace(path)
-    finally:
-        file.abandon()
-        part.unlink(missing_ok=True)
+    with whole(path) as part:
+        file = McapFile(part, joints=joints)
+        try:
+            yield file
+            file.close()
+        finally:
+            file.abandon()
 
 
 def existing(path: str | Path) -> Path:
@@ -203,6 +202,8 @@ def existing(path: str | Path) -> Path:
     path = Path(path)
     if path.is_dir():
         raise RecordingError(f"{path} is a folder, a recording needed")
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        path.stat()  # reports a link that leads to itself
     if not path.is_file():
         found = sorted(other.name for other in path.parent.glob("*.mcap"))
         names = f" Its folder has: {', '.join(found)}." if found else ""

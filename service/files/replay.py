@@ -20,6 +20,7 @@ from service.files.mcap_file import RecordingError, machine
 from service.files.recording import Recorder, Recording
 from service.files.steps import Gap, Step, checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
+from service.settings.file_content import whole
 
 REPLAY_TOLERANCE = 1e-5  # [m, rad] other machines may differ by this, because their last bits differ
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
@@ -106,9 +107,9 @@ def replay(
         raise RecordingError(f"--output {output}: a file other than the recording, and a single recording, needed")
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
     before: Step | None = None
-    with threadpool_limits(1):
+    with threadpool_limits(1), whole(output) if output else contextlib.nullcontext() as part:
         for i, recording in enumerate(recordings):
-            before = _Comparison(recording, result, after, before, i > 0, progress, output).compared()
+            before = _Comparison(recording, result, after, before, i > 0, progress, part).compared()
             result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
             result.truncated = result.truncated or recording.truncated
     return result
@@ -169,7 +170,7 @@ class _Comparison:
         if self.output is None:
             return contextlib.nullcontext()
         if self.result.missing:
-            raise RecordingError(f"{self.output} cannot be written: {self.result.missing[-1]}")
+            raise RecordingError(f"--output cannot be written: {self.result.missing[-1]}")
         settings, urdf = self.recording.settings, self.recording.urdf
         return Recorder(self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf)
 

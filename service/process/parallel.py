@@ -1,18 +1,20 @@
-"""Work on many items, spread over the workers of joblib: processes of this machine, a Dask cluster,
-or whatever `joblib.parallel_config` sets in a program.
+"""Work on many items, spread over the workers of joblib: processes of this machine, a Dask or Ray
+cluster, or whatever `joblib.parallel_config` sets in a program.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any, TypeVar
 
 from service.contract.explain import ExplainedError, in_words
 
-DASK = "dask:"  # begins the workers of a Dask cluster; its scheduler's address follows
+CLUSTERS = {"dask": "distributed", "ray": "ray"}  # back ends of joblib that are clusters, and their packages
+CONNECT_TIMEOUT_S = 3.0
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
@@ -20,28 +22,45 @@ Outcome = TypeVar("Outcome")
 def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "") -> Iterator[Outcome]:
     """The outcome of each item, in order.
 
-    `workers` is a number of processes, or `dask:ADDRESS`. If it is empty, joblib decides: by
-    `joblib.parallel_config` where a program set it, else the work is done in this process. Each
-    piece of work has one BLAS thread. Raises ExplainedError without such workers.
+    `workers` is a number of processes, `dask:ADDRESS` or `ray:ADDRESS`. If it is empty, joblib
+    decides: by `joblib.parallel_config` where a program set it, else the work is done in this
+    process. Each piece of work has one BLAS thread. Raises ExplainedError without such workers.
     """
     from joblib import Parallel, delayed, parallel_config  # slow to import
+    from joblib.parallel import get_active_backend
 
-    backend: dict[str, Any] = {}
-    if workers.startswith(DASK):
-        if importlib.util.find_spec("distributed") is None:
-            raise ExplainedError(f"--workers {workers}: the package distributed, of Dask, needed here")
-        backend = {"backend": "dask", "scheduler_host": workers.removeprefix(DASK)}
-    elif workers:
+    cluster, _, address = workers.partition(":")
+    backend: dict[str, Any] = {"backend": cluster} if address else {}
+    if backend and importlib.util.find_spec(CLUSTERS[cluster]) is None:
+        raise ExplainedError(f"--workers {workers}: the package {CLUSTERS[cluster]} needed here")
+    if workers and not backend:
         backend = {"backend": "loky", "n_jobs": int(workers)}
     try:
+        if cluster == "dask":
+            backend["scheduler_host"] = address
+        elif cluster == "ray":
+            _connect_to_ray(address)
         with parallel_config(**backend) if backend else contextlib.nullcontext():
-            parallel = Parallel(return_as="generator", max_nbytes=None)
-    except (OSError, ValueError) as error:  # the scheduler's address is not one, or nothing answers there
-        raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running scheduler's address needed") from None
+            in_turn = "generator" if get_active_backend()[0].supports_return_generator else "list"
+            parallel = Parallel(return_as=in_turn, max_nbytes=None)
+    except (OSError, ValueError, RuntimeError) as error:  # the address is not one, or nothing answers there
+        raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running cluster's address needed") from None
     try:
         yield from parallel(delayed(_alone)(work, item) for item in items)
     except BrokenExecutor:
         raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
+
+
+def _connect_to_ray(address: str) -> None:
+    """Connect to a Ray cluster, whose workers joblib then knows. Raises OSError, ValueError."""
+    import ray
+    from ray.util.joblib import register_ray
+
+    host, _, port = address.rpartition(":")
+    if port.isdecimal():  # where nothing listens, Ray would wait for minutes
+        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
+    register_ray()
+    ray.init(address=address, log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

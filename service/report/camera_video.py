@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.contract.explain import ExplainedError, in_words
+from service.contract.explain import ExplainedError
 from service.contract.images import CompressedImage
 from service.files.recording import Recording
+from service.process.progress import say
 
 CODEC, PIXELS = "h264", "yuv420p"
 OPTIONS = {"g": "2", "crf": "23"}  # a key frame at every second picture, as training reads at random
@@ -43,7 +44,7 @@ class _Video:
         except ImportError:
             raise ExplainedError(f"images of {key} need PyAV for a video: pip install 'thirdhand[video]'") from None
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.path, self.fps, self.sampled = path, fps, list[list[NDArray[np.float64]]]()
+        self.path, self.fps, self.sampled, self.has_damaged = path, fps, list[list[NDArray[np.float64]]](), False
         self.container, self._encoded = av.open(path, "w"), av.VideoFrame.from_image
         self._stream: Any = self.container.add_stream(CODEC, rate=fps, options=OPTIONS)
         self._stream.pix_fmt, self._stream.time_base = PIXELS, Fraction(1, fps)
@@ -51,22 +52,27 @@ class _Video:
 
     def begin(self, episodes: Sequence[CameraRows]) -> None:
         """Begin a recording with these episodes, whose images follow."""
-        self._rows = [(time_ns, i) for one in episodes for i, time_ns in enumerate(one.times_ns.tolist())][::-1]
+        self.rows = [(time_ns, i) for one in episodes for i, time_ns in enumerate(one.times_ns.tolist())][::-1]
         self._newest: CompressedImage | None = None
+        self._picture: Image.Image | None = None  # the last one that could be decoded
 
     def show(self, image: CompressedImage | None, at_ns: float) -> None:
         """Write the rows before an image's time with the image before it, else with itself; None
-        ends the recording.
+        ends the recording. In place of an image that cannot be decoded, the one before it is
+        written, or else the next one.
         """
         shown, picture = self._newest or image, None
-        while shown is not None and self._rows and self._rows[-1][0] < at_ns:
-            picture = picture or _opened(shown.data)
-            self._write(picture, self._rows.pop()[1])
+        if shown is not None and self.rows and self.rows[-1][0] < at_ns:
+            picture = _opened(shown.data)
+            self.has_damaged = self.has_damaged or picture is None
+            self._picture = picture = picture or self._picture
+        while picture is not None and self.rows and self.rows[-1][0] < at_ns:
+            self._write(picture, self.rows.pop()[1])
         self._newest = image
 
     def _write(self, picture: Image.Image, row: int) -> None:
         if self._size is None:
-            self._size = picture.width // 2 * 2, picture.height // 2 * 2  # even, as the colours need it
+            self._size = max(2, picture.width // 2 * 2), max(2, picture.height // 2 * 2)  # even, for the colours
             self._stream.width, self._stream.height = self._size
         shown = picture if picture.size == self._size else picture.resize(self._size)
         if row == 0:
@@ -86,11 +92,15 @@ class _Video:
         return {"dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"], "info": info}
 
 
-def _opened(file: bytes) -> Image.Image:
+def _opened(file: bytes) -> Image.Image | None:
+    """The picture in a file; None if it is damaged."""
     try:
-        return Image.open(io.BytesIO(file)).convert("RGB")
-    except OSError as error:
-        raise ExplainedError(f"an image of the recording cannot be decoded: {in_words(error)}") from None
+        image: Image.Image = Image.open(io.BytesIO(file))
+        if image.mode.startswith("I"):  # a grey of 16 bits
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        return image.convert("RGB")
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return None
 
 
 def write_videos(
@@ -116,8 +126,13 @@ def write_videos(
                     videos[key].show(image, at_ns)
             for key in seen:
                 videos[key].show(None, math.inf)
-            for key in videos.keys() - seen:
+            for key in [key for key in videos if key not in seen or videos[key].rows]:
                 video = videos.pop(key)
                 video.container.close()
-                video.path.unlink()
+                video.path.unlink(missing_ok=True)
+                if video.has_damaged:
+                    say(f"images of {key} cannot be decoded; it has no video")
+        for key, video in videos.items():
+            if video.has_damaged:
+                say(f"images of {key} cannot be decoded; in their place, its video has those beside them")
         return {key: (video.feature(), video.sampled) for key, video in sorted(videos.items())}

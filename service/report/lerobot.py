@@ -74,7 +74,7 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     arms = {(ElementTree.fromstring(urdf).get("name"), names) for urdf, names in told}
     if len(arms) > 1 or not parts:
         why = "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
-        raise ExplainedError(f"{folder} is not written: {why}")
+        raise ExplainedError(f"no data set is written: {why}")
     ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
     for i, part in enumerate(parts):
         row = np.arange(ends[i + 1] - ends[i])

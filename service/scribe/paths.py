@@ -5,6 +5,7 @@ limits.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 import time
 from datetime import UTC, datetime, timedelta
@@ -27,10 +28,21 @@ def stem_of(cell: str) -> str:
 
 
 def named_after(cell: str, folder: Path, suffix: str) -> list[Path]:
-    """The files of a kind in a folder that have names of this cell's recordings, oldest first."""
+    """The files of a kind in a folder that have names of this cell's recordings, oldest first.
+    Raises OSError.
+    """
     names = re.compile(re.escape(stem_of(cell)) + r"-\d{8}T\d{6}Z(-2)*")
-    found = sorted(folder.glob(f"*Z*{suffix}"))
+    found = sorted(folder.iterdir()) if folder.exists() else []  # iterdir reports a folder that cannot be read
     return [path for path in found if path.suffix == suffix and names.fullmatch(path.stem)]
+
+
+def _ages_s(changed: list[float], longest_gap_s: float) -> list[float]:
+    """The ages [s] of files from the times of their last changes, oldest first. A gap between two
+    of them, or after the last, counts as at most `longest_gap_s`, because the clock may have been
+    set meanwhile.
+    """
+    gaps = [min(max(0.0, end - begin), longest_gap_s) for begin, end in itertools.pairwise([*changed, time.time()])]
+    return list(itertools.accumulate(gaps[::-1]))[::-1]
 
 
 class RecordingPaths:
@@ -88,8 +100,10 @@ class RecordingPaths:
         ):
             found = self._found(suffix) if self._folder is not None and (keep_mb or keep_hours) else []
             total = sum(size for _, size, _ in found)
-            for path, size, changed in found:
-                too_old = keep_hours and time.time() - changed > keep_hours * 3600
+            longest_gap_s = keep_hours * 1800 + files.segment_minutes * 60
+            ages_s = _ages_s([changed for *_, changed in found], longest_gap_s)
+            for (path, size, _), age_s in zip(found, ages_s, strict=True):
+                too_old = keep_hours and age_s > keep_hours * 3600
                 too_much = keep_mb and total > keep_mb * MB
                 if (too_old or too_much) and (writing is None or path.stem != writing.stem):
                     with contextlib.suppress(OSError):

@@ -25,7 +25,7 @@ from support.paths import RECORDINGS, ROOT
 from support.wam import URDF
 
 NAMES = ("a.mcap", "b.mcap", "broken.mcap", "c.mcap")
-CLUSTER = """
+DASK = """
 import sys
 from distributed import LocalCluster
 from service.cli.main import main
@@ -33,6 +33,13 @@ if __name__ == "__main__":
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         code = main([*sys.argv[1:], "--workers", f"dask:{cluster.scheduler_address}"])
     sys.exit(code)
+"""
+RAY = """
+import os, subprocess, sys
+import ray
+address = ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR").address_info["address"]
+arguments = [*sys.argv[1:], "--workers", f"ray:{address}"]
+sys.exit(subprocess.run([sys.executable, "-m", "service", *arguments]).returncode)
 """
 
 
@@ -74,10 +81,11 @@ def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neith
     assert named_failures(shared.stderr) == [first, last]
 
 
-def test_a_dask_cluster_of_two_workers_prints_the_same(files: list[str], tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
+@pytest.mark.parametrize(("package", "cluster"), [("distributed", DASK), ("ray", RAY)], ids=["dask", "ray"])
+def test_a_cluster_of_two_workers_prints_the_same(package: str, cluster: str, files: list[str], tmp_path: Path) -> None:
+    pytest.importorskip(package)
     script = tmp_path / "with_a_cluster.py"
-    script.write_text(CLUSTER, encoding="utf-8")
+    script.write_text(cluster, encoding="utf-8")
     command = ["replay", "--each", *files]
     done = subprocess.run(
         [sys.executable, str(script), *command], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
@@ -92,7 +100,7 @@ def test_a_dask_cluster_of_two_workers_prints_the_same(files: list[str], tmp_pat
     [
         (("replay", "--workers", "2"), "--workers: --each needed"),
         (("replay", "--each", "--output", "new.mcap"), "--output writes the frames of one recording"),
-        (("report", "--workers", "many"), "many given; a number of processes, or dask:tcp://HOST:8786 needed"),
+        (("report", "--workers", "many"), "many given; a number of processes, dask:tcp://HOST:8786 or"),
         (("tune", "--plot", "tune.png"), "the picture is of one file; 4 given"),
     ],
 )

@@ -101,6 +101,27 @@ def test_what_prevents_a_start_is_one_line_and_exit_code_1(
     assert {path.name for path in tmp_path.iterdir()} <= {"cell.toml", "state"}
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("key.pem", "another's", "key.pem is not the key of"),
+        ("key.pem", "text", "key.pem is not the key of"),
+        ("key.pem", None, "cannot read"),
+        ("certificate.pem", "text", "certificate.pem does not hold a certificate"),
+        ("authority.pem", "", "authority.pem does not hold a certificate"),
+    ],
+)
+def test_a_certificate_and_a_key_that_do_not_fit_are_wrong(
+    name: str, content: str | None, words: str, tmp_path: Path
+) -> None:
+    assert told("certificates", str(tmp_path / "new")).returncode == 0
+    path = tmp_path / "new" / "daemon" / name
+    given = (tmp_path / "new" / "operator" / name).read_text() if content == "another's" else content
+    path.unlink() if given is None else path.write_text(given)
+    found = lines(tmp_path, code=1, listen=TLS, network=f"certificate = '{tmp_path}/new/daemon'\n")
+    assert words in found["wrong certificates"][0]
+
+
 def test_certificates_are_dated_and_keys_in_endpoints_are_not_shown(tmp_path: Path) -> None:
     assert told("certificates", str(tmp_path / "new"), "--days", "20").returncode == 0
     secured = f"certificate = '{tmp_path}/new/daemon'\n"

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from service.contract.explain import ExplainedError
-from service.process.parallel import spread
+from service.process.parallel import CLUSTERS, spread
 
 
-@pytest.mark.parametrize("address", ["foo", "tcp://foo", "tcp://"])
-def test_an_address_of_no_scheduler_is_refused_with_its_option(address: str) -> None:
-    pytest.importorskip("distributed")
-    with pytest.raises(ExplainedError, match=f"--workers dask:{address}: .*needed"):
-        list(spread(abs, [1], f"dask:{address}"))
+@pytest.mark.parametrize("address", ["dask:foo", "dask:tcp://foo", "dask:tcp://", "ray:foo", "ray:127.0.0.1:1"])
+def test_an_address_of_no_cluster_is_refused_with_its_option(address: str) -> None:
+    pytest.importorskip(CLUSTERS[address.partition(":")[0]])
+    begun_s = time.monotonic()
+    with pytest.raises(ExplainedError, match=f"--workers {address}: .*needed"):
+        list(spread(abs, [1], address))
+    assert time.monotonic() - begun_s < 30

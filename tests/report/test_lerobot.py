@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from pyarrow import parquet
 
 from service.cli.main import main
 from service.contract import cdr
 from service.contract.images import CompressedImage, encode_image
 from service.core.controller import Controller, run
-from service.core.frame import Tick
+from service.core.frame import Frame, Tick
 from service.files.recording import Recorder, Recording
 from service.files.replay import ticks
 from service.learning.skill_file import StoredSkill
@@ -169,12 +173,87 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
     assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (1, 0, (2, 7))
 
 
-def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
-    """A recording of an arm that tells nothing of its joints."""
+def recorded(
+    path: Path,
+    skill: StoredSkill,
+    inputs: list[Tick],
+    urdf: str = URDF,
+    images: Sequence[tuple[int, str, bytes]] = (),
+) -> Path:
+    """A recording of an arm that tells nothing of its joints; `images` by tick and key."""
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf) as recorder:
-        run(controller, inputs, [lambda tick, frame: recorder.write(tick, frame, time_ns=tick.index * 2_000_000)])
+
+        def keep(tick: Tick, frame: Frame) -> None:
+            time_ns = tick.index * 2_000_000
+            recorder.write(tick, frame, time_ns=time_ns)
+            for at, key, file in images:
+                if at == tick.index:
+                    recorder.image(key, encode_image(CompressedImage(time_ns, "lens", "png", file)), time_ns)
+
+        run(controller, inputs, [keep])
     return path
+
+
+def png(mode: str = "RGB", size: tuple[int, int] = (64, 48)) -> bytes:
+    """The file of a picture of level 77, or 77 of 255 with 16 bits."""
+    out, level = io.BytesIO(), {"RGB": (77, 77, 77), "RGBA": (77, 77, 77, 9), "L": 77, "I;16": 77 * 257}[mode]
+    Image.new(mode, size, level).save(out, "PNG")
+    return out.getvalue()
+
+
+CUT = png()[:-40]
+STREAMS = {
+    "two sizes": [png(), png(size=(33, 21)), png(size=(640, 480))],
+    "odd size": [png(size=(65, 49))],
+    "one pixel": [png(size=(1, 1))],
+    "16 bits": [png("I;16")],
+    "grey": [png("L")],
+    "transparent": [png("RGBA")],
+    "damaged first": [CUT, png(), png()],
+    "damaged later": [png(), CUT, png(), png()[:60], CUT],
+    "damaged": [CUT],
+}
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_odd_images_become_a_video_with_a_picture_for_each_row(
+    stream: str, skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At irregular times, beside a camera that starts late."""
+    av = pytest.importorskip("av", reason="videos need the extra `video`")
+    files = STREAMS[stream]
+    images = [(10 + 3 * i**2, "camera/odd", file) for i, file in enumerate(files)] + [(80, "late", png())]
+    path = recorded(tmp_path / "a.mcap", skill, resting(0, 100), images=images)
+    assert main(["report", str(path), "--lerobot", str(tmp_path / "data"), "--fps", "500"]) == 0
+    info = json.loads((tmp_path / "data" / "meta" / "info.json").read_text())
+    keys = {f"observation.images.{name}" for name in ("late", "camera_odd")[: 1 + (stream != "damaged")]}
+    assert {name for name in info["features"] if "images" in name} == keys
+    for key in keys:
+        shown = tmp_path / "data" / info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
+        with av.open(str(shown)) as container:
+            levels = [one.to_ndarray(format="rgb24").mean() for one in container.decode(container.streams.video[0])]
+        assert len(levels) == info["total_frames"] > 10
+        np.testing.assert_allclose(levels, 77, atol=4)
+    assert ("cannot be decoded" in capsys.readouterr().err) == ("damaged" in stream)
+
+
+def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
+    skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    disk, path = tmp_path / "disk", recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    disk.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", disk], capture_output=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
+    try:
+        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1
+        assert f"{disk}/data: No space left on device; room on that disk needed" in capsys.readouterr().err
+        assert list(disk.iterdir()) == []
+        subprocess.run(["mount", "-o", "remount,size=4m", disk], check=True)
+        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
+    finally:
+        subprocess.run(["umount", "--lazy", disk], check=True, timeout=10)
 
 
 def test_an_arm_that_tells_nothing_is_where_it_was_last_told_to_be(skill: StoredSkill, tmp_path: Path) -> None:

@@ -124,13 +124,36 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
     assert places.keep_mb_left == pytest.approx(0.5 * size_mb + 0.02, rel=0.05)
     os.utime(old[2], (0, 0))
     os.utime(drawings[2], (0, 0))
-    for limits, removed in (({"rerun_keep_hours": 1}, [drawings[2]]), ({"keep_hours": 1}, [old[2]])):
+    for limits, removed in (({"rerun_keep_hours": 0.3}, [drawings[2]]), ({"keep_hours": 0.3}, [old[1], old[2]])):
         aged = RecordingPaths(with_limits(**limits), str(tmp_path), None, None)
         assert aged.prune(current) == removed
         assert aged.keep_mb_left == pytest.approx(60_000, rel=0.01)
     unlimited = RecordingPaths(with_limits(rerun_keep_mb=0), str(tmp_path), None, None)
     assert unlimited.prune(current) == []
     assert unlimited.keep_mb_left is None
+
+
+@pytest.mark.parametrize(
+    ("set_years", "set_before", "count"),
+    [(0, 0, 24), (10, 0, 12), (10, 5, 13), (-2, 0, 25), (-2, 5, 25)],
+    ids=["right", "ahead now", "ahead five files ago", "back now", "back five files ago"],
+)
+def test_a_clock_that_was_set_makes_no_recording_much_older(
+    set_years: int, set_before: int, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drawing an hour, of which those of a day are kept; the clock was set before the last
+    `set_before` of them.
+    """
+    settings, now_s, set_s = with_limits(rerun_keep_hours=24), 1.8e9, set_years * 365 * 86400
+    for hours in range(31):
+        path = tmp_path / f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd"
+        path.write_bytes(b"")
+        changed_s = now_s - 3600 * hours + set_s * (hours < set_before)
+        os.utime(path, (changed_s, changed_s))
+    monkeypatch.setattr("service.scribe.paths.time.time", lambda: now_s + set_s + 1)
+    RecordingPaths(settings, str(tmp_path), None, None).prune(None)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd" for hours in reversed(range(count))]
 
 
 class Session:
