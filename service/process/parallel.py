@@ -36,6 +36,8 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
     if workers and not backend:
         backend = {"backend": "loky", "n_jobs": int(workers)}
     try:
+        if cluster in CLUSTERS:
+            _try(address)
         if cluster == "dask":
             backend["scheduler_host"] = address
         elif cluster == "ray":
@@ -43,7 +45,7 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
         with parallel_config(**backend) if backend else contextlib.nullcontext():
             in_turn = "generator" if get_active_backend()[0].supports_return_generator else "list"
             parallel = Parallel(return_as=in_turn, max_nbytes=None)
-    except (OSError, ValueError, RuntimeError) as error:  # the address is not one, or nothing answers there
+    except (OSError, ValueError, RuntimeError, OverflowError) as error:  # no address, or nothing answers there
         raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running cluster's address needed") from None
     try:
         yield from parallel(delayed(_alone)(work, item) for item in items)
@@ -51,14 +53,21 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
         raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
 
 
+def _try(address: str) -> None:
+    """Connect to a cluster's address and leave: where nothing listens, its client would wait for
+    minutes. Raises OSError, ValueError, OverflowError.
+    """
+    host, _, port = address.rpartition("/")[2].rpartition(":")
+    if not port.isdecimal():
+        raise ValueError("it has no port")
+    socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
+
+
 def _connect_to_ray(address: str) -> None:
     """Connect to a Ray cluster, whose workers joblib then knows. Raises OSError, ValueError."""
     import ray
     from ray.util.joblib import register_ray
 
-    host, _, port = address.rpartition(":")
-    if port.isdecimal():  # where nothing listens, Ray would wait for minutes
-        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
     register_ray()
     ray.init(address=address, log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
 

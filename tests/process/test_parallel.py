@@ -10,7 +10,18 @@ from service.contract.explain import ExplainedError
 from service.process.parallel import CLUSTERS, spread
 
 
-@pytest.mark.parametrize("address", ["dask:foo", "dask:tcp://foo", "dask:tcp://", "ray:foo", "ray:127.0.0.1:1"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "dask:foo",
+        "dask:tcp://foo",
+        "dask:tcp://",
+        "dask:127.0.0.1:99999",
+        "dask:tcp://127.0.0.1:1",
+        "ray:foo",
+        "ray:127.0.0.1:1",
+    ],
+)
 def test_an_address_of_no_cluster_is_refused_with_its_option(address: str) -> None:
     pytest.importorskip(CLUSTERS[address.partition(":")[0]])
     begun_s = time.monotonic()
