@@ -15,8 +15,8 @@ from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.settings.arm_description import description
 from service.settings.config import load
-from service.settings.file_content import whole
 from service.settings.mesh_cover import unfound
+from service.settings.whole_file import whole
 
 DEGREES = 7.0  # [rad] larger limits of a revolute joint are probably in degrees
 

@@ -25,7 +25,7 @@ from service.files.mcap_file import machine
 from service.files.shipped import cell_of
 from service.scribe.paths import MB, named_after, stem_of
 from service.settings.config import Settings, without_secrets
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
 _KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL)

@@ -21,7 +21,7 @@ from service.cli.usage import UsageError
 from service.client import AUTHORITY, CERTIFICATE, KEY
 from service.contract.explain import ExplainedError, in_words
 from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 DAYS = 3650
 AUTHORITY_KEY = "authority.key"

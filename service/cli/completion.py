@@ -8,7 +8,7 @@ from pathlib import Path
 from service.cli.usage import check_writable
 from service.contract.explain import ExplainedError
 from service.process.progress import say
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 
 def completion(args: argparse.Namespace) -> int:

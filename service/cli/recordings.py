@@ -37,7 +37,7 @@ from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
 from service.process.progress import progress, say, steps
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 

@@ -24,7 +24,7 @@ from service.process.progress import progress
 from service.report.columns import KEPT
 from service.report.report import Report, reported
 from service.report.tables import Table, comparison, names_of, summary, tables
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}

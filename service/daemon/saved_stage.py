@@ -9,7 +9,7 @@ from service.core.skill.skill import Skill
 from service.daemon.saved_state import restored
 from service.daemon.single_instance import state_folder
 from service.settings.config import Settings
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 MAX_RESTART_S = 600.0  # after a longer pause the task begins again, at the stage where the hands are
 MIN_BELIEF = 0.5  # a less probable stage is not saved

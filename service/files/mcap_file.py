@@ -19,7 +19,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 from service.core.frame import definitions
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
 _BYTES = "application/octet-stream"

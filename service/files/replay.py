@@ -20,7 +20,7 @@ from service.files.mcap_file import RecordingError, machine
 from service.files.recording import Recorder, Recording
 from service.files.steps import Gap, Step, checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.settings.file_content import whole
+from service.settings.whole_file import whole
 
 REPLAY_TOLERANCE = 1e-5  # [m, rad] other machines may differ by this, because their last bits differ
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from service.contract.explain import ExplainedError, in_words
 
 CLUSTERS = {"dask": "distributed", "ray": "ray"}  # back ends of joblib that are clusters, and their packages
-CONNECT_TIMEOUT_S = 3.0
+CLUSTER_TIMEOUT_S = 3.0
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
@@ -60,7 +60,7 @@ def _try(address: str) -> None:
     host, _, port = address.rpartition("/")[2].rpartition(":")
     if not port.isdecimal():
         raise ValueError("it has no port")
-    socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
+    socket.create_connection((host, int(port)), timeout=CLUSTER_TIMEOUT_S).close()
 
 
 def _connect_to_ray(address: str) -> None:
