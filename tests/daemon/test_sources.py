@@ -155,7 +155,10 @@ def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: in
             told_of.add(told.because)
             for side in ("left", "right"):
                 assert re.search(rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", told.because)
-            assert told.remedy == "publish hands more often, or raise [hands] stale_ms"
+            assert (
+                told.remedy
+                == "publish hands more often, or raise [hands] stale_ms; or [hands] stale_max_ms if they come in bursts"
+            )
     assert told_of
 
 
