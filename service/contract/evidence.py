@@ -227,7 +227,7 @@ def _contest(seen: Evidence) -> str:
 
 
 def two_places(source: Source) -> str:
-    """What the samples of a hand look like that two trackers publish, while it rests."""
+    """The sign, in words, that two trackers publish the same hand; it appears while that rests."""
     return f"at rest, its samples alternate between two places {source.apart_mm:g} mm apart"
 
 

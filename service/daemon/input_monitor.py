@@ -51,7 +51,7 @@ class _History:
         self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
         self.cause, self.refused_s = "", -math.inf
         self.apart: deque[tuple[float, float]] = deque()
-        self.told_apart = False
+        self.is_apart_logged = False
 
 
 class InputMonitor:
@@ -143,9 +143,9 @@ class InputMonitor:
         for source, now in sources.items():
             history, name = self._histories[source], SOURCE_NAMES[source]
             logged, found = history.logged, history.found
-            if now.apart_mm and not history.told_apart:
-                history.told_apart = True
-                yield f"{name}: {two_places(now)}: {what_to_do(Condition.TWO_PLACES)}"
+            if now.apart_mm and not history.is_apart_logged:
+                history.is_apart_logged = True
+                yield name + in_full(two_places(now), what_to_do(Condition.TWO_PLACES))
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
                 yield f"{name}: rejected as {cause}{in_full(*found[cause])}"

@@ -374,20 +374,20 @@ def two_trackers(
 
 
 @pytest.mark.parametrize("rates_hz", [(100.0, 100.0), (97.0, 100.0), (100.0, 60.0), (30.0, 30.0)])
-def test_two_trackers_a_few_millimetres_apart_are_told_by_a_hand_that_rests(
+def test_two_trackers_a_few_millimetres_apart_are_detected_while_the_hand_rests(
     rates_hz: tuple[float, float], skill: Skill
 ) -> None:
-    cell, now_s, told = Cell(skill), 0.0, 0.0
+    cell, now_s, apart_mm = Cell(skill), 0.0, 0.0
     for position, at_s in zip(*two_trackers(0.005, noise_m=0.0007, rates_hz=rates_hz), strict=True):
         while now_s + cell.settings.period_s < at_s:
             cell.tell()
             now_s += cell.settings.period_s
             if round(now_s / cell.settings.period_s) % 50 == 0:
-                told = cell.status(now_s).sources["left"].apart_mm
-                assert not told or now_s > 2.5
+                apart_mm = cell.status(now_s).sources["left"].apart_mm
+                assert not apart_mm or now_s > 2.5
         cell.tell(("left", pose(S + round(S * at_s), tuple(position.tolist()))))
         now_s += cell.settings.period_s
-    assert told == pytest.approx(5.0, abs=0.5)
+    assert apart_mm == pytest.approx(5.0, abs=0.5)
     (line,) = (line for line in cell.log if "alternate" in line)
     assert line.startswith("left hand: at rest, its samples alternate between two places ")
     assert "stop one" in line
