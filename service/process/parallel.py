@@ -60,7 +60,7 @@ def _try(address: str) -> None:
     host, _, port = address.rpartition("/")[2].rpartition(":")
     if not port.isdecimal():
         raise ValueError("it has no port")
-    socket.create_connection((host, int(port)), timeout=CLUSTER_TIMEOUT_S).close()
+    socket.create_connection((host.strip("[]"), int(port)), timeout=CLUSTER_TIMEOUT_S).close()
 
 
 def _connect_to_ray(address: str) -> None:
