@@ -126,7 +126,7 @@ def check_writable(path: Path, suffix: str = "") -> None:
     """Raise UsageError if no file of this suffix can be written at a path; for a check before long
     work.
     """
-    folder = Path(os.path.realpath(path)).parent  # of the file that a link leads to
+    folder = Path(os.path.realpath(path) if path.is_symlink() else path).parent
     if path.is_dir():
         raise UsageError(f"{path} is a folder; the name of a file needed")
     if suffix and path.suffix.lower() != suffix:

@@ -244,7 +244,7 @@ def test_what_rest_is_is_told_as_it_is() -> None:
     assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
     assert f"{RETAINED_REST_S:g} s are then retained" in options
     page = " ".join((ROOT / "docs" / "record-takes.md").read_text(encoding="utf-8").split())
-    assert f"within {1000 * REST_M:g} mm, and joints within {REST_RAD:g} rad, for that time" in page
+    assert f"each stays within {1000 * REST_M:g} mm, and each joint of the arm within {REST_RAD:g} rad" in page
     assert MOVED_RATIO == 5, "the page says five times"
 
 
