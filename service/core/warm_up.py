@@ -51,7 +51,7 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     )
     for one in (plain, skill):
         one.predict(*np.zeros((3, 2, 3)))
-    plain.elsewhere(np.zeros((2, 3, 3)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
+    plain.model.elsewhere(np.zeros((3, 6)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
     other = replace(plain, model=HandsKMP(KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)))
     other.predict(*np.zeros((3, 2, 3)))
     other.model.mean(np.zeros((1, 6)))

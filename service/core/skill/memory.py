@@ -126,6 +126,37 @@ def delayed(moving: Vector, memory: Vector, late_s: float, out: Vector) -> None:
 
 
 @compiled
+def recall(
+    states: Records, rules: Records, now: Vector, moving: Vector, past: Vector, turns: Vector, stillness: Vector
+) -> bool:
+    """Update the memory of the hands, and write what a skill predicts from, see `Seen`: motion
+    `now` (3, 6), motion `moving` (3, 6) `late_s` ago, `past` (ORDER, 6), `turns` (TURNS, 18) and
+    `stillness` (2,). Column group n is that of the hand `sides`[n].
+
+    Returns true if a hand has a new sample in this tick, or if the state has no covariance yet.
+    """
+    state, rule = states[0], rules[0]
+    remember(states, rule.period_s, rule.lag_s, rule.turn_lag_s)
+    for n in range(2):
+        side = rule.sides[n]
+        stillness[n] = state.hand_stillness[side]
+        for i in range(3):
+            for order in range(3):
+                now[order, 3 * n + i] = state.hands[side, order, i]
+            for row in range(len(past)):
+                past[row, 3 * n + i] = state.memory[row, side, i]
+        for i in range(9):
+            for row in range(len(turns)):
+                turns[row, 9 * n + i] = state.turns[row, side, i]
+    if rule.late_s == 0.0:
+        moving[:] = now
+    else:
+        delayed(now, past, rule.late_s, moving)
+    has_sample = state.hand_ticks[0] == state.tick or state.hand_ticks[1] == state.tick
+    return bool(has_sample or state.covariance[0, 0] == 0.0)
+
+
+@compiled
 def _filtered(values: Vector, share: float, steps: int, out: Vector) -> None:
     """Rows of the cascade along values (T, D), written to `out` (T, K, D); each interval between
     two values is interpolated linearly in some `steps`.

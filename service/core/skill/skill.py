@@ -200,7 +200,7 @@ class Skill(Immutable):
         The result is rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines whose last bits differ agree
         in all that follows.
         """
-        now = self._moving(hands, velocities, accelerations)
+        now = self._conducting(np.stack([hands, velocities, accelerations])).reshape(3, 6)
         behind = np.tile(now[0], (ORDER, 1)) if past is None else self._conducting(past).reshape(ORDER, 6)
         if belief is None:
             belief = self.model.belief(now[0])
@@ -211,7 +211,12 @@ class Skill(Immutable):
         if self.conductor is not None:
             stillness = stillness[[self.conductor] * 2]
         told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
-        seen = Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s, clock)
+        return self.predicted(
+            Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s, clock), before
+        )
+
+    def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
+        """Prediction for hands that move like this; `before` as in `predict`."""
         motion = self.model.predict(seen, None if before is None else before[0])
         if before is not None and math.isnan(motion.gate_m):
             motion = motion._replace(gate_m=before[3])
@@ -224,19 +229,6 @@ class Skill(Immutable):
         if self.gripper is None or before is not None:
             return Prediction(*motion, turn, NO_GRIPPER if before is None else before[2])
         return Prediction(*motion, turn, self.gripper.predict(at))
-
-    def elsewhere(self, hands: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
-        """See `Model.elsewhere`, for the motion (2, 3, 3) of both hands."""
-        now = self._moving(hands[:, 0], hands[:, 1], hands[:, 2])
-        if self.conductor is not None:
-            stillness = stillness[[self.conductor] * 2]
-        return self.model.elsewhere(now, stillness, period_s, belief, unprimed)
-
-    def _moving(self, hands: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Motion (3, 6) of both hands: positions, velocities, accelerations."""
-        moving = np.empty((3, 2, 3))  # filled row by row, which is faster than np.array of three views
-        moving[0], moving[1], moving[2] = hands, velocities, accelerations
-        return self._conducting(moving).reshape(3, 6)
 
     def _conducting(self, both: Vector) -> Vector:
         """Arrays of both hands (M, 2, D). If one hand leads alone, the other hand's values are

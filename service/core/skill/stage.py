@@ -6,15 +6,15 @@ import numpy as np
 
 from service.core.frame import Record, as_array, parameters
 from service.core.numerics import UNPRIMED_DECIDED
-from service.core.skill import ORDER
-from service.core.skill.memory import remember, turn_lag_s
-from service.core.skill.model import Target, Wanted
+from service.core.skill import ORDER, TURNS
+from service.core.skill.memory import recall, turn_lag_s
+from service.core.skill.model import Seen, Target, Wanted
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import NEVER, Skill, clamp, reach_of
 from service.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_stage
 from service.core.skill.task_clock import move
 from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
-from service.core.skill.unseen import off_m
+from service.core.skill.unseen import deviation_m, off_m
 from service.settings.config import Settings
 
 
@@ -23,12 +23,15 @@ class SkillStage:
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
         self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
+        self._now, self._moving = np.empty((3, 6)), np.empty((3, 6))  # what `recall` writes
+        self._past, self._turns, self._still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
         self._take(skill)
 
     def _take(self, skill: Skill) -> None:
         """Put a skill into force, with the time constant of the hands' memory that it needs."""
         self.skill = skill
-        delay_s = max(skill.model.delay_s - self._lead_s, 0.0)
+        late_s = skill.model.delay_s - self._lead_s
+        delay_s, self._seen_turn_lag_s = max(late_s, 0.0), turn_lag_s(late_s)
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
         self._clock, side = skill.model.clock_rows, skill.conductor
@@ -37,6 +40,10 @@ class SkillStage:
         self._doubts = regions.alarm > 0.0 and bool(skill.model.names)
         self._rules = parameters(
             period_s=self._period_s,
+            lag_s=self._lag_s,
+            turn_lag_s=self._turn_lag_s,
+            late_s=late_s,
+            sides=self._sides,
             workspace=skill.workspace,
             reach=reach_of(self._reach),
             scale=regions.scale,
@@ -65,34 +72,36 @@ class SkillStage:
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
         """Request of the skill for the hands in the state, which must be known; `unseen` is the
         side of a hand that is not seen now. Covariances and closure are computed at new samples
-        only.
+        only. The doubt is the probability that the task did not begin at its first stage.
         """
+        states, frames, rules = as_array(state), as_array(frame), self._rules
         self._count(state)
-        remember(as_array(state), self._period_s, self._lag_s, self._turn_lag_s)
-        hands, known, tick = state["hands"], state["covariance"], int(state["tick"])
-        is_new, before = tick in state["hand_ticks"].tolist() or known[0, 0] == 0.0, None
+        is_new = recall(states, rules, self._now, self._moving, self._past, self._turns, self._still)
+        belief, known, before = state["stage_belief"], state["covariance"], None
+        seen = Seen(
+            self._moving,
+            self._still,
+            self._past,
+            self._turns,
+            self._seen_turn_lag_s,
+            self._now,
+            belief,
+            self._period_s,
+            state["task_clock"],
+        )
         if not is_new:
             before = known, state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
-        found = self.skill.predict(
-            hands[:, 0],
-            hands[:, 1],
-            hands[:, 2],
-            state["hand_stillness"],
-            before=before,
-            past=state["memory"],
-            turns=state["turns"],
-            belief=state["stage_belief"],
-            period_s=self._period_s,
-            lead_s=self._lead_s,
-            clock=state["task_clock"],
-        )
+        found = self.skill.predicted(seen, before)
         if is_new:
-            state["covariance"], state["orientation_covariance"] = found.covariance, found.turn.covariance
-            state["closure"], state["known_gate_m"] = found.closure, found.gate_m
-        frame["orientation"], frame["turning"], frame["orientation_covariance"] = found.turn
-        off = 0.0 if unseen is None else off_m(self.skill, state, unseen, self._period_s)
-        doubt = self._doubt_of_start(state) if self._doubts else 0.0
-        outcome = conclude(as_array(state), as_array(frame), self._rules, found[:6], found.closure, off, doubt)
+            state["known_gate_m"] = found.gate_m
+        off = 0.0
+        if unseen is not None:
+            columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
+            off = off_m(self.skill.model, seen, columns, deviation_m(states, unseen, self._period_s), known)
+        doubt, unprimed = 0.0, state["unprimed_belief"]
+        if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
+            doubt = self.skill.model.elsewhere(self._now, self._still, self._period_s, belief, unprimed)
+        outcome = conclude(states, frames, rules, found[:6], found.turn, found.closure, off, doubt)
         target = Target(*found[:3], clamped=False)
         if outcome & IS_OUTSIDE:
             target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
@@ -109,15 +118,6 @@ class SkillStage:
         before = int(state["memory_ticks"].max())
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
         move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
-
-    def _doubt_of_start(self, state: Record) -> float:
-        """Probability that the task did not begin at its first stage."""
-        unprimed = state["unprimed_belief"]
-        if unprimed[0] == UNPRIMED_DECIDED:
-            return 0.0
-        return self.skill.elsewhere(
-            state["hands"], state["hand_stillness"], self._period_s, state["stage_belief"], unprimed
-        )
 
     def set_stage(self, state: Record, name: str) -> None:
         """Set the belief to the stage that begins at the via-point of this name (at the last

@@ -65,6 +65,7 @@ def conclude(
     frames: Records,
     rules: Records,
     motion: tuple[Vector, Vector, Vector, Vector, float, float],
+    turn: tuple[Vector, Vector, Vector],
     closure: float,
     off: float,
     doubt: float,
@@ -72,8 +73,9 @@ def conclude(
     """Write a prediction into the frame with its calibrated covariance, the probability of an error
     p and the most probable stage; update the skill's part of the state.
 
-    `motion` are the first parts of a `Prediction`; `off` [m] is the possible error because a
-    hand is not seen, and `doubt` the probability that the task did not begin at its first stage:
+    `motion` are the first parts of a `Prediction`, `turn` its `Turn`; `off` [m] is the possible
+    error because a hand is not seen, and `doubt` the probability that the task did not begin at its
+    first stage:
 
         p = p_C + (1 - p_C) doubt,   p_C = error_probability(C, off² / REGION_95)
 
@@ -84,7 +86,9 @@ def conclude(
     state, frame, rule = states[0], frames[0], rules[0]
     position, velocity, acceleration, covariance, gate_m, ambiguity = motion
     frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = position, velocity, acceleration
+    frame.orientation[:], frame.turning[:], frame.orientation_covariance[:] = turn
     frame.gate_m, frame.closure = gate_m, closure
+    state.covariance[:], state.orientation_covariance[:], state.closure = covariance, turn[2], closure
     passed_s, state.trail_tick = (state.tick - state.trail_tick) * rule.period_s, state.tick
     moved = recent(position, passed_s, state.trail)
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)

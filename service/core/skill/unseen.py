@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Record, Records, Vector, as_array
+from service.core.frame import Records, Vector
 from service.core.intake.tuning import MODE_PRIOR, MODE_SWITCH_RATES_PER_S
-from service.core.skill.model import REGION_95
-
-if TYPE_CHECKING:
-    from service.core.skill.skill import Skill
-
-STANDS = np.zeros((2, 3))  # velocities and accelerations of both hands: not needed for the position
+from service.core.skill.memory import turn_lag_s
+from service.core.skill.model import REGION_95, Model, Seen
 
 
 @compiled
@@ -37,35 +32,23 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     return math.sqrt(variance)
 
 
-def off_m(skill: Skill, state: Record, side: int, period_s: float) -> float:
+def off_m(model: Model, seen: Seen, columns: list[int], deviation: float, known: Vector) -> float:
     """Possible error [m] of the target because one hand is not seen.
 
-    With d = sqrt(REGION_95) * `deviation_m`, the prediction is repeated with that hand moved by d
-    along each axis; the result is the norm of the three differences (3, 3). The skill's delay is
-    left out.
+    With d = sqrt(REGION_95) * `deviation` [m], the prediction for the hands `seen` is repeated with
+    that hand, whose x, y and z begin at `columns` (a hand that leads alone stands for both), moved
+    by d along each axis. The result is the norm of the three differences (3, 3). Velocities and the
+    skill's delay are left out; the `known` covariance (3, 3) need not be computed.
     """
-    by_m = math.sqrt(REGION_95) * deviation_m(as_array(state), side, period_s)
-    known = state["covariance"], state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
-
-    def tool(hands: Vector) -> Vector:
-        """Predicted position (3,) [m] of the tool for hands (2, 3) [m] at rest."""
-        return skill.predict(
-            hands,
-            STANDS,
-            STANDS,
-            state["hand_stillness"],
-            before=known,
-            past=state["memory"],
-            turns=state["turns"],
-            belief=state["stage_belief"],
-            lead_s=skill.model.delay_s,
-            clock=state["task_clock"],
-        ).position
-
-    hands = state["hands"][:, 0]
-    off, here = np.empty((3, 3)), tool(hands)
+    if not columns:
+        return 0.0
+    at, off = np.zeros((3, 6)), np.empty((3, 3))
+    resting = seen._replace(moving=at, now=at, turn_lag_s=turn_lag_s(0.0), period_s=0.0)
+    at[0] = seen.now[0]
+    here = model.predict(resting, known).position
     for axis in range(3):
-        there = hands.copy()
-        there[side, axis] += by_m
-        off[axis] = tool(there) - here
+        at[0] = seen.now[0]
+        for column in columns:
+            at[0, column + axis] += math.sqrt(REGION_95) * deviation
+        off[axis] = model.predict(resting, known).position - here
     return float(np.linalg.norm(off))
