@@ -60,7 +60,7 @@ from service.settings.config import Settings
 # Plain integers, because combining the members of an enumeration takes a microsecond.
 CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
 SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
-ENGAGING = int(Flag.ENGAGING)
+ENGAGING, EITHER_UNSEEN = int(Flag.ENGAGING), sum(UNSEEN)
 SAMPLES = {channel.key for channel in CHANNELS if channel.direction == "in" and channel.event}
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -101,7 +101,7 @@ class Controller:
         self._setpoint = SetpointStage(settings, self._arm)
         self._limiter = LimiterStage(settings, self._arm)
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
-        self._here: Kinematics | None = None  # kinematics at the state's joints
+        self._here: Kinematics | None = None  # kinematics at the state's joints; None: not yet computed
 
     @property
     def state(self) -> Record:
@@ -133,7 +133,7 @@ class Controller:
         conditions = self._take_in(tick, frame)
         lap("intake")
         conditions |= self._alone(frame)
-        unseen = UNSEEN.index(side) if (side := conditions & sum(UNSEEN)) else None
+        unseen = UNSEEN.index(side) if (side := conditions & EITHER_UNSEEN) else None
         wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
         if wanted is not None:
             conditions |= STAGE_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
@@ -178,8 +178,11 @@ class Controller:
         A hand that was seen lately may be near, so the arm holds. The arm keeps away from where the
         other hand was last seen.
         """
-        side, ages = self.skill.conductor, frame["hand_ages"]
-        if side is None or ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
+        side = self.skill.conductor
+        if side is None:
+            return 0
+        ages = frame["hand_ages"]
+        if ages[side] < 0 or 0 <= ages[1 - side] < self._gone_ticks:
             return 0
         return ONE_HAND | (HANDS_KNOWN if ages[side] < frame["stale_ticks"][side] else 0)
 
@@ -197,6 +200,7 @@ class Controller:
         starts = self.decision.step(state, frame, here.record, conditions, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
+            self._here = None
         if starts:
             here = self._at()
             self._setpoint.begin(state, frame, here)
@@ -244,10 +248,9 @@ class Controller:
 
     def _at(self) -> Kinematics:
         """Kinematics of the arm at the state's joints, computed once for each posture."""
-        joints, here = self._state["joints"][0], self._here
-        if here is None or here.record["joints"][0].tobytes() != joints.tobytes():
-            here = self._here = self._arm.at(joints)
-        return here
+        if self._here is None:
+            self._here = self._arm.at(self._state["joints"][0])
+        return self._here
 
 
 def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:

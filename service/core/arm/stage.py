@@ -33,6 +33,8 @@ from service.core.separation.stage import Separation
 from service.settings.config import Reach, Settings
 from service.settings.urdf import Urdf
 
+AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED  # of the tool's Jacobian: frame base, at the tool
+
 
 class Solution(NamedTuple):
     """Joint velocities (J,) [rad/s] and accelerations (J,) [rad/s²] that follow the setpoint.
@@ -146,11 +148,9 @@ class Arm:
         """Kinematics of the arm at joints q (J,) [rad, m]."""
         here = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
         stand(here, q)
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian = pin.computeFrameJacobian(self._model, self._data, here["joints"][0], self._tool, axes)
+        jacobian = pin.computeFrameJacobian(self._model, self._data, here["joints"][0], self._tool, AXES)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        here["position"][0] = placement.translation
-        describe(self.parameters, here, np.ascontiguousarray(jacobian), placement.rotation.copy())
+        describe(self.parameters, here, jacobian, placement.homogeneous)
         return Kinematics(here)
 
     def costs(self, here: Kinematics) -> Vector:

@@ -37,10 +37,11 @@ def stand(heres: Records, q: Vector) -> None:
 
 
 @compiled
-def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) -> None:
-    """Write Jacobian, rotation, task matrix and damping of the arm at some joints.
+def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> None:
+    """Write Jacobian, position, rotation, task matrix and damping of the arm at some joints.
 
-    With the tool's Jacobian (6, J) = (Jv; Jw), rotation R (3, 3) and the turn lever l [m]:
+    With the tool's Jacobian (6, J) = (Jv; Jw), the rotation R (3, 3) of its `pose`, a homogeneous
+    matrix (4, 4), and the turn lever l [m]:
 
         tasks (5 or 6, J) = (Jv; l R^T Jw)                row 5, if present, is the turn about +z
         damping [m²] = damping0 + singular_damping max(1 - sqrt(det(Jv Jv^T)) / singular_volume, 0)²
@@ -53,14 +54,14 @@ def describe(arms: Records, heres: Records, jacobian: Vector, rotation: Vector) 
     """
     arm, here = arms[0], heres[0]
     joints, gram, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
-    here.jacobian[:], here.rotation[:] = jacobian, rotation
+    here.jacobian[:], here.position[:], here.rotation[:] = jacobian, pose[:3, 3], pose[:3, :3]
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
         for i in range(len(tasks) - 3):
             turn = 0.0
             for k in range(3):
-                turn += rotation[k, i] * jacobian[3 + k, joint]
+                turn += pose[k, i] * jacobian[3 + k, joint]
             tasks[3 + i, joint] = arm.turn_lever * turn
     for i in range(3):
         for j in range(3):

@@ -54,9 +54,9 @@ class Decision:
         `gate_m` [m] is compared with the skill's `threshold` [m]; it is NaN if the skill predicts
         nothing.
         """
-        gates = gate_m, threshold
-        starts, error, speed = step(as_array(state), as_array(frame), here, self._parameters, conditions, *gates)
-        frame["mode"], frame["reason"] = state["mode"], state["reason"]
+        starts, error, speed = step(
+            as_array(state), as_array(frame), here, self._parameters, conditions, gate_m, threshold
+        )
         if error >= 0.0:
             self.measured = error, speed
         return int(starts)

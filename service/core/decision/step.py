@@ -67,7 +67,25 @@ def step(
     gate_m: float,
     threshold: float,
 ) -> tuple[int, float, float]:
-    """Mode and reason of this tick, written to the state; compiled part of `Decision.step`.
+    """Mode and reason of this tick, written to state and frame; compiled part of `Decision.step`,
+    which states what is returned.
+    """
+    found = _decided(states, frames, heres, parameters, conditions, gate_m, threshold)
+    frames[0].mode, frames[0].reason = states[0].mode, states[0].reason
+    return found
+
+
+@compiled
+def _decided(
+    states: Records,
+    frames: Records,
+    heres: Records,
+    parameters: Records,
+    conditions: int,
+    gate_m: float,
+    threshold: float,
+) -> tuple[int, float, float]:
+    """Mode and reason of this tick, written to the state.
 
     A fault remains until a reset. Otherwise the arm may cause a fault (`_arm`), or the first reason
     in this order causes a hold; without one, the arm follows:

@@ -107,10 +107,10 @@ class HandEstimator:
         state["bank_ticks"] = -len(self._models)
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
-        """Advance both hands by some ticks. A hand without a sample for `stale_ticks` is assumed to
-        stand still.
+        """Advance the state by some ticks, and both hands with it. A hand without a sample for
+        `stale_ticks` is assumed to stand still.
         """
-        _advance_both(as_array(state), stale_ticks, self._model(ticks), self._models)
+        _advance_both(as_array(state), ticks, stale_ticks, self._model(ticks), self._models)
 
 
 @compiled
@@ -149,12 +149,13 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
 
 
 @compiled
-def _advance_both(states: Records, stale_ticks: int, one: Records, models: Records) -> None:
-    """Advance modes, estimate and stillness of both hands to the current tick. `one` (1,) is the
-    record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
+def _advance_both(states: Records, ticks: int, stale_ticks: int, one: Records, models: Records) -> None:
+    """Advance the state by some ticks: modes, estimate and stillness of both hands. `one` (1,) is
+    the record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
     stands still: its velocity, acceleration and tremor are set to zero.
     """
     state, over = states[0], one[0]
+    state.tick += ticks
     for side in range(2):
         hand = state.hands[side]
         if state.tremors[side, 0] == 0.0:  # a state that an earlier version recorded

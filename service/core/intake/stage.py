@@ -78,6 +78,7 @@ class Intake:
         longest_s = hands.longest_stale_ms / 1000
         stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
         unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        self._unseen_ticks = unseen_ticks
         max_late_s = max(MAX_LATE_S, longest_s)
         self._models = models(settings.period_s, unseen_ticks + math.ceil(max_late_s / settings.period_s) + 1)
         joints = settings.joints
@@ -138,8 +139,7 @@ class Intake:
 
     def advance(self, state: Record, ticks: int) -> None:
         """Advance the state by some ticks: hands seen lately move on, others stand still."""
-        state["tick"] += ticks
-        self._estimator.advance(state, ticks, int(self._parameters["unseen_ticks"][0]))
+        self._estimator.advance(state, ticks, self._unseen_ticks)
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""

@@ -88,13 +88,16 @@ class Limiter:
         calculated with (not finite, or too large) keep their positions, at velocity 0. Never
         raises.
         """
-        state, moved, wanted = np.empty((3, len(q))), np.empty((3, len(q))), np.zeros((2, len(q)))
-        state[0], state[1], state[2] = q, dq, ddq
+        return self.advance(np.stack((q, dq, ddq)), velocity, acceleration)
+
+    def advance(self, state: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
+        """`step` of the joints' state (3, J), which is not changed."""
+        moved, wanted = np.empty(state.shape), np.zeros((2, state.shape[1]))
         if acceleration is not None:
             wanted[1] = acceleration
         met = step(state, velocity, self._parameters, wanted, moved)
         if met == UNUSABLE:
-            return _stuck(q)
+            return _stuck(state[0])
         if met & CHASED:
             self._chase(state, wanted, moved)
             if forget_fast(state, moved, self._parameters):  # joints that become too fast: again, without the ramp
@@ -207,11 +210,11 @@ class LimiterStage:
         joints stop. If the tool exceeds its limit in this stop, its speed is reported as
         `excess_speed`.
         """
-        q, dq, ddq = state["joints"]
-        moved = self._limiter.step(q, dq, ddq, wanted, ramp)
-        limited, excess = moved.limited, separation.excess(*moved[1:3])
+        moved = self._limiter.advance(state["joints"], wanted, ramp)
+        limited, excess = moved.limited, separation.excess(moved.velocity, moved.acceleration)
         separated = excess > 0.0
         if separated:
+            q, dq, ddq = state["joints"]
             other = self._limiter.together(q, dq, ddq, wanted)
             if other is None or separation.excess(*other[1:3]) > 0.0:
                 other = self._brake(state, separation)[0]
@@ -219,7 +222,7 @@ class LimiterStage:
             moved, limited = (other, True) if separated else (moved, limited)
         here, excess_speed = self._arm.at(moved.position), 0.0
         if self._largest_speed_in_stop(moved, here) > STOP_SPEED_SHARE * self._max_speed:
-            moved, limited = self._limiter.stop(q, dq, ddq), True
+            moved, limited = self._limiter.stop(*state["joints"]), True
             here = self._arm.at(moved.position)
             speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
             excess_speed = speed if speed > self._max_speed else 0.0

@@ -139,9 +139,8 @@ class SetpointStage:
         states, frames = as_array(state), as_array(frame)
         target, tool = wanted.target, here.record["position"][0]
         self._position.engage(state, target.position)
-        max_speed = float(self._position.limits(state)["max_speed"][0])
-        slow = ready(states, here.record, self._arm.parameters, max_speed, share, self._costs)
-        gap_m = math.dist(state["setpoint"][0].tolist(), tool.tolist())
+        limits = self._position.limits(state)
+        slow, gap_m = ready(states, here.record, self._arm.parameters, limits, share, self._costs)
         if gap_m > GAP_WAITING_M:
             target = waiting(target, state["setpoint"], tool)
         if gap_m > GAP_STOPPED_M:

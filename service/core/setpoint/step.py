@@ -26,7 +26,7 @@ from service.core.setpoint.tuning import (
     STOP_JERK_ERROR_M,
     STOP_OVERSHOOT_M,
 )
-from service.core.vectors import norm
+from service.core.vectors import distance, norm
 
 
 @compiled
@@ -246,10 +246,15 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
 
 
 @compiled
-def ready(states: Records, heres: Records, arms: Records, max_speed: float, share: float, costs: Vector) -> float:
-    """Write the `joint_costs` of tool motion; return the share of speed that `slow_down` allows."""
+def ready(
+    states: Records, heres: Records, arms: Records, parameters: Records, share: float, costs: Vector
+) -> tuple[float, float]:
+    """Write the `joint_costs` of tool motion. Returns the share of speed that `slow_down` allows,
+    and the setpoint's distance from the tool [m].
+    """
     joint_costs(arms, heres, costs)
-    return slow_down(states[0].setpoint, heres[0].position, share, max_speed)
+    setpoint, tool = states[0].setpoint, heres[0].position
+    return slow_down(setpoint, tool, share, parameters[0].max_speed), distance(setpoint[0], tool)
 
 
 @compiled
