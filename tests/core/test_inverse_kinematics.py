@@ -39,10 +39,15 @@ def test_tasks_are_the_tool_s_velocity_and_what_turns_it(count: int) -> None:
     random = np.random.default_rng(1)
     jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
     arm = parameters(turn_lever=TURN_LEVER_M, damping=DAMPING_M2, singular_damping=2e-3, singular_volume=0.04)
-    here = parameters(tasks=np.empty((count, 7)), damping=0.0, jacobian=np.empty((6, 7)), rotation=np.empty((3, 3)))
-    describe(arm, here, jacobian, rotation)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, random.normal(size=3)
+    parts = {"jacobian": np.empty((6, 7)), "position": np.empty(3), "rotation": np.empty((3, 3))}
+    here = parameters(tasks=np.empty((count, 7)), damping=0.0, **parts)
+    describe(arm, here, jacobian, pose)
     expected = np.vstack([jacobian[:3], TURN_LEVER_M * rotation.T @ jacobian[3:]])[:count]
     np.testing.assert_allclose(here["tasks"][0], expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(here["position"][0], pose[:3, 3])
+    np.testing.assert_array_equal(here["rotation"][0], rotation)
     assert here["damping"][0] == DAMPING_M2  # far from singular
 
 
