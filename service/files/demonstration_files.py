@@ -78,14 +78,18 @@ def existing_path(folder: Path, name: str) -> Path:
     """The path of a take that exists. Raises DemonstrationNameError."""
     path = path_of(folder, name)
     if not path.is_file():
-        names = ", ".join(found.stem for found in demonstration_paths(folder)) or "none"
+        found = demonstration_paths(folder) if folder.is_dir() else []
+        names = ", ".join(one.stem for one in found) or "none"
         raise DemonstrationNameError(f"no take {path.stem!r} in {folder}; its takes: {names}")
     return path
 
 
 def demonstration_paths(folder: Path) -> list[Path]:
-    """The files of the takes in a folder, sorted by number: `take-2` before `take-10`."""
-    return sorted(folder.glob("*.mcap"), key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
+    """The files of the takes in a folder, sorted by number: `take-2` before `take-10`. Raises
+    OSError.
+    """
+    paths = [path for path in folder.iterdir() if path.suffix == ".mcap"]  # glob finds nothing where it may not read
+    return sorted(paths, key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
 
 
 def _split(name: str) -> list[str]:
