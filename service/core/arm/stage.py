@@ -177,8 +177,9 @@ class Arm:
         """
         out = np.empty((2, len(self._jerk)))
         constraints, count = separation.constraints, separation.count
-        limits = self._engaging if state["engaging"] else self.parameters
-        return _solution(out, follow(limits, here.record, as_array(state), self._goal, constraints, count, out))
+        states = as_array(state)
+        limits = self._engaging if states["engaging"][0] else self.parameters
+        return _solution(out, follow(limits, here.record, states, self._goal, constraints, count, out))
 
     def step(
         self,

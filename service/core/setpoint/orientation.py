@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from service.core.frame import Record, Records, Vector, parameters
+from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.numerics import ROUNDING
 from service.core.setpoint.tuning import ORIENTATION_GAIN_PER_S, PLANNED_BRAKE_SHARE, PLANNED_SPEED_SHARE
@@ -33,7 +33,7 @@ class OrientationSetpoint:
         """Parameters (1,) of a step from this state: while the position engages, the angular speed
         is limited to the same share of its own limit.
         """
-        return self._engaging if state["engaging"] else self._parameters
+        return self._engaging if as_array(state)["engaging"][0] else self._parameters
 
     def begin(self, state: Record, rotation: Vector, turning: Vector) -> None:
         """Start from the tool's rotation (3, 3) and angular velocity `turning` (3,) [rad/s]."""

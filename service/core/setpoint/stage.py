@@ -77,11 +77,11 @@ class SetpointGenerator:
 
     def limits(self, state: Record) -> Records:
         """Parameters (1,) of a step from this state, in which `max_speed` is the present limit."""
-        return self._engaging if state["engaging"] else self._parameters
+        return self._engaging if as_array(state)["engaging"][0] else self._parameters
 
     def engage(self, state: Record, target: Vector) -> None:
         """End the engaging of a setpoint that is within ENGAGED_GAP_M of its target (3,) [m]."""
-        if state["engaging"] and math.dist(target.tolist(), state["setpoint"][0].tolist()) < ENGAGED_GAP_M:
+        if as_array(state)["engaging"][0] and math.dist(target.tolist(), state["setpoint"][0].tolist()) < ENGAGED_GAP_M:
             state["engaging"] = 0
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
@@ -146,9 +146,10 @@ class SetpointStage:
         if gap_m > GAP_STOPPED_M:
             box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
-        if state["closure"] != NO_GRIPPER:
+        closure = float(states["closure"][0])
+        if closure != NO_GRIPPER:
             off = math.dist(wanted.target.position.tolist(), tool.tolist())
-            self._grip(state, float(state["closure"]), off)
+            self._grip(state, closure, off)
         elif self._takes_wishes:
             self._grip(state, float(state["gripper_wish"]), 0.0)
         finish(states, frames, self._orientation.limits(state))
@@ -158,8 +159,9 @@ class SetpointStage:
         """Open or close the gripper for a `closure` that the skill predicts or a person wishes, if
         the tool is near its target, `off` [m] away.
         """
-        before = int(state["gripper"])
-        since_s = self._period_s * int(state["tick"] - state["gripper_tick"])
-        state["gripper"] = decided(before, closure, since_s=since_s, off=off)
-        if state["gripper"] != before:
-            state["gripper_tick"] = state["tick"]
+        states = as_array(state)
+        before, tick = int(states["gripper"][0]), int(states["tick"][0])
+        since_s = self._period_s * (tick - int(states["gripper_tick"][0]))
+        after = decided(before, closure, since_s=since_s, off=off)
+        if after != before:
+            state["gripper"], state["gripper_tick"] = after, tick

@@ -19,6 +19,7 @@ from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.numerics import MEMORY_STEP_S
 from service.core.skill import TURNS
+from service.core.skill.model import Seen
 from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
 
 
@@ -126,32 +127,30 @@ def delayed(moving: Vector, memory: Vector, late_s: float, out: Vector) -> None:
 
 
 @compiled
-def recall(
-    states: Records, rules: Records, now: Vector, moving: Vector, past: Vector, turns: Vector, stillness: Vector
-) -> bool:
-    """Update the memory of the hands, and write what a skill predicts from, see `Seen`: motion
-    `now` (3, 6), motion `moving` (3, 6) `late_s` ago, `past` (ORDER, 6), `turns` (TURNS, 18) and
-    `stillness` (2,). Column group n is that of the hand `sides`[n].
+def recall(states: Records, rules: Records, seen: Seen) -> bool:
+    """Update the memory of the hands, and write to `seen` what a skill predicts from: the motion
+    `now` and that `late_s` ago, memory and stillness. Column group n is that of the hand
+    `sides`[n].
 
     Returns true if a hand has a new sample in this tick, or if the state has no covariance yet.
     """
-    state, rule = states[0], rules[0]
+    state, rule, now = states[0], rules[0], seen.now
     remember(states, rule.period_s, rule.lag_s, rule.turn_lag_s)
     for n in range(2):
         side = rule.sides[n]
-        stillness[n] = state.hand_stillness[side]
+        seen.stillness[n] = state.hand_stillness[side]
         for i in range(3):
             for order in range(3):
                 now[order, 3 * n + i] = state.hands[side, order, i]
-            for row in range(len(past)):
-                past[row, 3 * n + i] = state.memory[row, side, i]
+            for row in range(len(seen.past)):
+                seen.past[row, 3 * n + i] = state.memory[row, side, i]
         for i in range(9):
-            for row in range(len(turns)):
-                turns[row, 9 * n + i] = state.turns[row, side, i]
+            for row in range(len(seen.turns)):
+                seen.turns[row, 9 * n + i] = state.turns[row, side, i]
     if rule.late_s == 0.0:
-        moving[:] = now
+        seen.moving[:] = now
     else:
-        delayed(now, past, rule.late_s, moving)
+        delayed(now, seen.past, rule.late_s, seen.moving)
     has_sample = state.hand_ticks[0] == state.tick or state.hand_ticks[1] == state.tick
     return bool(has_sample or state.covariance[0, 0] == 0.0)
 

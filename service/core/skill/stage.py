@@ -23,15 +23,23 @@ class SkillStage:
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
         self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
-        self._now, self._moving = np.empty((3, 6)), np.empty((3, 6))  # what `recall` writes
-        self._past, self._turns, self._still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
         self._take(skill)
 
     def _take(self, skill: Skill) -> None:
         """Put a skill into force, with the time constant of the hands' memory that it needs."""
         self.skill = skill
         late_s = skill.model.delay_s - self._lead_s
-        delay_s, self._seen_turn_lag_s = max(late_s, 0.0), turn_lag_s(late_s)
+        delay_s = max(late_s, 0.0)
+        self._seen = Seen(  # written by `recall`, and with belief and clock of the state
+            np.empty((3, 6)),
+            np.empty(2),
+            np.empty((ORDER, 6)),
+            np.empty((TURNS, 18)),
+            turn_lag_s(late_s),
+            np.empty((3, 6)),
+            np.empty(0),
+            self._period_s,
+        )
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
         self._clock, side = skill.model.clock_rows, skill.conductor
@@ -76,21 +84,15 @@ class SkillStage:
         """
         states, frames, rules = as_array(state), as_array(frame), self._rules
         self._count(state)
-        is_new = recall(states, rules, self._now, self._moving, self._past, self._turns, self._still)
-        belief, known, before = state["stage_belief"], state["covariance"], None
-        seen = Seen(
-            self._moving,
-            self._still,
-            self._past,
-            self._turns,
-            self._seen_turn_lag_s,
-            self._now,
-            belief,
-            self._period_s,
-            state["task_clock"],
-        )
+        seen = self._seen._replace(belief=state["stage_belief"], clock=state["task_clock"])
+        is_new, before, known = recall(states, rules, seen), None, state["covariance"]
         if not is_new:
-            before = known, state["orientation_covariance"], float(state["closure"]), float(state["known_gate_m"])
+            before = (
+                known,
+                state["orientation_covariance"],
+                float(states["closure"][0]),
+                float(states["known_gate_m"][0]),
+            )
         found = self.skill.predicted(seen, before)
         if is_new:
             state["known_gate_m"] = found.gate_m
@@ -100,7 +102,7 @@ class SkillStage:
             off = off_m(self.skill.model, seen, columns, deviation_m(states, unseen, self._period_s), known)
         doubt, unprimed = 0.0, state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
-            doubt = self.skill.model.elsewhere(self._now, self._still, self._period_s, belief, unprimed)
+            doubt = self.skill.model.elsewhere(seen.now, seen.stillness, self._period_s, seen.belief, unprimed)
         outcome = conclude(states, frames, rules, found[:6], found.turn, found.closure, off, doubt)
         target = Target(*found[:3], clamped=False)
         if outcome & IS_OUTSIDE:
