@@ -6,7 +6,7 @@ from service.contract.records import PER_JOINT, SOURCES, Cause, Field
 
 MODES = 3  # modes of the hand filter: rest, reach, change
 STATES = 5  # states of each mode and axis: position, velocity, acceleration, tremor and its velocity
-TREMOR_RATES, USUAL_RATE = 7, 5  # rates of tremor that are distinguished, from slow to fast, and the usual one
+TREMOR_RATES, USUAL_RATE = 10, 8  # rates of tremor that are distinguished, from slow to fast, and the usual one
 NO_TREMOR = 2  # filters without tremor in the bank of tremor filters
 BANK = NO_TREMOR + TREMOR_RATES  # filters of that bank
 KEPT = 49  # retained samples of each hand, among which late ones are inserted: 0.1 s of the fastest tracker

@@ -36,8 +36,8 @@ TREMOR_STDS_M = np.array([5e-4, 3e-4, 0.0])  # standard deviation on each axis; 
 TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
 # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
 TREMOR_DAMPING = 0.1  # damping ratio of the tremor's oscillator
-# [1/s] possible rates, 4 to 12 Hz; neighbours differ by the width of the resonance
-TREMOR_RATES_PER_S = TREMOR_RATE_PER_S * (1.0 + 2.0 * TREMOR_DAMPING) ** np.arange(-5.0, 2.0)
+# [1/s] possible rates, 2.3 to 12 Hz; neighbours differ by the width of the resonance
+TREMOR_RATES_PER_S = TREMOR_RATE_PER_S * (1.0 + 2.0 * TREMOR_DAMPING) ** np.arange(-8.0, 2.0)
 # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
 MAX_TREMOR_M = 6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
 # [m/s] after a hand's first sample: OUTLIER_STDS times the stationary one of the mode CHANGE
