@@ -115,7 +115,7 @@ class SystemClock:
         self._apart_ns = apart_ns
         if -STEP_NS < set_ns < STEP_NS:
             return ""
-        size = f"by {abs(set_ns) / 1e9:.3f} s"
+        size = f"by {abs(set_ns) / 1e9:.2f} s"
         return f"ahead {size}, or the machine was suspended meanwhile" if set_ns > 0 else f"back {size}"
 
 

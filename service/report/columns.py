@@ -90,6 +90,11 @@ class Columns:
     remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
 
     @property
+    def start_ns(self) -> int:
+        """The system clock's time of the first tick; 0 without one."""
+        return int(self.times_ns[0]) if len(self.times_ns) else 0
+
+    @property
     def period_s(self) -> float:
         """Duration of a tick [s]."""
         return self.recording.settings.period_s

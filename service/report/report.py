@@ -128,8 +128,7 @@ class Report:
         following = frames[frames["mode"] == Mode.FOLLOW]
         sent = frames[frames["commanded"] > 0]
         lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
-        begins_s = columns.times_ns[0] / 1e9 if len(columns.times_ns) else 0.0
-        begins = datetime.fromtimestamp(begins_s, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         self.path, self.columns = recording.path, columns
         self.begins = begins if len(frames) else "never: it holds no tick"  # by the system clock
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"

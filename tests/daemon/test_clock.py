@@ -200,10 +200,10 @@ def test_a_machine_that_was_suspended_has_missed_nothing_and_its_stamps_follow_a
 @pytest.mark.parametrize(
     ("set_by_s", "words"),
     [
-        (0.3, "ahead by 0.300 s, or the machine was suspended meanwhile"),
-        (-0.3, "back by 0.300 s"),
-        (10 * 365 * 86_400, "ahead by 315360000.000 s, or the machine was suspended meanwhile"),
-        (-3600, "back by 3600.000 s"),
+        (0.3, "ahead by 0.30 s, or the machine was suspended meanwhile"),
+        (-0.3, "back by 0.30 s"),
+        (10 * 365 * 86_400, "ahead by 315360000.00 s, or the machine was suspended meanwhile"),
+        (-3600, "back by 3600.00 s"),
     ],
 )
 def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str) -> None:
@@ -214,7 +214,7 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
         clock.now += 100_000_000
         clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000  # slewed by 500 parts in a million
         said.append(system.set_by())
-    assert [(k, text) for k, text in enumerate(said) if text] == [(50, words.replace("0.300", f"{0.3 + 5e-5:.3f}"))]
+    assert [(k, text) for k, text in enumerate(said) if text] == [(50, words)]
 
 
 def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:
