@@ -242,8 +242,10 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             return None
     except ViewerError:
         raise
-    except (RuntimeError, ConnectionError, TimeoutError, OSError) as error:
-        raise ViewerError(f"no picture of {source}: {in_words(error)} ({NO_VULKAN})") from error
+    except TimeoutError as error:
+        raise ViewerError(f"no picture of {source}: {in_words(error)}; try again when the machine is idle") from error
+    except (RuntimeError, OSError) as error:
+        raise ViewerError(f"no picture of {source}: {in_words(error)}") from error
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:

@@ -95,6 +95,7 @@ class Evidence(NamedTuple):
     mistake: str = ""  # in its unit, its names or its bytes
     jump: Jump | None = None
     held_up_s: float | None = None  # delay of the newest accepted sample beyond the others; None: the clock differs
+    is_set_back: bool = False  # all samples since the newest accepted one are stamped before it
 
 
 NOTHING = Evidence()
@@ -179,6 +180,8 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
             found = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
         case Cause.OLDER:
             found = f"stamped {-advanced_s:.3g} s before the newest accepted one"
+            if seen.is_set_back:
+                found, closer = f"{found}: its clock was set back", what_to_do(Condition.CLOCK_STEPPED)
         case Cause.AHEAD:
             found = f"stamped {advanced_s:.3g} s after the newest accepted one"
             if seen.held_up_s is None:

@@ -31,7 +31,8 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES",
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES "
+    "CLOCK_SET",
 )
 
 
@@ -218,7 +219,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the same stamp again", "stamp each sample when it was measured, and send it once"),
         Incident(Cause.OLDER, None, "stamp older",
             "a stamp more than 0.1 s before the newest one; of the arm, any before it",
-            "stop the second tracker or driver of this key; look for a network that reorders messages"),
+            "correct the publisher's clock, if it was set back; stop a second tracker or driver of this key; look for "
+            "a network that reorders messages"),
         Incident(Cause.INCOMPLETE, None, "joints incomplete",
             "joints that are missing, or named twice",
             "publish every joint once, under the names in `joints/command`, with one position each"),
@@ -242,7 +244,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "bytes that are not the message of their key; they are counted by key",
             "publish the type and encoding that docs/wire.md lists for the key"),
         Incident(Condition.CLOCK_STEPPED, None, "clock stepped",
-            "the source's clock stepped ahead",
+            "the source's clock was set, ahead or back",
             "correct the publisher's clock; samples are accepted again after the source was silent"),
         Incident(Condition.DELAYED, None, "samples delayed",
             "samples were held up on their way; the source's clock is right",
@@ -266,6 +268,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.CLOCKS_DIFFER, None, "clocks differ",
             "a clock differs from the daemon's: no latency can be measured",
             "synchronise the clocks (chrony, PTP), or let the source stamp samples when it sends them"),
+        Incident(Condition.CLOCK_SET, None, "clock set",
+            "the clock of the daemon's machine was set, or the machine was suspended; the loop is not affected",
+            "let NTP slew the clock instead of setting it; if it was set back by more than an hour, start the daemon "
+            "again, as the stamps of its commands hardly grow until the clock has passed them"),
     ),
     "The recording lacks something": (
         Incident(Condition.NOT_RECORDED, None, "nothing is recorded",

@@ -26,7 +26,7 @@ class Role(NamedTuple):
     about: str
     publishes: tuple[str, ...] = ()
     hears: bool = False  # receives everything that the daemon publishes
-    asks: bool = False  # sends any request; all roles may request the status, and list daemons
+    asks: bool = False  # sends any request; all roles may request the status of every cell, and list daemons
     hears_inputs: bool = False  # receives what trackers and the arm publish
 
 
@@ -103,18 +103,18 @@ def access_control(
     record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True))
     ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
-    status, present = keys(("status",)), [channels.presence(cell)]
+    # All roles see the daemons of all cells, which may be connected to this one.
+    status, present = [channels.key("**", "status")], [channels.PRESENCE_OF_ALL]
     tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
     if latched:
         asking = [*queries, "query", "declare_subscriber"]
         hear += both("hear what is latched", asking, [*tokens, "declare_queryable", "reply", "put"], latched)
     see = both("see", ["query"], ["declare_queryable", "reply"], status)
-    see.append(allow("see who lives", "ingress", queries, [*present, channels.PRESENCE_OF_ALL]))
-    see.append(allow("see who lives", "egress", tokens, present))
+    see += both("see who lives", queries, tokens, present)
     alive, answers = [*tokens, *queries], ["query", "reply", "declare_queryable"]
     if ros2_domain is not None:
         see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
-    # two daemons of one cell notice each other
+    # daemons notice each other, and pass on to each other who asks for a status
     neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
 
     allowed = {}

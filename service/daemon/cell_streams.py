@@ -73,6 +73,14 @@ class Arrivals:
         is_delay = held_up_ns > HELD_UP_NS and delay_ns > min_delay_ns - CLOCK_STEP_NS
         return held_up_ns / 1e9 if is_delay else None
 
+    def is_set_back(self, accepted_ns: int) -> bool:
+        """True if all messages after the one stamped `accepted_ns` are stamped before it, and there
+        are several: the source's clock was set back. A second source would take turns with it.
+        """
+        stamps = [stamp for stamp, _ in tuple(self._delays)]
+        later = stamps[stamps.index(accepted_ns) + 1 :] if accepted_ns in stamps else []
+        return len(later) > 1 and max(later) < accepted_ns
+
     def refuse(self, why: str) -> None:
         """Note bytes that cannot be decoded, and the reason."""
         self.why = why
@@ -163,7 +171,8 @@ class CellStreams:
             payload, at_ns = bytes(raw), time.time_ns()
             message = channel.codec.decode(payload)
             if suffix == ARM_STATE:
-                state = self._joints.take(message, at_ns / 1e9) or self._joints.incomplete(message, at_ns / 1e9)
+                now_s = time.monotonic()
+                state = self._joints.take(message, now_s) or self._joints.incomplete(message, now_s)
                 if state is None:
                     return None
                 if state is not message:

@@ -21,6 +21,7 @@ from service.core.frame import Vector
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
 PREPARE_NS = 650_000  # the next tick is prepared this long before its deadline, 1.5 times the duration of a tick
 STEP_NS = 20_000_000  # a larger difference from the system clock shows that the clock was set
+READ_NS = 1_000_000  # two clocks that were read within this time are compared
 DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
 CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
 _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
@@ -90,6 +91,32 @@ class Deadlines:
         """Achieved ticks per second since start."""
         elapsed = self._now_ns() - self._start_ns
         return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
+
+
+class SystemClock:
+    """The system clock, watched for steps against the monotonic one."""
+
+    def __init__(
+        self, *, now_ns: Callable[[], int] = time.monotonic_ns, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._now_ns, self._wall_ns = now_ns, wall_ns
+        self._apart_ns: int | None = None
+
+    def set_by(self) -> str:
+        """How far the clock was set since the last call, in words; empty if it was not.
+
+        A reading that took long, because others ran meanwhile, is left to the next call.
+        """
+        begin_ns = self._now_ns()
+        apart_ns = self._wall_ns() - begin_ns
+        if self._now_ns() - begin_ns > READ_NS:
+            return ""
+        set_ns = 0 if self._apart_ns is None else apart_ns - self._apart_ns
+        self._apart_ns = apart_ns
+        if -STEP_NS < set_ns < STEP_NS:
+            return ""
+        size = f"by {abs(set_ns) / 1e9:.2f} s"
+        return f"ahead {size}, or the machine was suspended meanwhile" if set_ns > 0 else f"back {size}"
 
 
 class Granted(NamedTuple):

@@ -35,6 +35,7 @@ from service.daemon.clock import (
     SPIN_NS,
     Deadlines,
     Granted,
+    SystemClock,
     Window,
     ask_for_real_time,
     run_beside_real_time,
@@ -66,6 +67,7 @@ MAX_NOTES_PER_S = 100
 STATUS_TRIES = 10  # attempts to read a frame and the state of the same tick
 STATUS_S = 0.1  # interval of published statuses
 FIRST_TICK_S = 0.01  # interval at which the first tick is waited for
+CLOCK_SET = "the system clock was set"
 MAX_LATENCY_MS = 1000.0  # a longer latency shows that the clocks differ
 
 
@@ -168,7 +170,7 @@ class Daemon:
 
     def _say(self, text: str) -> None:
         log.info(text)
-        self._scribe.note("requests", text, time.time_ns())
+        self._scribe.note("requests", text, self._clock.stamp_ns)
 
     def serve(self, announce: Callable[[Daemon], None] = lambda daemon: None) -> str:
         """Run until `stop` is called, close everything, and return a message on ticks that were not
@@ -324,7 +326,7 @@ class Daemon:
         self._open(announce)
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
-        due_s = time.monotonic()
+        due_s, system_clock = time.monotonic(), SystemClock()
         while not self._ended.is_set():
             self._status.wait(due_s - time.monotonic())
             is_due, is_published = time.monotonic() >= due_s, self._status.begin()
@@ -345,9 +347,14 @@ class Daemon:
                 due_s = time.monotonic() + STATUS_S
                 self._way_finder.poll(self._frame, self._controller.state)
                 self._streams.show(self._frame, self._controller.state)
-                self._scribe.note("status", payload.decode(), time.time_ns())
+                now_ns = self._clock.stamp_ns  # a recording has one time, which never goes back
+                self._scribe.note("status", payload.decode(), now_ns)
                 for stream in self._side_streams:
-                    stream.poll()
+                    stream.poll(now_ns)
+                if set_by := system_clock.set_by():
+                    text = f"{CLOCK_SET}{in_full(set_by, what_to_do(Condition.CLOCK_SET))}"
+                    log.warning("%s", text)
+                    self._scribe.note("log", text, now_ns)
                 try:
                     self._scribe.supervise()
                 except OSError as error:  # a lack of descriptors or memory may be temporary

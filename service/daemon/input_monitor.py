@@ -187,8 +187,14 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
+    is_set_back = cause is Cause.OLDER and arrivals.is_set_back(newest_ns)
     seen = Evidence(
-        settings=settings, sample=sample, newest_ns=newest_ns, frames=settings.tracker_frames, held_up_s=held_up_s
+        settings=settings,
+        sample=sample,
+        newest_ns=newest_ns,
+        frames=settings.tracker_frames,
+        held_up_s=held_up_s,
+        is_set_back=is_set_back,
     )
     if isinstance(sample, PoseStamped):
         mistake = _too_far(sample, settings) if cause is Cause.OUT_OF_RANGE else ""

@@ -5,7 +5,6 @@ the bench, and images of other programs.
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 
 import zenoh
@@ -39,14 +38,14 @@ class SideStream:
         self._subscriber = session.declare_subscriber(key, RingChannel(waiting))
         self._key, self._take, self._say, self._waiting, self._error = key, take, say, waiting, ""
 
-    def poll(self) -> None:
-        """Pass on the messages that arrived since the last call."""
+    def poll(self, now_ns: int) -> None:
+        """Pass on the messages that arrived since the last call, with the time now [ns]."""
         for _ in range(self._waiting):
             if (sample := self._subscriber.try_recv()) is None:
                 return
             before, self._error = self._error, ""
             try:
-                self._take(sample.payload.to_bytes(), time.time_ns())
+                self._take(sample.payload.to_bytes(), now_ns)
             except WireError as error:
                 self._error = str(error)
                 if self._error != before:

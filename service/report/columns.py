@@ -79,7 +79,8 @@ class Columns:
     recording: Recording
     frames: Records = field(default_factory=lambda: np.empty(0, TIMING))
     timing: Records = field(default_factory=lambda: np.empty(0, TIMING))
-    start_ns: int = 0  # the system clock's time of the first tick
+    ticks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # of all ticks with a decision
+    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # their system clock's times
     gaps: list[str] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)  # rows of `frames` before which some are missing
     orders: list[Order] = field(default_factory=list)
@@ -87,6 +88,11 @@ class Columns:
     statuses: list[Said] = field(default_factory=list)
     samples: Counter[str] = field(default_factory=Counter)  # events by kind
     remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
+
+    @property
+    def start_ns(self) -> int:
+        """The system clock's time of the first tick; 0 without one."""
+        return int(self.times_ns[0]) if len(self.times_ns) else 0
 
     @property
     def period_s(self) -> float:
@@ -119,6 +125,7 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
     block: list[Record] = []
     timing: list[Record] = []
     ticks: list[int] = []  # of all frames, recorded or left out
+    times_ns: list[int] = []
 
     def kept() -> Records:
         return repack_fields(np.array(block, layout)[list(KEPT)])
@@ -130,11 +137,11 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
         last = step.tick
         if step.frame is None and step.checksum is None:
             continue
-        found.start_ns = found.start_ns or step.time_ns
         _take_events(found, step)
         if step.lost or step.damage:
             found.breaks.append(len(ticks))
         ticks.append(step.tick)
+        times_ns.append(step.time_ns)
         if step.frame is not None:
             block.append(step.frame)
         if step.timing is not None:
@@ -145,7 +152,8 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
         if len(ticks) % BLOCK == 0:
             progress(len(ticks))
     found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
-    _fill(found, np.array(ticks, np.int64))
+    found.ticks, found.times_ns = np.array(ticks, np.int64), np.array(times_ns, np.int64)
+    _fill(found, found.ticks)
     for _, text, _ in recording.notes("status"):
         with contextlib.suppress(msgspec.MsgspecError):  # of another version
             found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))

@@ -59,7 +59,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             part: Episode = {name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)}
             part["action.gripper"] = frames["closure"][rows].astype(np.float32)
             part["observation.stage"] = np.where(frames["stage_belief"][rows] > 0, frames["stage"][rows], -1)
-            yield part | {"times_ns": found.start_ns + np.round(1e9 * found.times[rows]).astype(np.int64)}
+            yield part | {"times_ns": found.times_ns[found.ticks.searchsorted(frames["tick"][rows])]}
 
 
 def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:

@@ -127,7 +127,6 @@ class Report:
         recording, frames, timing = columns.recording, columns.frames, columns.timing
         following = frames[frames["mode"] == Mode.FOLLOW]
         sent = frames[frames["commanded"] > 0]
-        passed_s = (timing["time_ns"][-1] - timing["time_ns"][0]) / 1e9 if len(timing) > 1 else 0.0
         lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
         begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         self.path, self.columns = recording.path, columns
@@ -137,12 +136,7 @@ class Report:
         self.lasts_s = lasts_s
         self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))
-        ticks = (
-            int(((frames["tick"] >= timing["tick"][0]) & (frames["tick"] <= timing["tick"][-1])).sum())
-            if len(timing)
-            else 0
-        )
-        self.rate_hz = (ticks - 1) / passed_s if passed_s > 0 else len(frames) / lasts_s if lasts_s else 0.0
+        self.rate_hz = len(frames) / lasts_s if lasts_s else 0.0
         self.missed = int(timing["missed"][-1] - timing["missed"][0]) if len(timing) else 0
         self.lateness_us = Percentiles.of(timing["lateness_us"])
         self.work_us = Percentiles.of(timing["work_us"])

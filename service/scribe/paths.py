@@ -39,10 +39,13 @@ def named_after(cell: str, folder: Path, suffix: str) -> list[Path]:
 def _ages_s(changed: list[float], longest_gap_s: float) -> list[float]:
     """The ages [s] of files from the times of their last changes, oldest first. A gap between two
     of them, or after the last, counts as at most `longest_gap_s`, because the clock may have been
-    set meanwhile.
+    set meanwhile. No file is older than the time since its change, unless that is in the future.
     """
-    gaps = [min(max(0.0, end - begin), longest_gap_s) for begin, end in itertools.pairwise([*changed, time.time()])]
-    return list(itertools.accumulate(gaps[::-1]))[::-1]
+    now_s = time.time()
+    gaps = [min(max(0.0, end - begin), longest_gap_s) for begin, end in itertools.pairwise([*changed, now_s])]
+    ages_s = list(itertools.accumulate(gaps[::-1]))[::-1]
+    since_s = [now_s - change for change in changed]
+    return [age if since < 0.0 else min(age, since) for age, since in zip(ages_s, since_s, strict=True)]
 
 
 class RecordingPaths:

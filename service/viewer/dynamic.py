@@ -52,7 +52,7 @@ class DynamicScene:
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
-        self._live, self._settings = live, settings
+        self._live, self._settings, self._repeat_ticks = live, settings, settings.ticks_in(REPEAT_S)
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
@@ -71,7 +71,7 @@ class DynamicScene:
         """Start another file: its time begins at 0, and the mode is sent again."""
         self._followed = False
         self._shown: tuple[int, int, bool] | None = None
-        self._mode_sent_ns = 0
+        self._mode_sent_tick = 0
         self._last_tick = -1
         self._start_ns: int | None = None
         self.end_s = 0.0
@@ -105,11 +105,11 @@ class DynamicScene:
             return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
         seen = frames["hand_ages"] >= 0
-        is_repeated = self._live and times[-1] - self._mode_sent_ns > REPEAT_S * 1e9
+        is_repeated = self._live and ticks[-1] - self._mode_sent_tick > self._repeat_ticks
         if batch[0].measured is None and (self._shown is None or is_repeated):
             yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, seen, columns)
-        yield from self._modes(frames, times, columns)
+        yield from self._modes(frames, columns)
         before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
         sampled = np.flatnonzero(ticks // self._every != before // self._every)
         if len(sampled):
@@ -206,18 +206,18 @@ class DynamicScene:
         angles[following] = np.degrees(off_target(tool, target, direction=self._direction))
         return angles
 
-    def _modes(self, frames: NDArray[Any], times: NDArray[np.int64], columns: Columns) -> Iterator[rr.chunk.Chunk]:
+    def _modes(self, frames: NDArray[Any], columns: Columns) -> Iterator[rr.chunk.Chunk]:
         """Mode, reason and engaging where they change; to live viewers also every REPEAT_S."""
-        changed, sent = [], []
+        changed, sent, ticks = [], [], frames["tick"].tolist()
         engaging = (frames["flags"] & int(Flag.ENGAGING) > 0).tolist()
         for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)):
             if now != self._shown:
                 changed.append(i)
                 self._shown = now
-            elif not (self._live and times[i] - self._mode_sent_ns > REPEAT_S * 1e9):
+            elif not (self._live and ticks[i] - self._mode_sent_tick > self._repeat_ticks):
                 continue
             sent.append(i)
-            self._mode_sent_ns = int(times[i])
+            self._mode_sent_tick = ticks[i]
         if not sent:
             return
         modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()

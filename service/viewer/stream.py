@@ -73,7 +73,7 @@ class _Destination:
         skill: tuple[SkillContents, list[Demonstration]] | None,
         thinning: Thinning | None = None,
     ) -> None:
-        self._batch_ns = round(batch_s * 1e9)
+        self._batch_ticks, self._repeat_ticks = settings.ticks_in(batch_s), settings.ticks_in(SCENE_REPEAT_S)
         self._thinning = thinning
         self._pending: list[DrawnFrame] = []
         self._live, self._settings = live, settings
@@ -86,7 +86,7 @@ class _Destination:
         self._objects: tuple[SceneObject, ...] = ()
         self._moved: list[tuple[int, tuple[SceneObject, ...]]] = []  # times [ns], objects: to be sent with the frames
         self._image_ns: dict[str, int] = {}  # time [ns] of the newest image by key
-        self._repeated_ns = 0
+        self._repeated_ns = self._repeated_tick = 0
         self._open = False
         self.redirect(name, sink, path)
 
@@ -115,21 +115,22 @@ class _Destination:
 
     def add(self, shown: DrawnFrame) -> None:
         """Add one frame."""
+        tick = int(shown.frame["tick"])
         if not self._repeated_ns:
-            self._repeat(shown.time_ns)
+            self._repeat(tick, shown.time_ns)
             if self.models.remark:
                 self.log(self.models.remark, "WARN", shown.time_ns)
         kept = shown if self._thinning is None else self._thinning.kept(shown)
         if kept is not None:
             self._pending.append(kept)
-        if self._pending and shown.time_ns - self._pending[0].time_ns >= self._batch_ns:
+        if self._pending and tick - int(self._pending[0].frame["tick"]) >= self._batch_ticks:
             self.send()
-        if self._live and shown.time_ns - self._repeated_ns > SCENE_REPEAT_S * 1e9:
-            self._repeat(shown.time_ns)
+        if self._live and tick - self._repeated_tick > self._repeat_ticks:
+            self._repeat(tick, shown.time_ns)
 
-    def _repeat(self, time_ns: int) -> None:
+    def _repeat(self, tick: int, time_ns: int) -> None:
         """Send skill and objects, also for viewers that connect later."""
-        self._repeated_ns = time_ns
+        self._repeated_tick, self._repeated_ns = tick, time_ns
         if self._skill is not None:
             self.put(list(learned.skill_chunks(*self._skill, self._at(time_ns))))
         self._put_objects(time_ns)

@@ -11,7 +11,7 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.requests import Percentiles
-from service.daemon.clock import CREEP_NS, PREPARE_NS, STEP_NS, Deadlines, Window
+from service.daemon.clock import CREEP_NS, PREPARE_NS, READ_NS, STEP_NS, Deadlines, SystemClock, Window
 
 PERIOD_NS = 2_000_000
 WALL_NS = 1_800_000_000_000_000_000
@@ -195,6 +195,39 @@ def test_a_machine_that_was_suspended_has_missed_nothing_and_its_stamps_follow_a
     index, _ = deadlines.wait()
     assert (index, deadlines.missed) == (5, 0)
     assert deadlines.stamp_ns - before == PERIOD_NS + 8 * 3_600_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("set_by_s", "words"),
+    [
+        (0.3, "ahead by 0.30 s, or the machine was suspended meanwhile"),
+        (-0.3, "back by 0.30 s"),
+        (10 * 365 * 86_400, "ahead by 315360000.00 s, or the machine was suspended meanwhile"),
+        (-3600, "back by 3600.00 s"),
+    ],
+)
+def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str) -> None:
+    clock = FakeClock()
+    system = SystemClock(now_ns=clock.now_ns, wall_ns=clock.wall_ns)
+    said = []
+    for k in range(100):
+        clock.now += 100_000_000
+        clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000  # slewed by 500 parts in a million
+        said.append(system.set_by())
+    assert [(k, text) for k, text in enumerate(said) if text] == [(50, words)]
+
+
+def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:
+    clock = FakeClock()
+
+    waits_ns = iter([0, 40 * READ_NS, 0])  # for a processor
+
+    def wall_ns() -> int:
+        clock.now += next(waits_ns)
+        return clock.wall_ns()
+
+    system = SystemClock(now_ns=clock.now_ns, wall_ns=wall_ns)
+    assert [system.set_by() for _ in range(3)] == ["", "", ""]
 
 
 def test_an_empty_window_tells_zeros() -> None:

@@ -20,13 +20,13 @@ import zenoh
 from cryptography import x509
 
 from service.cli.main import main
-from service.client import Client, UnreachableError, endpoints, living, open_session
+from service.client import Client, UnreachableError, cells, endpoints, living, open_session
 from service.client.session import valid_until
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
-from service.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
+from service.contract.roles import DAEMON, ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.launch import launched
-from service.daemon.single_instance import NETWORK_BOUNDS
+from service.daemon.single_instance import NETWORK_BOUNDS, occupy
 from support.cell import LEFT, Tracker, thirdhand, told, until
 
 CELL = "bench"
@@ -207,6 +207,42 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
     assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}
+
+
+@contextlib.contextmanager
+def serving_cell(secrets: Path, cell: str, *, listen: Iterable[str] = (), connect: Iterable[str] = ()) -> Iterator[str]:
+    """A session of a cell's daemon, which answers a request for its status with the cell's name;
+    its endpoint.
+    """
+    more = NETWORK_BOUNDS | access_control(cell)
+    with open_session(listen=[*listen], connect=[*connect], certificate=secrets / DAEMON, more=more) as session:
+        token = occupy(session, cell)  # noqa: F841  # the cell is free when the token is deleted
+        answering = session.declare_queryable(
+            channels.key(cell, "status"), lambda query: query.reply(query.key_expr, cell.encode())
+        )
+        yield "".join(endpoints(session))
+        answering.undeclare()
+
+
+@pytest.mark.parametrize("by_router", [True, False], ids=["by a router", "directly"])
+@pytest.mark.parametrize("listens", [True, False], ids=["listening", "connecting only"])
+def test_every_role_sees_all_cells_that_are_connected(secrets: Path, by_router: bool, listens: bool) -> None:
+    here = ["tls/127.0.0.1:0"]
+    with contextlib.ExitStack() as stack:
+        meeting: tuple[str, ...] = ()
+        if by_router:
+            router = open_session(listen=here, certificate=secrets / ROUTER, more={"mode": "router"})
+            meeting = endpoints(stack.enter_context(router))
+        first = stack.enter_context(serving_cell(secrets, "lab/a", listen=here, connect=meeting))
+        second = serving_cell(secrets, "lab/b", listen=here * listens, connect=meeting or [first])
+        for at in filter(None, (*meeting, first, stack.enter_context(second))):
+            with open_session(connect=[at], certificate=secrets / "tracker") as session:
+                until(lambda session=session: {cell.name for cell in cells(session)} == {"lab/a", "lab/b"})
+                for cell in ("lab/a", "lab/b"):
+                    replies = session.get(channels.key(cell, "status"), payload=b"{}", timeout=10.0)
+                    assert [reply.ok and reply.ok.payload.to_bytes() for reply in replies] == [cell.encode()]
+                refused = session.get(channels.key("lab/b", "hold"), payload=b"{}", timeout=PATIENCE_S)
+                assert [reply.ok for reply in refused if reply.ok] == []
 
 
 def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:

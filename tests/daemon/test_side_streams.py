@@ -34,7 +34,7 @@ def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple
                 far.put(key, payload)
             time.sleep(0.3)
         for stream in streams:
-            stream.poll()
+            stream.poll(time.time_ns())
     assert [(key, decode_image(data).data) for key, data in came[:3]] == [
         (key, payload) for key, payload in sent[:-1] if payload != b"nonsense"
     ]

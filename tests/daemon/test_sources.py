@@ -213,6 +213,26 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
     assert delayed.advice in held.cell.log[-1]
 
 
+@pytest.mark.parametrize("set_back_s", [0.3, 3600, 10 * 365 * 86_400])
+def test_a_clock_that_was_set_back_is_told_from_a_second_source(skill: Skill, set_back_s: float) -> None:
+    set_back, second = Clock(skill), Clock(skill)
+    for one in (set_back, second):
+        for _ in range(50):
+            one.tell(one.now_ns)
+    for k in range(6):
+        set_back.tell(set_back.now_ns - round(set_back_s * S))
+        second.tell(second.now_ns - round(set_back_s * S) * (k % 2))
+    told_back, told_second = (one.cell.status(1.0).sources["right"] for one in (set_back, second))
+    assert (told_back.cause, told_second.cause) == ("older", "older")
+    assert told_back.refused.endswith(" s before the newest accepted one: its clock was set back")
+    assert told_back.advice.startswith("correct the publisher's clock; samples are accepted again after")
+    assert told_second.refused.endswith(" s before the newest accepted one")
+    assert "stop a second tracker or driver of this key" in told_second.advice
+    for _ in range(30):
+        set_back.tell(set_back.now_ns - round(set_back_s * S))
+    assert set_back.cell.status(2.1).sources["right"].fresh
+
+
 def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:
     cell = Cell(skill)
     for k in range(30):

@@ -116,17 +116,18 @@ def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
 @pytest.fixture(scope="module")
 def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of twice the first six seconds of the golden session, with a camera at 10 Hz whose
-    pictures brighten with time.
+    pictures brighten with time. After three seconds the clock is set ahead by an hour.
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
     path, old = tmp_path_factory.mktemp("filmed") / "filmed.mcap", Recording.open(golden)
     start, *steps = old.steps()
     with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
         for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 3000):
-            recorder.write(tick, step.frame, time_ns=step.time_ns)
+            time_ns = step.time_ns + 3_600_000_000_000 * (tick.index >= 1500)
+            recorder.write(tick, step.frame, time_ns=time_ns)
             if tick.index % 50 == 0:
-                image = encode_image(CompressedImage(step.time_ns, "lens", "jpeg", grey(tick.index // 20)))
-                recorder.image("camera/front", image, step.time_ns)
+                image = encode_image(CompressedImage(time_ns, "lens", "jpeg", grey(tick.index // 20)))
+                recorder.image("camera/front", image, time_ns)
     assert main(["report", str(path), str(path), "--lerobot", str(path.parent / "data"), "--task", "Hold."]) == 0
     return path.parent / "data"
 

@@ -134,23 +134,23 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
 
 
 @pytest.mark.parametrize(
-    ("set_years", "set_before", "count"),
-    [(0, 0, 24), (10, 0, 12), (10, 5, 13), (-2, 0, 25), (-2, 5, 25)],
-    ids=["right", "ahead now", "ahead five files ago", "back now", "back five files ago"],
+    ("set_years", "set_before", "right_after", "count"),
+    [(0, 0, 0, 24), (10, 0, 0, 12), (10, 5, 0, 13), (-2, 0, 0, 25), (-2, 5, 0, 25), (10, 6, 2, 24)],
+    ids=["right", "ahead now", "ahead five files ago", "back now", "back five files ago", "ahead for four files"],
 )
 def test_a_clock_that_was_set_makes_no_recording_much_older(
-    set_years: int, set_before: int, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    set_years: int, set_before: int, right_after: int, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A drawing an hour, of which those of a day are kept; the clock was set before the last
-    `set_before` of them.
+    `set_before` of them, and right again for the last `right_after`.
     """
     settings, now_s, set_s = with_limits(rerun_keep_hours=24), 1.8e9, set_years * 365 * 86400
     for hours in range(31):
         path = tmp_path / f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd"
         path.write_bytes(b"")
-        changed_s = now_s - 3600 * hours + set_s * (hours < set_before)
+        changed_s = now_s - 3600 * hours + set_s * (right_after <= hours < set_before)
         os.utime(path, (changed_s, changed_s))
-    monkeypatch.setattr("service.scribe.paths.time.time", lambda: now_s + set_s + 1)
+    monkeypatch.setattr("service.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1)
     RecordingPaths(settings, str(tmp_path), None, None).prune(None)
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd" for hours in reversed(range(count))]

@@ -32,7 +32,9 @@ from service.learning.skill_file import with_file
 from service.settings.config import WAM, Settings, parse
 from service.viewer.banner import banner, headline
 from service.viewer.blueprint import blueprint
+from service.viewer.dynamic import REPEAT_S, DrawnFrame, DynamicScene
 from service.viewer.sentences import sentence
+from service.viewer.static import ArmModels
 from service.viewer.stream import Viewer, ViewerError
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
 from support.turning import sliding_cell
@@ -147,6 +149,14 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
     told = [name for found in names.values() for several in found for name in several]
     assert len(told) > 30
     assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
+
+
+def test_a_live_viewer_gets_the_mode_again_while_a_clock_that_was_set_back_catches_up() -> None:
+    """The times of its frames grow by a microsecond a tick."""
+    scene = DynamicScene(ArmModels(WAM, Settings()), Settings(), live=True)
+    shown = [DrawnFrame(frame, at_ns(0) + 1000 * k, timing, None) for k, (_, frame, timing) in enumerate(ticks(1200))]
+    batches = [[chunk.entity_path for chunk in scene.chunks(shown[k : k + 100])] for k in range(0, 1200, 100)]
+    assert sum("/mode" in paths for paths in batches) >= 1200 // Settings().ticks_in(REPEAT_S)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
