@@ -122,8 +122,8 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
     assert all(path.exists() for path in [*spared, current, rrd, *old[1:], drawings[2]])
     assert places.prune(current) == []
     assert places.keep_mb_left == pytest.approx(0.5 * size_mb + 0.02, rel=0.05)
-    os.utime(old[2], (0, 0))
-    os.utime(drawings[2], (0, 0))
+    for path in (old[1], old[2], drawings[2]):
+        os.utime(path, (0, 0))
     for limits, removed in (({"rerun_keep_hours": 0.3}, [drawings[2]]), ({"keep_hours": 0.3}, [old[1], old[2]])):
         aged = RecordingPaths(with_limits(**limits), str(tmp_path), None, None)
         assert aged.prune(current) == removed
