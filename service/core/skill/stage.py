@@ -30,15 +30,10 @@ class SkillStage:
         self.skill = skill
         late_s = skill.model.delay_s - self._lead_s
         delay_s = max(late_s, 0.0)
-        self._seen = Seen(  # written by `recall`, and with belief and clock of the state
-            np.empty((3, 6)),
-            np.empty(2),
-            np.empty((ORDER, 6)),
-            np.empty((TURNS, 18)),
-            turn_lag_s(late_s),
-            np.empty((3, 6)),
-            np.empty(0),
-            self._period_s,
+        past, turns, still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
+        # `recall` writes to this; belief and clock are those of the state
+        self._seen = Seen(
+            np.empty((3, 6)), still, past, turns, turn_lag_s(late_s), np.empty((3, 6)), np.empty(0), self._period_s
         )
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
@@ -84,7 +79,7 @@ class SkillStage:
         """
         states, frames, rules = as_array(state), as_array(frame), self._rules
         self._count(state)
-        seen = self._seen._replace(belief=state["stage_belief"], clock=state["task_clock"])
+        seen = Seen(*self._seen[:6], state["stage_belief"], self._period_s, state["task_clock"])
         is_new, before, known = recall(states, rules, seen), None, state["covariance"]
         if not is_new:
             before = (
