@@ -94,7 +94,9 @@ class SkillStage:
         off = 0.0
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
-            off = off_m(self.skill.model, seen, columns, deviation_m(states, unseen, self._period_s), known)
+            again = found.covariance, found.turn.covariance, found.closure, found.gate_m  # need not be computed
+            deviation = deviation_m(states, unseen, self._period_s)
+            off = off_m(lambda hands: self.skill.predicted(hands, again).position, seen, columns, deviation)
         doubt, unprimed = 0.0, state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
             doubt = self.skill.model.elsewhere(seen.now, seen.stillness, self._period_s, seen.belief, unprimed)

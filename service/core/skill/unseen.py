@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from kmp.compiled import compiled
 from service.core.frame import Records, Vector
 from service.core.intake.tuning import MODE_PRIOR, MODE_SWITCH_RATES_PER_S
 from service.core.skill.memory import turn_lag_s
-from service.core.skill.model import REGION_95, Model, Seen
+from service.core.skill.model import REGION_95, Seen
 
 
 @compiled
@@ -32,23 +33,23 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     return math.sqrt(variance)
 
 
-def off_m(model: Model, seen: Seen, columns: list[int], deviation: float, known: Vector) -> float:
+def off_m(tool: Callable[[Seen], Vector], seen: Seen, columns: list[int], deviation: float) -> float:
     """Possible error [m] of the target because one hand is not seen.
 
-    With d = sqrt(REGION_95) * `deviation` [m], the prediction for the hands `seen` is repeated with
-    that hand, whose x, y and z begin at `columns` (a hand that leads alone stands for both), moved
-    by d along each axis. The result is the norm of the three differences (3, 3). Velocities and the
-    skill's delay are left out; the `known` covariance (3, 3) need not be computed.
+    With d = sqrt(REGION_95) * `deviation` [m], the prediction of the `tool` (3,) [m] for the hands
+    `seen` is repeated with that hand, whose x, y and z begin at `columns` (a hand that leads alone
+    stands for both), moved by d along each axis. The result is the norm of the three differences
+    (3, 3). Velocities and the skill's delay are left out.
     """
     if not columns:
         return 0.0
     at, off = np.zeros((3, 6)), np.empty((3, 3))
     resting = seen._replace(moving=at, now=at, turn_lag_s=turn_lag_s(0.0), period_s=0.0)
     at[0] = seen.now[0]
-    here = model.predict(resting, known).position
+    here = tool(resting)
     for axis in range(3):
         at[0] = seen.now[0]
         for column in columns:
             at[0, column + axis] += math.sqrt(REGION_95) * deviation
-        off[axis] = model.predict(resting, known).position - here
+        off[axis] = tool(resting) - here
     return float(np.linalg.norm(off))

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from service.core.intake.hand_estimator import STILL
 from service.core.numerics import MOTION_STEP_S
-from service.core.skill.model import NO_CLOCK
+from service.core.skill.model import Seen
 from service.core.skill.pose import NO_GRIPPER
 from service.core.skill.skill import Earlier, Prediction, Skill
 from service.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
@@ -62,23 +61,9 @@ class Rival(Skill):
 
     says: Callable[[Array, Array, Array], Said] = field(kw_only=True)
 
-    def predict(
-        self,
-        hands: Array,
-        velocities: Array,
-        accelerations: Array,
-        stillness: Array = STILL,
-        *,
-        before: Earlier | None = None,
-        past: Array | None = None,
-        turns: Array | None = None,
-        belief: Array | None = None,
-        period_s: float = 0.0,
-        lead_s: float = 0.0,
-        clock: Array = NO_CLOCK,
-    ) -> Prediction:
+    def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
-        said = self.says(hands.reshape(6), velocities.reshape(6), accelerations.reshape(6))
+        said = self.says(*seen.now.copy())
         position, velocity, acceleration = np.round(said.motion, 6)
         turn, gate_m = self.constant_turn, float(said.far)
         return Prediction(position, velocity, acceleration, said.covariance, gate_m, 0.0, turn, NO_GRIPPER)
