@@ -67,28 +67,36 @@ def step(
     gate_m: float,
     threshold: float,
 ) -> tuple[int, float, float]:
-    """Mode and reason of this tick, written to state and frame; compiled part of `Decision.step`,
-    which states what is returned.
+    """Mode and reason of this tick, written to state and frame; compiled part of `Decision.step`.
+
+    A fault remains until a reset. Otherwise the arm may cause a fault (`_arm`), or a reason
+    (`_why_hold`, or BLOCKED: the tool is stuck, and the arm waits or moves along a way out, see
+    `_stuck`) causes a hold; without one, the arm follows.
+
+    Returns STARTS_ASSUMED or STARTS_MEASURED if the arm starts, else 0, and the result of
+    `measured_error`, or -1 twice if nothing was measured.
     """
-    found = _decided(states, frames, heres, parameters, conditions, gate_m, threshold)
-    frames[0].mode, frames[0].reason = states[0].mode, states[0].reason
-    return found
+    state, frame, starts, error, speed = states[0], frames[0], 0, -1.0, -1.0
+    if state.mode != FAULT:
+        starts, fault, error, speed = _arm(states, heres, parameters, conditions)
+        if fault != NONE:
+            state.mode, state.reason = FAULT, fault
+        else:
+            _note_hold(states, conditions)
+            reason = _why_hold(states, parameters, conditions, gate_m, threshold)
+            if reason == NONE:
+                state.stuck = _stuck(states, frames, heres, parameters)
+                reason = BLOCKED if state.stuck == HELD else NONE
+            state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+            if reason == NONE:
+                state.followed_tick = state.tick
+    frame.mode, frame.reason = state.mode, state.reason
+    return starts, error, speed
 
 
 @compiled
-def _decided(
-    states: Records,
-    frames: Records,
-    heres: Records,
-    parameters: Records,
-    conditions: int,
-    gate_m: float,
-    threshold: float,
-) -> tuple[int, float, float]:
-    """Mode and reason of this tick, written to the state.
-
-    A fault remains until a reset. Otherwise the arm may cause a fault (`_arm`), or the first reason
-    in this order causes a hold; without one, the arm follows:
+def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: float, threshold: float) -> int:
+    """The first reason for a hold in this order, or NONE:
 
     * TWO_SOURCES: a hand or the arm is contested.
     * GUIDED: the arm is led by hand. This is an operator's hold, which lasts afterwards.
@@ -103,44 +111,25 @@ def _decided(
     * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > END_SHARE
       threshold.
     * AMBIGUOUS: the stage of the task is not known.
-    * BLOCKED: the tool is stuck, and the arm waits or moves along a way out (`_stuck`).
-
-    Returns STARTS_ASSUMED or STARTS_MEASURED if the arm starts, else 0, and the result of
-    `measured_error`, or -1 twice if nothing was measured.
     """
     state = states[0]
-    if state.mode == FAULT:
-        return 0, -1.0, -1.0
-    starts, fault, error, speed = _arm(states, heres, parameters, conditions)
-    if fault != NONE:
-        state.mode, state.reason = FAULT, fault
-        return starts, error, speed
-    _note_hold(states, conditions)
     if conditions & CONTESTED:
-        reason = TWO_SOURCES
-    elif conditions & ARM_GUIDED and not parameters[0].is_assumed:
-        reason = GUIDED
-    elif state.arm_ready != READY and not (state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED):
-        reason = NOT_READY
-    elif state.operator_hold:
-        reason = OPERATOR
-    elif conditions & CLUTCH_RELEASED:
-        reason = CLUTCH
-    elif math.isnan(gate_m):
+        return TWO_SOURCES
+    if conditions & ARM_GUIDED and not parameters[0].is_assumed:
+        return GUIDED
+    if state.arm_ready != READY and not (state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED):
+        return NOT_READY
+    if state.operator_hold:
+        return OPERATOR
+    if conditions & CLUTCH_RELEASED:
+        return CLUTCH
+    if math.isnan(gate_m):
         unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not conditions & ONE_HAND
-        reason = NO_HANDS if unseen else STALE_HAND
-    elif conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
-        reason = STALE_HAND
-    else:
-        ease = END_SHARE if state.reason == FAR else 1.0
-        reason = FAR if gate_m > ease * threshold else AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
-    if reason == NONE:
-        state.stuck = _stuck(states, frames, heres, parameters)
-        reason = BLOCKED if state.stuck == HELD else NONE
-    state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
-    if reason == NONE:
-        state.followed_tick = state.tick
-    return starts, error, speed
+        return NO_HANDS if unseen else STALE_HAND
+    if conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
+        return STALE_HAND
+    ease = END_SHARE if state.reason == FAR else 1.0
+    return FAR if gate_m > ease * threshold else AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
 
 
 @compiled
