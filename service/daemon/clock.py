@@ -9,6 +9,7 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,7 +20,10 @@ from service.contract.requests import Percentiles
 from service.core.frame import Vector
 
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
-PREPARE_NS = 650_000  # the next tick is prepared this long before its deadline, 1.5 times the duration of a tick
+PREPARING_NS = 430_000  # the next tick is prepared within this time, which is that of a tick
+PREPARE_NS = 3 * PREPARING_NS // 2  # preparation begins this long before the deadline
+BESIDE_NS = 300_000  # work beside the loop is done in parts, most of which take less
+NO_TICK_S = 0.02  # work beside a loop that does not tick is done after this time
 STEP_NS = 20_000_000  # a larger difference from the system clock shows that the clock was set
 READ_NS = 1_000_000  # two clocks that were read within this time are compared
 DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
@@ -56,19 +60,37 @@ class Deadlines:
         self._start_ns = now_ns()
         self.stamp_ns = wall_ns() - self.period_ns
         self._index = -1
+        self._sleeps_until_ns = 0
+        self._is_in_tick = threading.Lock()  # locked by `between_ticks`, released at the end of a tick
+
+    def between_ticks(self) -> None:
+        """Wait, on another thread, until the loop sleeps for at least BESIDE_NS more, or has just
+        begun to sleep.
+
+        A thread that holds the interpreter lock when the loop wakes delays it. Only one thread may
+        use this.
+        """
+        if self._now_ns() > self._sleeps_until_ns - BESIDE_NS:
+            self._is_in_tick.acquire(blocking=False)
+            self._is_in_tick.acquire(timeout=NO_TICK_S)
 
     def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
         """Wait for the next deadline and return its number and lateness [ns].
 
-        `prepare` is called PREPARE_NS before the deadline, if there is time.
+        `prepare` is called PREPARE_NS before the deadline, unless it would end after it.
         """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
         passed = index - self._index
         self.missed += passed - 1
         self._index = index
         deadline = self._start_ns + index * self.period_ns
-        if prepare is not None and self._sleep_until(deadline - PREPARE_NS):
-            prepare()
+        self._sleeps_until_ns = deadline - (self._spin_ns if prepare is None else PREPARE_NS)
+        if self._is_in_tick.locked():
+            self._is_in_tick.release()
+        if prepare is not None:
+            self._sleep_until(deadline - PREPARE_NS)
+            if self._now_ns() < deadline - PREPARING_NS:
+                prepare()
         self._sleep_until(deadline - self._spin_ns)
         while (late := self._now_ns() - deadline) < 0:
             pass
@@ -80,12 +102,11 @@ class Deadlines:
             self.stamp_ns = due + off if off > 0 else self.stamp_ns + CREEP_NS
         return index, late
 
-    def _sleep_until(self, at_ns: int) -> bool:
-        """Sleep until a time [ns]; False if it has passed."""
+    def _sleep_until(self, at_ns: int) -> None:
+        """Sleep until a time [ns], unless it has passed."""
         early = at_ns - self._now_ns()
         if early > 0:
             self._sleep(early / 1e9)
-        return early > 0
 
     def rate_hz(self) -> float:
         """Achieved ticks per second since start."""

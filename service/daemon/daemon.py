@@ -331,6 +331,7 @@ class Daemon:
             self._status.wait(due_s - time.monotonic())
             is_due, is_published = time.monotonic() >= due_s, self._status.begin()
             status = self._status_now()
+            self._clock.between_ticks()
             payload, errors = encode_json(status), list(status.scribe["errors"])
             if is_due or is_published:
                 self._streams.publish("status", payload)
@@ -343,6 +344,7 @@ class Daemon:
                 errors.append(f"the certificate ends on {self._ends:%Y-%m-%d}: {advice}")
             self._status.end(payload)
             self._start.systemd.progressed(status.tick)
+            self._clock.between_ticks()
             if is_due:
                 due_s = time.monotonic() + STATUS_S
                 self._way_finder.poll(self._frame, self._controller.state)
@@ -382,15 +384,24 @@ class Daemon:
         return frame, state
 
     def _status_now(self) -> Status:
-        """The present status."""
-        clock = self._clock
+        """The present status, made in parts between ticks."""
+        clock, now_s = self._clock, time.monotonic()
+        clock.between_ticks()
         frame, state = self._moment()
-        now_s = time.monotonic()
-        sources = self._sources.update(self._controller, state, now_s)
+        sources = {}
+        for name, source in self._sources.update(self._controller, state, now_s):
+            sources[name] = source
+            clock.between_ticks()
         inside = self._measured_arm.inside(state)
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
         machine, scribe = self._machine, self._scribe.status()
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
+        memory_mb = resident_mb(daemon=os.getpid(), scribe=scribe["pid"])
+        windows = []
+        for window in (self._lateness, self._work, self._latency):
+            clock.between_ticks()
+            windows.append(window.percentiles())
+        clock.between_ticks()
         known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
             time_ns=time.time_ns(),
@@ -399,11 +410,11 @@ class Daemon:
             realtime=self._granted.realtime,
             memory_locked=self._granted.locked,
             received={key: arrivals.count for key, arrivals in self._sources.arrivals.items()},
-            lateness_us=self._lateness.percentiles(),
-            work_us=self._work.percentiles(),
-            latency_ms=self._latency.percentiles(),
+            lateness_us=windows[0],
+            work_us=windows[1],
+            latency_ms=windows[2],
             scribe=scribe,
-            memory_mb=resident_mb(daemon=os.getpid(), scribe=scribe["pid"]),
+            memory_mb=memory_mb,
             command_heard=self._streams.is_followed,
             busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,

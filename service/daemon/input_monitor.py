@@ -63,9 +63,10 @@ class InputMonitor:
         self._histories = {source: _History() for source in SOURCES if KEY_OF_SOURCE[source] in self.arrivals}
         self._counted_s = 0.0
 
-    def update(self, controller: Controller, state: Record, now_s: float) -> dict[str, Source]:
-        """Each source at this moment, from the state of this controller."""
-        return {source: self._source(source, controller, state, now_s) for source in self._histories}
+    def update(self, controller: Controller, state: Record, now_s: float) -> Iterator[tuple[str, Source]]:
+        """Each source with its name at this moment, from the state of this controller."""
+        for source in self._histories:
+            yield source, self._source(source, controller, state, now_s)
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
         history, arrivals, index = self._histories[source], self.arrivals[KEY_OF_SOURCE[source]], SOURCES.index(source)

@@ -4,6 +4,8 @@ well.
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +13,18 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.contract.requests import Percentiles
-from service.daemon.clock import CREEP_NS, PREPARE_NS, READ_NS, STEP_NS, Deadlines, SystemClock, Window
+from service.daemon import clock as clock_module
+from service.daemon.clock import (
+    BESIDE_NS,
+    CREEP_NS,
+    PREPARE_NS,
+    PREPARING_NS,
+    READ_NS,
+    STEP_NS,
+    Deadlines,
+    SystemClock,
+    Window,
+)
 
 PERIOD_NS = 2_000_000
 WALL_NS = 1_800_000_000_000_000_000
@@ -255,6 +268,29 @@ def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -
     deadlines.wait(prepare)  # the first deadline is now: no time
     assert deadlines.wait(prepare) == (1, 0)
     assert prepared == [PERIOD_NS - PREPARE_NS]
-    clock.now = start + 2 * PERIOD_NS - PREPARE_NS + 1
+    clock.now = start + 2 * PERIOD_NS - PREPARING_NS  # this tick ended late
     assert deadlines.wait(prepare) == (2, 0)
     assert len(prepared) == 1
+    clock.oversleep_ns = PREPARE_NS - PREPARING_NS  # another thread held the interpreter lock
+    deadlines.wait(prepare)
+    assert len(prepared) == 1
+
+
+def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock_module, "NO_TICK_S", 60.0)
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    deadlines.wait()
+    deadlines.wait()
+    clock.now -= BESIDE_NS  # as before the end of its sleep
+    deadlines.between_ticks()  # returns at once
+    clock.now += 1
+    beside = threading.Thread(target=deadlines.between_ticks, daemon=True)
+    beside.start()
+    beside.join(0.1)
+    assert beside.is_alive()
+    clock.now += BESIDE_NS
+    for _ in range(100):
+        deadlines.wait()  # the tick has ended
+        beside.join(0.1)
+    assert not beside.is_alive()

@@ -60,7 +60,7 @@ class Cell:
 
     def status(self, now_s: float, *, failure: str = "") -> Status:
         state = self.controller.state
-        told = self.sources.update(self.controller, state, now_s)
+        told = dict(self.sources.update(self.controller, state, now_s))
         self.log += self.sources.news(told, now_s)
         none = Percentiles()
         more = {"rate_hz": 500.0, "missed": 0, "realtime": True, "memory_locked": True, "scribe": {}, "endpoints": ()}

@@ -83,7 +83,7 @@ class Told:
                 )
                 state = controller.state if lost else None
                 recorder.write(tick, frame, time_ns=stamp(k), timing=timing, state=state, lost=lost)
-                sources = monitor.update(controller, controller.state, k * PERIOD_S)
+                sources = dict(monitor.update(controller, controller.state, k * PERIOD_S))
                 if statuses and k % 50 == 0:
                     failure = "the request thread failed: out of paper" if what == "failed" else ""
                     cell = CellStatus(frame, controller, controller.state, sources, SETTINGS, failure)
