@@ -36,11 +36,12 @@ def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIM
 
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
-    """A message with the likely reason for a cell's silence: its daemon starts or ends, or it has
-    none.
-    """
+    """A message with the likely reasons for a cell's silence."""
     if living(session, cell):
-        return "its daemon is alive, but it is starting or ending, too busy, or denies access: try again"
+        return (
+            "its daemon is alive, but it is starting or ending, too busy, denies access, or is reached through another "
+            "cell's daemon, which forwards no streams: try again, or connect to it directly"
+        )
     return "is the daemon running there, and is the cell's name right?"
 
 

@@ -24,11 +24,27 @@ CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # f
 ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
 ATTEMPT_S = 1.0  # timeout of one attempt
 RETRY_S = 0.05  # pause before the next attempt
+SERVER_PROBLEMS = {  # by OpenSSL's code of a failed verification; others: another authority
+    9: "is not valid yet by the clock of this machine",
+    10: "has expired",
+    26: "is that of another role",
+    62: "is not for this name",
+    64: "is not for this address",
+}
+CLIENT_PROBLEMS = {  # by the alert of TLS that the server sends
+    **dict.fromkeys(("UNKNOWN_CA", "DECRYPT_ERROR"), "is not from the authority there"),
+    **dict.fromkeys(("BAD_CERTIFICATE", "CERTIFICATE_UNKNOWN", "CERTIFICATE_REQUIRED"), "is not valid there"),
+    "CERTIFICATE_EXPIRED": "has expired by the clock there",
+}
 Attempted = TypeVar("Attempted")
 
 
 class UnreachableError(ExplainedError, OSError):
     """No Zenoh session can be opened, or no daemon answers."""
+
+
+class CertificateError(UnreachableError):
+    """A certificate is missing, wrong or not valid now; waiting does not help."""
 
 
 class StartingError(UnreachableError):
@@ -63,7 +79,8 @@ def open_session(
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
     begin with `tls/`; None: $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`,
-    $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError.
+    $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError, and
+    CertificateError at once if TLS fails for a certificate.
     """
     for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
         if lacks := lacking(endpoint):
@@ -71,6 +88,7 @@ def open_session(
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
     if otherwise and not connect and not listen:
         connect = _endpoints_in(config) or otherwise
+    folder = os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate
     role = ("router" if connect else "peer") if listen or not connect else "client"
     settings: dict[str, Any] = {
         "mode": json.loads(config.get_json("mode")) or role,
@@ -86,7 +104,7 @@ def open_session(
         "plugins_loading/enabled": False,
         "namespace": None,  # the contract's keys are absolute
         "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
-        **_tls(os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate),
+        **_tls(folder),
         **(more or {}),
     }
 
@@ -99,6 +117,9 @@ def open_session(
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
+            ours = connect if folder or not zenoh_config else ()  # else the file may have certificates of its own
+            if problem := next(filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""):
+                raise CertificateError(problem) from None
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
     return tried(opened, None if timeout_s is None and not listen else 0.0)
@@ -110,15 +131,20 @@ def check_open(session: zenoh.Session) -> None:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
+def _address(endpoint: str) -> tuple[str, str, int] | None:
+    """Protocol, host and port of an endpoint to which a TCP connection leads, else None."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    return (protocol, host.strip("[]"), int(port)) if protocol in ("tcp", "tls", "ws") and port.isdecimal() else None
+
+
 def _refused(endpoints: Sequence[str]) -> bool:
     """True if the system refuses a connection to every endpoint: nothing listens there."""
     for endpoint in endpoints:
-        protocol, _, address = endpoint.partition("/")
-        host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-        if protocol not in ("tcp", "tls", "ws") or not port.isdecimal():
+        if (address := _address(endpoint)) is None:
             return False
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=ATTEMPT_S).close()
+            socket.create_connection(address[1:], timeout=ATTEMPT_S).close()
         except ConnectionRefusedError:
             continue
         except OSError:
@@ -127,10 +153,48 @@ def _refused(endpoints: Sequence[str]) -> bool:
     return bool(endpoints)
 
 
+def tls_problem(endpoint: str, folder: str | Path | None) -> str:
+    """The reason why a TLS handshake with an endpoint fails, in words; empty if it succeeds or
+    fails for another cause. Zenoh itself gives no reason.
+
+    In TLS 1.3 the server reports after the handshake that it refuses the client's certificate.
+    """
+    if (address := _address(endpoint)) is None or address[0] != "tls":
+        return ""
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        if folder:
+            own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+            tls.load_verify_locations(authority)
+            tls.load_cert_chain(own, key)
+        else:
+            tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
+        with (
+            socket.create_connection(address[1:], timeout=ATTEMPT_S) as plain,
+            tls.wrap_socket(plain, server_hostname=address[1]) as secured,
+        ):
+            secured.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        words = SERVER_PROBLEMS.get(error.verify_code, f"is not from the authority in {folder}")
+        return f"the certificate of the daemon or router at {endpoint} {words}"
+    except ssl.SSLError as error:
+        problem = CLIENT_PROBLEMS.get(str(error.reason).partition("ALERT_")[2], "")
+        if folder or not problem:
+            return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
+        return (
+            f"{endpoint} requires a certificate, and none was given: the folder of your role, made by "
+            "`thirdhand certificates`, needed, as --certificate or $THIRDHAND_CERTIFICATE"
+        )
+    except OSError:
+        pass
+    return ""
+
+
 def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: bool | None = None) -> Attempted:
     """The result of `attempt`, which is repeated while it raises UnreachableError.
 
-    The error is raised after `timeout_s` [s] with the same message; None: never. One message on
+    The error is raised after `timeout_s` [s] with the same message; None: never. A CertificateError
+    is raised at once. One message on
     standard error reports the waiting unless `silent`, which by default holds if there is a
     timeout.
     """
@@ -139,6 +203,8 @@ def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: 
     while True:
         try:
             return attempt()
+        except CertificateError:
+            raise
         except UnreachableError as error:
             if reported and str(error) != reported:
                 begun_s = time.monotonic()
@@ -156,12 +222,9 @@ def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     """A message with the reason why there is no session between these endpoints."""
     if connect and "connect" in reason:
-        secured = any(endpoint.startswith("tls/") for endpoint in connect)
         return (
             f"nobody answers at {', '.join(connect)}: "
             "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
-            + " Is your certificate, if you gave one, from the daemon's authority, and is the daemon's own valid, and "
-            "for this name or address?" * secured
         )
     found = re.search(r"\(os error (\d+)\)", reason)
     words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason

@@ -30,18 +30,19 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
     from joblib.parallel import get_active_backend
 
     cluster, _, address = workers.partition(":")
-    backend: dict[str, Any] = {"backend": cluster} if address else {}
+    backend: dict[str, Any] = {"backend": cluster, "n_jobs": -1} if address else {}  # else Ray gets no work
     if backend and importlib.util.find_spec(CLUSTERS[cluster]) is None:
         raise ExplainedError(f"--workers {workers}: the package {CLUSTERS[cluster]} needed here")
     if workers and not backend:
         backend = {"backend": "loky", "n_jobs": int(workers)}
+    lost: tuple[type[Exception], ...] = (BrokenExecutor,)
     try:
         if cluster in CLUSTERS:
             _try(address)
         if cluster == "dask":
             backend["scheduler_host"] = address
         elif cluster == "ray":
-            _connect_to_ray(address)
+            lost = (_connect_to_ray(address),)
         with parallel_config(**backend) if backend else contextlib.nullcontext():
             in_turn = "generator" if get_active_backend()[0].supports_return_generator else "list"
             parallel = Parallel(return_as=in_turn, max_nbytes=None)
@@ -49,7 +50,7 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
         raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running cluster's address needed") from None
     try:
         yield from parallel(delayed(_alone)(work, item) for item in items)
-    except BrokenExecutor:
+    except lost:
         raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
 
 
@@ -63,13 +64,17 @@ def _try(address: str) -> None:
     socket.create_connection((host.strip("[]"), int(port)), timeout=CLUSTER_TIMEOUT_S).close()
 
 
-def _connect_to_ray(address: str) -> None:
-    """Connect to a Ray cluster, whose workers joblib then knows. Raises OSError, ValueError."""
+def _connect_to_ray(address: str) -> type[Exception]:
+    """Connect to a Ray cluster, whose workers joblib then knows. Returns the error of a worker that
+    was killed. Raises OSError, ValueError.
+    """
     import ray
+    from ray.exceptions import RayActorError
     from ray.util.joblib import register_ray
 
     register_ray()
     ray.init(address=address, log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
+    return RayActorError  # type: ignore[no-any-return]  # Ray may not be installed
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

@@ -42,6 +42,15 @@ arguments = [*sys.argv[1:], "--workers", f"ray:{address}"]
 sys.exit(subprocess.run([sys.executable, "-m", "service", *arguments]).returncode)
 """
 
+RAY_WORKERS = """
+import os
+import ray
+from service.process.parallel import spread
+address = ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR").address_info["address"]
+at = list(spread(lambda _: os.getpid(), range(4), f"ray:{address}"))
+print(len(at), os.getpid() in at)
+"""
+
 
 @pytest.fixture(scope="module")
 def files(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
@@ -93,6 +102,13 @@ def test_a_cluster_of_two_workers_prints_the_same(package: str, cluster: str, fi
     alone = told(*command)
     assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr
     assert named_failures(done.stderr) == named_failures(alone.stderr)
+
+
+def test_a_ray_cluster_does_the_work_itself() -> None:
+    pytest.importorskip("ray")
+    command = [sys.executable, "-c", RAY_WORKERS]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False, cwd=ROOT)
+    assert done.stdout == "4 False\n", done.stderr
 
 
 @pytest.mark.parametrize(

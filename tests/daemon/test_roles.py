@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import itertools
+import json
 import os
 import re
 import shutil
@@ -21,7 +22,7 @@ from cryptography import x509
 
 from service.cli.main import main
 from service.client import Client, UnreachableError, cells, endpoints, living, open_session
-from service.client.session import valid_until
+from service.client.session import CertificateError, valid_until
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import DAEMON, ROLES, ROUTER, TOPICS, access_control, names
@@ -372,10 +373,89 @@ def test_a_certificate_that_ends_soon_is_reported_by_daemon_doctor_and_cells(tmp
         until(lambda: "the certificate ends on" in service.log.read_text())
 
 
+def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the checks of the own files' dates, as if the clocks of both machines differed."""
+    own, other, ago = tmp_path / "own", tmp_path / "other", datetime.datetime.now(datetime.UTC)
+    shutil.copytree(secrets, own)
+    assert told("certificates", str(other)).returncode == 0
+    ago -= datetime.timedelta(days=30)
+    monkeypatch.setattr("service.cli.certificates.now", lambda: ago)
+    for role, name in (("daemon", "daemon-8"), ("operator", "operator-8")):
+        assert told("certificates", str(own), "--role", role, "--name", name, "--days", "3").returncode == 0
+    shutil.copytree(other / "operator", own / "operator-9")
+    shutil.copy(own / "operator" / "authority.pem", own / "operator-9")
+    monkeypatch.setattr("service.client.session.check_dates", lambda path: None)
+    for daemon, client, words in (
+        ("daemon", None, "requires a certificate, and none was given"),
+        (
+            "daemon",
+            other / "operator",
+            "the certificate of the daemon .* is not from the authority in .*other/operator",
+        ),
+        ("daemon", own / "operator-8", "refuses the certificate in .*operator-8, which has expired by the clock there"),
+        (
+            "daemon",
+            own / "operator-9",
+            "refuses the certificate in .*operator-9, which is not from the authority there",
+        ),
+        ("daemon-8", own / "operator", "the certificate of the daemon .* has expired"),
+    ):
+        with open_session(listen=["tls/127.0.0.1:0"], certificate=own / daemon) as session:
+            for timeout_s in (0.3, None):  # with None, other errors are waited for
+                with pytest.raises(CertificateError, match=words):
+                    open_session(connect=endpoints(session), certificate=client or "", timeout_s=timeout_s)
+    with (
+        open_session(listen=["tls/127.0.0.2:0"], certificate=own / "daemon") as session,
+        pytest.raises(CertificateError, match=r"the certificate of the daemon .* is not for this address"),
+    ):
+        open_session(connect=endpoints(session), certificate=own / "operator", timeout_s=0.3)
+
+
+def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path, tmp_path: Path) -> None:
+    """Of which one connects to the other; a third is of another authority, a fourth has none."""
+    at, operator = "", ("--certificate", str(secrets / "operator"))
+    with contextlib.ExitStack() as closing:
+        endpoints_of: dict[str, str] = {}
+        for name in ("lab/a", "lab/b"):
+            folder = tmp_path / name
+            folder.mkdir(parents=True)
+            network = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\nconnect = [{at}]\n'
+            arguments = ("--cell", name, "--joints", "assumed", "--rate", "100")
+            service = closing.enter_context(launched(folder, *arguments, network=network, rerun=False))
+            endpoints_of[name], at = service.endpoint, f'"{service.endpoint}"'
+        for endpoint in endpoints_of.values():
+            shown = until(
+                lambda endpoint=endpoint: (
+                    shown
+                    if len(shown := json.loads(told("cells", "--json", "--connect", endpoint, *operator).stdout)) == 2
+                    and all(cell["status"] for cell in shown)
+                    else None
+                )
+            )
+            for cell in (cell["status"] for cell in shown):
+                assert (cell["mode"], cell["reason"], cell["skill"]) == ("hold", "no_hands", "soldering")
+                assert cell["version"]
+                assert cell["lateness_us"]["p99"] > 0
+        assert told("certificates", str(tmp_path / "other")).returncode == 0
+        serve = ("serve", "--cell", "lab/c", "--joints", "assumed", "--connect", endpoint)
+        config = tmp_path / "c.toml"
+        config.write_text(f'[network]\nlisten = []\ncertificate = "{tmp_path}/other/daemon"\n')
+        foreign = told(*serve, "--config", str(config))
+        assert (foreign.returncode, foreign.stdout) == (1, "")
+        assert re.search(
+            "^thirdhand serve: the certificate of the daemon .* is not from the authority in", foreign.stderr
+        )
+        without = thirdhand("cells", "--connect", endpoint)
+        assert (without.returncode, without.stdout) == (1, "")
+        assert re.search("^thirdhand cells: .* requires a certificate, and none was given", without.stderr)
+
+
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:
     assert told("certificates", str(tmp_path / "own")).returncode == 0
-    for certificate in (tmp_path / "own" / "operator", None):
-        with pytest.raises(UnreachableError, match="nobody answers"):
+    for certificate, words in ((tmp_path / "own" / "operator", "is not from the authority"), (None, "none was given")):
+        with pytest.raises(UnreachableError, match=words):
             open_session(connect=[guarded.endpoint], certificate=certificate, timeout_s=1.0)
     with pytest.raises(UnreachableError):
         open_session(connect=[guarded.endpoint.replace("tls/", "tcp/")], timeout_s=1.0)
@@ -385,7 +465,7 @@ def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
     """A role's certificate is no daemon's: clients do not talk to who listens with it."""
     with (
         open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "operator") as false,
-        pytest.raises(UnreachableError),
+        pytest.raises(CertificateError, match="is that of another role"),
     ):
         open_session(connect=endpoints(false), certificate=secrets / "tracker", timeout_s=1.0)
 

@@ -97,12 +97,13 @@ def serving(
 
 class Tracker:
     """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not
-    seen.
+    seen. Its clock is `ahead_ns` ahead.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.left: tuple[float, float, float] | None = LEFT
         self.right: tuple[float, float, float] | None = RIGHT
+        self.ahead_ns = 0
         self._publishers = {side: session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")}
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._publish)
@@ -110,7 +111,7 @@ class Tracker:
 
     def _publish(self) -> None:
         while not self._end.wait(0.01):
-            stamp_ns = time.time_ns()
+            stamp_ns = time.time_ns() + self.ahead_ns
             for side, position in (("left", self.left), ("right", self.right)):
                 if position is not None:
                     pose = messages.PoseStamped(stamp_ns, messages.BASE, position, (0.0, 0.0, 0.0, 1.0))
