@@ -13,7 +13,7 @@ import msgspec
 
 from service.cli.status import AHEAD_MS, disk, hours_until_full
 from service.contract.channels import BY_KEY, key
-from service.contract.evidence import Evidence, explained, two_places
+from service.contract.evidence import Evidence, explained, lasting, two_places
 from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
@@ -128,7 +128,7 @@ def _in_order_of_cause(
     yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
-        found = f"{abs(apart_s):.3g} s {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
+        found = f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
         advice = what_to_do(Condition.CLOCKS_DIFFER)
         yield Finding("note", "clock here", found, f"within {OWN_CLOCK_S:g} s", advice)
 
@@ -224,7 +224,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
     yield judged(is_fine, what, found, wanted, advice or what_to_do(Condition.RATE_LOW))
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
         order = "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
-        found = f"a sample is stamped {abs(source.clock_ms) / 1000:.3g} s {order}; no latency can be measured"
+        found = f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be measured"
         level = "note" if name == "arm" else "wrong"  # no latency is computed from the arm's stamps
         advice = what_to_do(Condition.CLOCKS_DIFFER)
         yield Finding(level, f"{what}'s clock", found, f"less than {LATE_MS / 1000:g} s", advice)

@@ -17,6 +17,7 @@ from service.cli.clients import ask
 from service.cli.usage import reached
 from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
+from service.contract.evidence import lasting
 from service.contract.incidents import SOURCE_NAMES, in_brief, what_happened, what_to_do, word
 from service.contract.records import SIDES, Flag
 from service.contract.requests import Source, Status
@@ -178,12 +179,10 @@ def disk(scribe: Mapping[str, Any]) -> str:
         return found
     found += f", {rate / 1000:.2g} GB an hour written"
     if (full_h := hours_until_full(scribe)) is not None:
-        return f"{found}: full in {_hours(full_h)}"
-    return f"{found}: never full, in {_hours(scribe['keep_mb_left'] / rate)} each new file takes an older one's place"
-
-
-def _hours(hours: float) -> str:
-    return f"{hours:.1f} h" if hours < 48 else f"{hours / 24:.0f} days"
+        return f"{found}: full in {lasting(3.6e6 * full_h)}"
+    begins_ms = 3.6e6 * scribe["keep_mb_left"] / rate
+    begins = f"in {lasting(begins_ms)} " if begins_ms else ""
+    return f"{found}: never full, {begins}each new file takes an older one's place"
 
 
 def _doubt(now: Status) -> str:
@@ -198,7 +197,7 @@ def differing_clocks(now: Status) -> str:
     for side in SIDES:
         apart_ms = getattr(now.sources.get(side), "clock_ms", None)
         if apart_ms is not None and not AHEAD_MS <= apart_ms <= LATE_MS:
-            difference = f"{abs(apart_ms) / 1000:.3g} s {'ahead of' if apart_ms < 0 else 'behind'}"
+            difference = f"{lasting(abs(apart_ms))} {'ahead of' if apart_ms < 0 else 'behind'}"
             found.append(f"the {SOURCE_NAMES[side]}'s stamps are {difference} the daemon's clock")
     return ", ".join(found)
 

@@ -179,15 +179,15 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
         case Cause.REPEATED:
             found = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
         case Cause.OLDER:
-            found = f"stamped {-advanced_s:.3g} s before the newest accepted one"
+            found = f"stamped {lasting(-1000 * advanced_s)} before the newest accepted one"
             if seen.is_set_back:
                 found, closer = f"{found}: its clock was set back", what_to_do(Condition.CLOCK_STEPPED)
         case Cause.AHEAD:
-            found = f"stamped {advanced_s:.3g} s after the newest accepted one"
+            found = f"stamped {lasting(1000 * advanced_s)} after the newest accepted one"
             if seen.held_up_s is None:
                 found, closer = f"{found}: its clock stepped ahead", what_to_do(Condition.CLOCK_STEPPED)
             else:
-                found += f", which was held up for {seen.held_up_s:.3g} s on its way; the clock is right"
+                found += f", which was held up for {lasting(1000 * seen.held_up_s)} on its way; the clock is right"
                 closer = what_to_do(Condition.DELAYED)
         case Cause.JUMPED if (jump := seen.jump) is not None:
             found = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one sample to the next"
@@ -206,7 +206,7 @@ def _unseen(seen: Evidence) -> str:
     said = []
     for side in SIDES:
         if (source := seen.sources.get(side)) is not None and not source.fresh:
-            since = "has not been seen yet" if source.age_ms is None else f"was last seen {_time(source.age_ms)} ago"
+            since = "has not been seen yet" if source.age_ms is None else f"was last seen {lasting(source.age_ms)} ago"
             since = f"arrives {rate}" if (rate := _rate_too_low(seen, side)) else since
             instead = (
                 f", as what arrives is rejected as {source.cause}: {source.refused}" if _is_rejected(source) else ""
@@ -274,7 +274,7 @@ def _silence(seen: Evidence) -> str:
         return f"joint states arrive {rate}"
     if source is None or source.fresh:
         return ""
-    return "no joint states arrived yet" if source.age_ms is None else f"no joint states for {_time(source.age_ms)}"
+    return "no joint states arrived yet" if source.age_ms is None else f"no joint states for {lasting(source.age_ms)}"
 
 
 def _not_ready(seen: Evidence) -> tuple[str, str]:
@@ -325,8 +325,14 @@ def _is_of_a_busy_machine(reason: Reason, seen: Evidence) -> bool:
     return not _rejected_remedy(seen, *OF_A_BUSY_MACHINE[reason])
 
 
-def _time(duration_ms: float) -> str:
-    return f"{duration_ms:.0f} ms" if duration_ms < 1000 else f"{duration_ms / 1000:.1f} s"
+def lasting(duration_ms: float) -> str:
+    """A duration for people: 30 ms, 4.2 s, 3 h, 12 days."""
+    if duration_ms < 1000.0:
+        return f"{duration_ms:.0f} ms"
+    sizes_ms = {"days": 86.4e6, "h": 3.6e6, "min": 60e3}
+    unit, size_ms = next((one for one in sizes_ms.items() if duration_ms >= 2.0 * one[1]), ("s", 1000.0))
+    count = duration_ms / size_ms
+    return f"{count:.{3 if count < 1000.0 else 4}g} {unit}"
 
 
 def figures(values: Sequence[float]) -> str:

@@ -200,7 +200,7 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
         (
             {"scribe": {"state": "recording", "free_mb": 2400.0, "mb_per_hour": 3600.0, "keep_mb_left": 9000.0}},
             "disk",
-            ("2.4 GB free", "3.6 GB an hour written: full in 0.7 h", "1 h", "rerun_mb_per_hour"),
+            ("2.4 GB free", "3.6 GB an hour written: full in 40 min", "1 h", "rerun_mb_per_hour"),
         ),
     ],
 )
@@ -217,11 +217,11 @@ def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     ("scribe", "told"),
     [
         ({"mb_per_hour": 1500.0, "keep_mb_left": None}, "1.5 GB an hour written: full in 33.3 h"),
-        ({"mb_per_hour": 200.0, "keep_mb_left": None}, "0.2 GB an hour written: full in 10 days"),
-        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "never full, in 0.0 h each new file takes an older one's place"),
+        ({"mb_per_hour": 200.0, "keep_mb_left": None}, "0.2 GB an hour written: full in 10.4 days"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "never full, each new file takes an older one's place"),
         (
             {"mb_per_hour": 1500.0, "keep_mb_left": 3000.0},
-            "never full, in 2.0 h each new file takes an older one's place",
+            "never full, in 2 h each new file takes an older one's place",
         ),
         ({"mb_per_hour": None, "keep_mb_left": None}, "50.0 GB free where it records |"),
         ({}, "50.0 GB free where it records |"),  # of an older daemon
