@@ -21,6 +21,7 @@ from service.contract.requests import ANY_DIRECTION, ToolLimits
 from service.core.arm.stage import Arm
 from service.core.geometry import quaternion_of
 from service.core.separation.body import Body, body_of
+from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.tool_limits import limits_of_task, tool_limits
 from service.settings.arm_description import description
@@ -53,8 +54,8 @@ class Proposal(NamedTuple):
     """[m] position of the URDF's root in frame base"""
     text: str
     """the URDF with its root at `stand`; empty for a root at the origin"""
-    clearance: float
-    """[m] distance of the arm in its posture from the table and from itself"""
+    clearance: tuple[float, str]
+    """[m] distance of the arm in its posture from the table or itself, and the nearer of both"""
     margin: float
     """smallest distance of a joint to a limit, as a share of half its range"""
     tilt: float
@@ -110,7 +111,7 @@ def proposed(
     posture, tilt = first_posture(settings, robot, workspace, shell, start=DEMO_TOOL_M["start"])
     arm = msgspec.structs.replace(settings.arm, posture=tuple(posture.round(3).tolist()))
     settings = msgspec.structs.replace(settings, arm=arm)
-    clearance = Separation(settings, robot).clearance(np.array(arm.posture), np.empty((0, 3)))[0]
+    depth_m, _, nearest = Separation(settings, robot).intrusion(np.array(arm.posture))
     unmet = tuple(name for name, place in DEMO_TOOL_M.items() if not _is_in(place, shell))
     return Proposal(
         urdf,
@@ -121,7 +122,7 @@ def proposed(
         body_of(settings, robot),
         at,
         text,
-        clearance,
+        (-depth_m, "itself" if nearest == NEAR_ITSELF else "the table"),
         float(limit_margins(np.array(arm.posture), settings).min()),
         tilt,
         efforts,

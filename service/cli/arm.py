@@ -124,7 +124,7 @@ def text(proposal: Proposal, path: Path) -> str:
         f"{settings.reach.min_z:g} m and x ≥ {settings.reach.min_x:g} m",
         f"  posture   [{posture}] rad",
         f"            the tool is {math.degrees(proposal.tilt):.0f}° from straight down, the arm "
-        f"{100 * proposal.clearance:.0f} cm from the table and itself, and the nearest limit "
+        f"{100 * proposal.clearance[0]:.0f} cm from {proposal.clearance[1]}, and the nearest limit "
         f"{100 * proposal.margin:.0f} % of half a range away",
     ]
     where = "in this posture" if proposal.unmet else "where the demo's tool goes"

@@ -84,7 +84,9 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
     assert (here.position[:2] > low).all()
     assert (here.position[:2] < high).all()
     assert 0.1 < here.position[2] < 0.8
-    assert Separation(cell, robot).clearance(posture, np.empty((0, 3)))[0] > 0.0  # beyond what is kept
+    beyond_m = Separation(cell, robot).clearance(posture, np.empty((0, 3)))[0]
+    assert beyond_m > 0.0
+    assert proposal.clearance[0] == pytest.approx(beyond_m + cell.obstacles.clearance)
     lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
     assert (np.minimum(posture - lower, upper - posture) > 0.05 * (upper - lower)).all()
 
