@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli.serve import settings_of, skill_path
+from service.cli.status import in_gb
 from service.client.session import check_files, valid_until
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
@@ -87,7 +88,7 @@ def _folder(folder: Path) -> str:
 
 def _disk(files: Files) -> str:
     free_mb = shutil.disk_usage(existing_folder(Path(files.record))).free / MB
-    text = f"{free_mb / 1000:.1f} GB free for recordings of up to {files.segment_mb:g} MB each"
+    text = f"{in_gb(free_mb)} free for recordings of up to {files.segment_mb:g} MB each"
     if free_mb < files.segment_mb:
         raise ExplainedError(f"{text}; room on that disk needed")
     return text
