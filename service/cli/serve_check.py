@@ -78,7 +78,7 @@ def _skill(settings: Settings, path: Path) -> str:
 def _folder(folder: Path) -> str:
     found = existing_folder(folder)
     if not found.is_dir():
-        raise ExplainedError(f"{folder}: {found} is not a folder")
+        raise ExplainedError(f"{found} is not a folder; a folder, or nothing, needed there")
     if os.statvfs(found).f_flag & os.ST_RDONLY:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(found))
     if not os.access(found, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):

@@ -179,7 +179,8 @@ def disk(scribe: Mapping[str, Any]) -> str:
     found += f", {rate / 1000:.2g} GB an hour written"
     if (full_h := hours_until_full(scribe)) is not None:
         return f"{found}: full in {_hours(full_h)}"
-    return f"{found}: never full, in {_hours(scribe['keep_mb_left'] / rate)} each new file takes an older one's place"
+    begun = f"in {_hours(left_h)} " if (left_h := scribe["keep_mb_left"] / rate) else ""
+    return f"{found}: never full, {begun}each new file takes an older one's place"
 
 
 def in_gb(size_mb: float) -> str:

@@ -218,7 +218,7 @@ def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     [
         ({"mb_per_hour": 1500.0, "keep_mb_left": None}, "1.5 GB an hour written: full in 33.3 h"),
         ({"mb_per_hour": 200.0, "keep_mb_left": None}, "0.2 GB an hour written: full in 10 days"),
-        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "never full, in 0.0 h each new file takes an older one's place"),
+        ({"mb_per_hour": 1500.0, "keep_mb_left": 0.0}, "never full, each new file takes an older one's place"),
         (
             {"mb_per_hour": 1500.0, "keep_mb_left": 3000.0},
             "never full, in 2.0 h each new file takes an older one's place",
