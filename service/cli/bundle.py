@@ -56,7 +56,7 @@ def bundle(args: argparse.Namespace) -> int:
     about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
     if not found:
-        unnamed = "no daemon answers and " + ("[files] record names no folder" if settings else "--config is not given")
+        unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
         about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
     texts["README.txt"] = HEAD + about
     _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
