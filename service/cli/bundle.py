@@ -53,11 +53,11 @@ def bundle(args: argparse.Namespace) -> int:
         folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
     found = named_after(args.cell, Path(folder), ".mcap") if folder else []
     recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
-    about = "".join(f"{name}: {len(text.splitlines())} lines\n" for name, text in texts.items())
+    about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
     if not found:
-        none = f"in {folder}" if folder else "--config names the cell's settings, and these the folder of recordings"
-        about += f"no recordings of cell {args.cell}: {none}\n"
+        unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
+        about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
     texts["README.txt"] = HEAD + about
     _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
     print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")

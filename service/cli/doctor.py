@@ -77,9 +77,9 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
                 for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
                 if reply.ok is not None
             }
-            remedy = what_to_do(Condition.NO_ANSWER if args.cell in cells else Condition.NO_DAEMON)
-            if cells and args.cell not in cells:
-                remedy = f"{what_to_do(Condition.OTHER_CELL)}: here, {', '.join(sorted(cells))} can be reached"
+            remedy = what_to_do(
+                Condition.NO_ANSWER if args.cell in cells else Condition.OTHER_CELL if cells else Condition.NO_DAEMON
+            )
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
         except RefusedError as error:
@@ -149,11 +149,11 @@ def _span(series: Series) -> float:
 
 def unreachable(endpoint: str, error_text: str) -> Finding:
     """The reason why no session with an endpoint can be opened."""
-    match = re.fullmatch(r"(?:tcp|tls)/\[?(.+?)\]?:(\d+)", endpoint)
-    if match is None:
-        return wrong("port", error_text, "an endpoint", what_to_do(Condition.NO_ENDPOINT))
-    host, port = match.groups()
+    match = re.fullmatch(r"(?:tcp|tls|ws)/\[?(.+?)\]?:(\d+)", endpoint)
     wanted = f"a daemon that listens on {endpoint}"
+    if match is None:
+        return wrong("port", error_text, wanted, what_to_do(Condition.PORT_CLOSED))
+    host, port = match.groups()
     try:
         socket.create_connection((host, int(port)), timeout=PROBE_S).close()
     except ConnectionRefusedError:

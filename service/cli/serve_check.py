@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli.serve import settings_of, skill_path
+from service.cli.status import in_gb
 from service.client.session import check_files, valid_until
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
@@ -77,7 +78,7 @@ def _skill(settings: Settings, path: Path) -> str:
 def _folder(folder: Path) -> str:
     found = existing_folder(folder)
     if not found.is_dir():
-        raise ExplainedError(f"{folder}: {found} is not a folder")
+        raise ExplainedError(f"{found} is not a folder; a folder, or nothing, needed there")
     if os.statvfs(found).f_flag & os.ST_RDONLY:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(found))
     if not os.access(found, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
@@ -87,7 +88,7 @@ def _folder(folder: Path) -> str:
 
 def _disk(files: Files) -> str:
     free_mb = shutil.disk_usage(existing_folder(Path(files.record))).free / MB
-    text = f"{free_mb / 1000:.1f} GB free for recordings of up to {files.segment_mb:g} MB each"
+    text = f"{in_gb(free_mb)} free for recordings of up to {files.segment_mb:g} MB each"
     if free_mb < files.segment_mb:
         raise ExplainedError(f"{text}; room on that disk needed")
     return text

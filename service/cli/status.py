@@ -174,7 +174,7 @@ def hours_until_full(scribe: Mapping[str, Any]) -> float | None:
 
 def disk(scribe: Mapping[str, Any]) -> str:
     """Free space where the scribe records, in words, and how long it lasts if that is known."""
-    rate, found = scribe.get("mb_per_hour"), f"{scribe['free_mb'] / 1000:.1f} GB free where it records"
+    rate, found = scribe.get("mb_per_hour"), f"{in_gb(scribe['free_mb'])} free where it records"
     if not rate:
         return found
     found += f", {rate / 1000:.2g} GB an hour written"
@@ -183,6 +183,11 @@ def disk(scribe: Mapping[str, Any]) -> str:
     begins_ms = 3.6e6 * scribe["keep_mb_left"] / rate
     begins = f"in {lasting(begins_ms)} " if begins_ms else ""
     return f"{found}: never full, {begins}each new file takes an older one's place"
+
+
+def in_gb(size_mb: float) -> str:
+    """A size in words, in GB, below 0.1 GB in MB."""
+    return f"{size_mb:.0f} MB" if size_mb < 100 else f"{size_mb / 1000:.1f} GB"
 
 
 def _doubt(now: Status) -> str:

@@ -37,11 +37,14 @@ def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIM
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
     """A message with the likely reasons for a cell's silence."""
-    if living(session, cell):
+    served = {name for name, _ in _tokens(session, channels.PRESENCE_OF_ALL, PRESENCE_TIMEOUT_S)}
+    if cell in served:
         return (
             "its daemon is alive, but it is starting or ending, too busy, denies access, or is reached through another "
             "cell's daemon, which forwards no streams: try again, or connect to it directly"
         )
+    if served:
+        return f"only daemons of other cells run there: {', '.join(map(printable, sorted(served)))}"
     return "is the daemon running there, and is the cell's name right?"
 
 

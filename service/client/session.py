@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from service.contract.channels import lacking
+from service.contract.channels import is_host, lacking
 from service.contract.explain import ExplainedError, in_words
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
@@ -75,7 +75,7 @@ def open_session(
 
     Opening is tried for `timeout_s` [s]. None, for a session that only connects: until Ctrl-C, with
     one message on standard error, so that programs may be started in any order. With `at_once`, the
-    call fails immediately if the system reports that nothing listens.
+    call fails immediately if the system reports that nothing listens, or that there is no way.
 
     `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
     begin with `tls/`; None: $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`,
@@ -108,8 +108,10 @@ def open_session(
         **(more or {}),
     }
 
-    if at_once and _refused(connect):
-        raise UnreachableError(f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?")
+    if at_once and (failed := _failures(connect)):
+        raise UnreachableError(
+            _unreached(failed) or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
+        )
 
     def opened() -> zenoh.Session:
         try:
@@ -135,22 +137,34 @@ def _address(endpoint: str) -> tuple[str, str, int] | None:
     """Protocol, host and port of an endpoint to which a TCP connection leads, else None."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-    return (protocol, host.strip("[]"), int(port)) if protocol in ("tcp", "tls", "ws") and port.isdecimal() else None
+    host, on_tcp = host.strip("[]"), protocol in ("tcp", "tls", "ws")
+    return (protocol, host, int(port)) if on_tcp and port.isdecimal() and is_host(host) else None
 
 
-def _refused(endpoints: Sequence[str]) -> bool:
-    """True if the system refuses a connection to every endpoint: nothing listens there."""
+def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
+    """By endpoint, why the system connects to none of them; empty where one accepts or hangs."""
+    failed: dict[str, OSError] = {}
     for endpoint in endpoints:
         if (address := _address(endpoint)) is None:
-            return False
+            return {}
         try:
             socket.create_connection(address[1:], timeout=ATTEMPT_S).close()
-        except ConnectionRefusedError:
-            continue
-        except OSError:
-            return False
-        return False
-    return bool(endpoints)
+        except TimeoutError:
+            return {}
+        except OSError as error:
+            failed[endpoint] = error
+        else:
+            return {}
+    return failed
+
+
+def _unreached(failed: Mapping[str, OSError]) -> str:
+    """The failures in words that are no refusals; empty if all are refusals."""
+    return "; ".join(
+        f"{endpoint} cannot be reached: {in_words(error)}"
+        for endpoint, error in failed.items()
+        if not isinstance(error, ConnectionRefusedError)
+    )
 
 
 def tls_problem(endpoint: str, folder: str | Path | None) -> str:
@@ -222,7 +236,7 @@ def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     """A message with the reason why there is no session between these endpoints."""
     if connect and "connect" in reason:
-        return (
+        return _unreached(_failures(connect)) or (
             f"nobody answers at {', '.join(connect)}: "
             "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
         )

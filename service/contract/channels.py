@@ -173,6 +173,8 @@ def lacking(endpoint: str) -> str:
     host, _, port = re.sub("[?#].*", "", address).rpartition(":")
     if protocol in _ON_IP and port.isdecimal() and int(port) > LAST_PORT:
         return f"{endpoint!r} given; a port from 0 to {LAST_PORT} needed"
+    if protocol in _ON_IP and not is_host(host.strip("[]")):
+        return f"{endpoint!r} given; the name of a host or an IP address needed"
     if slashes == "/" and address and (protocol not in _ON_IP or re.fullmatch(".+:.+", address)):
         return ""
     host, _, port = address.rpartition(":")
@@ -180,6 +182,15 @@ def lacking(endpoint: str) -> str:
         host, port = port, "7447"
     meant = f"{protocol if protocol in _ON_IP else 'tcp'}/{host or '127.0.0.1'}:{port}"
     return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
+
+
+def is_host(name: str) -> bool:
+    """Whether a name can be looked up: the system's resolver fails for others without a reason."""
+    try:
+        name.encode("idna")
+    except UnicodeError:
+        return False
+    return True
 
 
 def key(cell: str, suffix: str) -> str:

@@ -24,6 +24,7 @@ NEEDED = {  # by the operating system's number of an error
     errno.EPERM: "permission of this user needed",
     errno.ELOOP: "a link that leads to a file or folder needed",
     errno.ENAMETOOLONG: "a shorter name needed",
+    errno.ECONNREFUSED: "a program that listens there needed",
     errno.EADDRINUSE: "another program has it; another port, or 0 for any that is free, needed",
     errno.EADDRNOTAVAIL: "an address of this machine needed",
 }

@@ -30,7 +30,7 @@ Condition = enum.StrEnum(
     "MALFORMED CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
-    "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL NO_ENDPOINT PORT_CLOSED NO_WAY "
+    "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL PORT_CLOSED NO_WAY "
     "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES "
     "CLOCK_SET",
 )
@@ -300,8 +300,6 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.CERTIFICATE_ENDS, None, "certificate ends",
             "the daemon's certificate, or its authority's, ends within 30 days; then nobody is connected any more",
             "`thirdhand certificates DIR --renew`, copy it to the daemon's machine and start the daemon again"),
-        Incident(Condition.NO_ENDPOINT, None, "no endpoint",
-            "`--connect` is not an endpoint", "give one like tcp/127.0.0.1:7447"),
         Incident(Condition.PORT_CLOSED, None, "port closed",
             "nothing listens on the port",
             "start `thirdhand serve`; its first line names the endpoint to give as `--connect`"),

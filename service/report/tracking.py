@@ -37,12 +37,14 @@ class TrackingFigures(NamedTuple):
 
 def tracking(target: Vector, tool: Vector, period_s: float, judged: NDArray[np.bool_]) -> TrackingFigures:
     """The figures at the ticks that are `judged` (T,), of which there must be one."""
+    lag = lag_ms(target, tool, period_s, judged)
+    is_inner = TRIED_LAGS_S[0] + period_s / 2 < lag / 1000 < TRIED_LAGS_S[1] - period_s / 2  # else no maximum
     off_mm = 1000 * np.linalg.norm(tool - target, axis=1)[judged]
     passed_mm = 1000 * overshoots(target, tool, period_s, judged)
     return TrackingFigures(
         error_mm=_usual_error_mm(target, tool, period_s, judged),
         error_p95_mm=float(np.percentile(off_mm, 95)),
-        lag_ms=lag_ms(target, tool, period_s, judged),
+        lag_ms=lag if is_inner else math.nan,
         jerk=rms(derivative(tool, period_s, order=3)[judged]),
         overshoot_mm=float(passed_mm.max(initial=0.0)) if len(passed_mm) else math.nan,
         stops=len(passed_mm),

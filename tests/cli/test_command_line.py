@@ -116,6 +116,7 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (2, "", ("record",)),
         (2, "accepted as a take's name", ("record", "a/b", *NOBODY)),
         (2, "a port from 0 to 65535 needed", ("status", "--connect", "tcp/127.0.0.1:99999")),
+        (2, "the name of a host or an IP address needed", ("status", "--connect", "tcp/bench..local:7447")),
         (2, "0 to 65535 needed", ("serve", "--live", "99999")),
         (2, "no such process", ("serve", "--end-with", "2147483647")),
         (2, "nan given, -10 to 10 m needed", ("via-points", "add", "here", "--left", "nan", "0", "0")),
@@ -174,6 +175,9 @@ def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
     done = thirdhand("status", *NOBODY)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("thirdhand status: nothing listens at tcp/127.0.0.1:1: is a daemon")
+    done = thirdhand("status", "--connect", "tcp/bench.invalid:1")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"thirdhand status: tcp/bench\.invalid:1 cannot be reached: .+\n", done.stderr)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = thirdhand("status", "--connect", f"tcp/127.0.0.1:{silent.getsockname()[1]}")
     assert done.returncode == 1

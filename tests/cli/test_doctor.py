@@ -186,14 +186,23 @@ def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytes
     assert "needed: tcp/127.0.0.1:7447 ?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "unixsock-stream/nowhere"])
+def test_an_endpoint_that_cannot_be_probed_is_no_wrong_one(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--connect", endpoint]) == 1
+    said = capsys.readouterr().out
+    assert f"nobody answers at {endpoint}" in said
+    assert f"required: a daemon that listens on {endpoint}" in said
+    assert "start thirdhand serve" in said
+
+
 def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = near.liveliness().declare_token("lab/bench2/daemon/1")
         assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
         token.undeclare()  # type: ignore[no-untyped-call]
     said = capsys.readouterr().out
-    assert "nobody answers on lab/status" in said
-    assert "give the name of the cell by --cell: here, lab/bench2 can be reached" in said
+    assert "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in said
+    assert "give the name of the cell by --cell" in said
 
 
 def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: pytest.CaptureFixture[str]) -> None:

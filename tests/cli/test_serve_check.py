@@ -83,7 +83,7 @@ def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_pat
         ("disk", "room on that disk needed", {"files": "segment_mb = 1e12"}, ()),
         ("certificates", "certificate.pem: a folder made by", {"listen": TLS, "network": "certificate = 'none'"}, ()),
         ("certificates", "cannot read the Zenoh configuration", {"network": "zenoh_config = 'none.json5'"}, ()),
-        ("router", "Connection refused", {}, ("--connect", "tcp/127.0.0.1:1")),
+        ("router", "Connection refused; a program that listens there needed", {}, ("--connect", "tcp/127.0.0.1:1")),
         ("port", "Address already in use", {}, ("--listen", "TAKEN")),
         ("port", "Cannot assign requested address", {"network": "allow_insecure = true"}, ("--listen", FOREIGN)),
     ],

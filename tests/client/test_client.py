@@ -118,6 +118,15 @@ def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
         open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 
 
+@pytest.mark.parametrize("host", ["bench.invalid", "a" * 64])
+def test_a_name_that_nobody_knows_is_told_to_who_waits_too(host: str, tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"  # its endpoints are Zenoh's own matter
+    file.write_text(f'{{connect: {{endpoints: ["tcp/{host}:1"]}}}}')
+    reason = "cannot be reached: " if "." in host else "nobody answers at"
+    with pytest.raises(UnreachableError, match=reason):
+        open_session(otherwise=["tcp/127.0.0.1:1"], zenoh_config=file, timeout_s=0.2)
+
+
 def test_listening_where_another_does_is_told_with_the_endpoint(daemon: zenoh.Session) -> None:
     (taken,) = endpoints(daemon)
     with pytest.raises(UnreachableError, match=f"cannot listen on {taken}: .*in use"):

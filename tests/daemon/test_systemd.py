@@ -150,6 +150,7 @@ def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
     options = {name: parser().parse_args(words[1:]) for name, words in commands().items()}
     assert [options[name].run for name in ("ExecStartPre", "ExecStart")] == ["cli.serve_check.check", "cli.serve.serve"]
     assert options["ExecStart"].hold
+    assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")  # it does not see the check's exit code
     assert {str(one.config) for one in options.values()} == {"/etc/thirdhand/%i.toml"}
 
 

@@ -29,6 +29,12 @@ def test_a_delayed_path_has_that_lag_and_the_error_of_the_way_it_makes_meanwhile
     assert math.isnan(found.overshoot_mm)
 
 
+def test_a_lag_at_the_end_of_those_that_are_tried_is_not_known() -> None:
+    assert tracking(wave(TIMES), wave(TIMES - 0.19), PERIOD_S, ALL).lag_ms == pytest.approx(190.0, abs=2.0)
+    for lag_s in (0.3, -0.15):
+        assert math.isnan(tracking(wave(TIMES), wave(TIMES - lag_s), PERIOD_S, ALL).lag_ms)
+
+
 def test_ticks_that_are_not_judged_do_not_count() -> None:
     target, judged = wave(TIMES), ALL.copy()
     tool, judged[1000:2000] = wave(TIMES - 0.05), False
