@@ -169,15 +169,9 @@ def _live(
 def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> None:
     """Wait until hands and joints arrive. Raises CalibrationError after --wait."""
     begun_s = time.monotonic()
-    while missing := live.missing(args.hand, needs_joints=needs_joints):
+    while missing := live.lacking(args.hand, needs_joints=needs_joints):
         if time.monotonic() - begun_s > args.wait:
-            unreadable = "".join(
-                f"; {count} messages on {key} are not readable" for key, count in live.malformed.items()
-            )
-            raise CalibrationError(
-                f"not received: {', '.join(missing)}{unreadable}. Are tracker and arm running, connected to the same "
-                f"endpoint, and in the same cell?"
-            )
+            raise CalibrationError(live.not_received(missing))
         time.sleep(CALIBRATE_POLL_S)
         live.collect()
 
