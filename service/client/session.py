@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from service.contract.channels import lacking
+from service.contract.channels import lacking, tcp_address
 from service.contract.explain import ExplainedError, in_words
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
@@ -131,20 +131,13 @@ def check_open(session: zenoh.Session) -> None:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
-def _address(endpoint: str) -> tuple[str, str, int] | None:
-    """Protocol, host and port of an endpoint to which a TCP connection leads, else None."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-    return (protocol, host.strip("[]"), int(port)) if protocol in ("tcp", "tls", "ws") and port.isdecimal() else None
-
-
 def _refused(endpoints: Sequence[str]) -> bool:
     """True if the system refuses a connection to every endpoint: nothing listens there."""
     for endpoint in endpoints:
-        if (address := _address(endpoint)) is None:
+        if (address := tcp_address(endpoint)) is None:
             return False
         try:
-            socket.create_connection(address[1:], timeout=ATTEMPT_S).close()
+            socket.create_connection(address, timeout=ATTEMPT_S).close()
         except ConnectionRefusedError:
             continue
         except OSError:
@@ -159,7 +152,7 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
 
     In TLS 1.3 the server reports after the handshake that it refuses the client's certificate.
     """
-    if (address := _address(endpoint)) is None or address[0] != "tls":
+    if (address := tcp_address(endpoint)) is None or not endpoint.startswith("tls/"):
         return ""
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
@@ -170,8 +163,8 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         else:
             tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
         with (
-            socket.create_connection(address[1:], timeout=ATTEMPT_S) as plain,
-            tls.wrap_socket(plain, server_hostname=address[1]) as secured,
+            socket.create_connection(address, timeout=ATTEMPT_S) as plain,
+            tls.wrap_socket(plain, server_hostname=address[0]) as secured,
         ):
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:

@@ -182,6 +182,13 @@ def lacking(endpoint: str) -> str:
     return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
 
 
+def tcp_address(endpoint: str) -> tuple[str, int] | None:
+    """Host and port of an endpoint to which a TCP connection leads; None for others."""
+    protocol, _, address = re.sub("[?#].*", "", endpoint).partition("/")
+    host, _, port = address.rpartition(":")
+    return (host.strip("[]"), int(port)) if protocol in ("tcp", "tls", "ws") and port.isdecimal() else None
+
+
 def key(cell: str, suffix: str) -> str:
     """The key expression of one channel of a cell."""
     return suffix if suffix.startswith("/") else f"{cell}/{suffix}"
