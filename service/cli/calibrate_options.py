@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import option, within
+from service.cli.usage import flag, option, within
 from service.contract.records import SIDES
 
 ABOUT_CALIBRATE = (
@@ -27,15 +27,14 @@ def add_options(c: argparse.ArgumentParser) -> None:
     )
     option(c, "--config", "CELL", config)
     how = c.add_mutually_exclusive_group()
-    held = "the hand holds the tool while you lead the arm (the default)"
-    how.add_argument("--held", action="store_true", help=held)
+    flag(how, "--held", "the hand holds the tool while you lead the arm (the default)")
     points = "the tracked point of the hand touches the tool at some postures, or points given by --at; Enter each"
-    how.add_argument("--points", action="store_true", help=points)
+    flag(how, "--points", points)
     check = (
         "measure for 10 s how far the hand is from where it should be while it holds the tool; with --held, after "
         "the calibration, else by the last one"
     )
-    c.add_argument("--check", action="store_true", help=check)
+    flag(c, "--check", check)
     hand = "the hand that holds or touches (default: the one that moves with the tool)"
     option(c, "--hand", None, hand, choices=SIDES)
     recording = "use this recording of hands and joint states, instead of a running cell"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import ARM_HELP, option
+from service.cli.usage import ARM_HELP, flag, option
 
 ABOUT_RECORD = (
     "Records a demonstration of hands and tool from a running cell, called a take, and summarizes it. Also lists, "
@@ -43,8 +43,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--places", "FILE", places)
     option(c, "--plot", "FILE", "draw the take to this .png file")
     instead = c.add_mutually_exclusive_group()
-    instead.add_argument("--list", action="store_true", help="list the takes, and record none")
-    instead.add_argument("--show", action="store_true", help="show the take of this name, and record none")
+    flag(instead, "--list", "list the takes, and record none")
+    flag(instead, "--show", "show the take of this name, and record none")
     instead.add_argument(
         "--trim",
         metavar=("FROM", "TO"),
@@ -52,4 +52,4 @@ def add_options(c: argparse.ArgumentParser) -> None:
         type=float,
         help="cut the take of this name to these seconds; the uncut take is kept beside it as NAME.mcap.uncut",
     )
-    instead.add_argument("--delete", action="store_true", help="delete the take of this name and its .uncut file")
+    flag(instead, "--delete", "delete the take of this name and its .uncut file")
