@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.cli.calibrate_options import METRES
 from service.cli.keys import EnterPressed
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, inputs_session
 from service.contract.explain import in_words
@@ -100,11 +100,10 @@ def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
             if not words:
                 continue
             try:
-                x, y, z = map(float, words)
-            except ValueError:
-                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; three numbers needed") from None
-            if not all(math.isfinite(value) and abs(value) <= 5 for value in (x, y, z)):
-                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; -5 to 5 m accepted")
+                x, y, z = map(METRES, words)
+            except (ValueError, argparse.ArgumentTypeError):
+                needed = "three numbers from -5 to 5 m needed"
+                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; {needed}") from None
             found.append((x, y, z))
     if found and len(found) < MIN_POINTS:
         raise UsageError(f"{len(found)} points given; {MIN_POINTS} or more needed")

@@ -17,6 +17,7 @@ CALIBRATE_EXAMPLE = """thirdhand calibrate --config cell.toml
   thirdhand calibrate --config cell.toml --points --hand right
   thirdhand calibrate --config cell.toml --from led.mcap"""
 MAX_ACCEPTED_MM = 200.0
+METRES = within(float, -5, 5, " m")  # reads a coordinate of a point to touch
 
 
 def add_options(c: argparse.ArgumentParser) -> None:
@@ -40,8 +41,7 @@ def add_options(c: argparse.ArgumentParser) -> None:
     recording = "use this recording of hands and joint states, instead of a running cell"
     option(c, "--from", "FILE", recording, dest="recording", type=Path)
     at = "with --points, a point to touch, in frame base [m]; may be repeated"
-    metres = within(float, -5, 5, " m")
-    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=metres, action="append", help=at)
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=at)
     option(c, "--at-file", "FILE", "with --points, a file with a point X Y Z in each line", type=Path)
     accept = "accept this standard deviation of a mapped position at the corners of the bench"
     option(c, "--accept", "MM", accept, 10.0, type=within(float, 0.1, MAX_ACCEPTED_MM, " mm"))

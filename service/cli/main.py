@@ -417,7 +417,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
     renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
     flag(c, "--renew", renew)
-    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)
+    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=within(int, 1, 36500))
 
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM

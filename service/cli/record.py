@@ -91,9 +91,6 @@ def _list(folder: Path, settings: Settings | None) -> int:
 
 
 def _capture(args: argparse.Namespace, settings: Settings) -> None:
-    for name, low, high in (("seconds", 1, 3600), ("wait", 0, 3600), ("rest", 0.2, 60)):
-        if not low <= getattr(args, name) <= high:
-            raise UsageError(f"--{name} {getattr(args, name):g}: {low:g} to {high:g} s accepted")
     if len(args.person or "") > LONGEST_PERSON:
         raise UsageError(f"--person of {len(args.person)} characters: up to {LONGEST_PERSON} accepted")
     path = path_of(args.folder, args.name)
