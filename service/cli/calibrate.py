@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -75,12 +76,11 @@ def calibrate(args: argparse.Namespace) -> int:
         _write(file, record, found.frame, settings)
         return _checked(led, settings, record, args) if args.check else 0
     settings = settings or Settings()
-    with inputs_session(args, CONNECT_TIMEOUT_S) as session:
-        live = LiveLed(session, args.cell or settings.cell, settings)
-        try:
-            return _live(live, settings, file, given, only_check, args)
-        finally:
-            live.close()
+    with (
+        inputs_session(args, CONNECT_TIMEOUT_S) as session,
+        contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
+    ):
+        return _live(live, settings, file, given, only_check, args)
 
 
 def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
@@ -314,10 +314,8 @@ def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args
         say(f"remark: {remark}")
     if track.frame not in ("", record.frame):
         say(f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the tracker was recentred")
+    is_far = bool(np.median(off_mm) > most_mm)
+    advice = ". Does the hand hold the tool as before? Then the tracker has moved: calibrate again" * is_far
     found = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
-    if np.median(off_mm) <= most_mm:
-        print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted"))
-        return 0
-    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted. Does the hand hold the tool as before? Then the"
-                          " tracker has moved: calibrate again"))  # fmt: skip
-    return 1
+    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted{advice}"))
+    return int(is_far)
