@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import math
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.cli.calibrate_options import METRES
 from service.cli.keys import EnterPressed
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, inputs_session
 from service.contract.explain import in_words
@@ -75,12 +76,11 @@ def calibrate(args: argparse.Namespace) -> int:
         _write(file, record, found.frame, settings)
         return _checked(led, settings, record, args) if args.check else 0
     settings = settings or Settings()
-    with inputs_session(args, CONNECT_TIMEOUT_S) as session:
-        live = LiveLed(session, args.cell or settings.cell, settings)
-        try:
-            return _live(live, settings, file, given, only_check, args)
-        finally:
-            live.close()
+    with (
+        inputs_session(args, CONNECT_TIMEOUT_S) as session,
+        contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
+    ):
+        return _live(live, settings, file, given, only_check, args)
 
 
 def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
@@ -100,11 +100,10 @@ def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
             if not words:
                 continue
             try:
-                x, y, z = map(float, words)
-            except ValueError:
-                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; three numbers needed") from None
-            if not all(math.isfinite(value) and abs(value) <= 5 for value in (x, y, z)):
-                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; -5 to 5 m accepted")
+                x, y, z = map(METRES, words)
+            except (ValueError, argparse.ArgumentTypeError):
+                needed = "three numbers from -5 to 5 m needed"
+                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; {needed}") from None
             found.append((x, y, z))
     if found and len(found) < MIN_POINTS:
         raise UsageError(f"{len(found)} points given; {MIN_POINTS} or more needed")
@@ -169,15 +168,9 @@ def _live(
 def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> None:
     """Wait until hands and joints arrive. Raises CalibrationError after --wait."""
     begun_s = time.monotonic()
-    while missing := live.missing(args.hand, needs_joints=needs_joints):
+    while missing := live.lacking(args.hand, needs_joints=needs_joints):
         if time.monotonic() - begun_s > args.wait:
-            unreadable = "".join(
-                f"; {count} messages on {key} are not readable" for key, count in live.malformed.items()
-            )
-            raise CalibrationError(
-                f"not received: {', '.join(missing)}{unreadable}. Are tracker and arm running, connected to the same "
-                f"endpoint, and in the same cell?"
-            )
+            raise CalibrationError(live.not_received(missing))
         time.sleep(CALIBRATE_POLL_S)
         live.collect()
 
@@ -321,10 +314,8 @@ def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args
         say(f"remark: {remark}")
     if track.frame not in ("", record.frame):
         say(f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the tracker was recentred")
+    is_far = bool(np.median(off_mm) > most_mm)
+    advice = ". Does the hand hold the tool as before? Then the tracker has moved: calibrate again" * is_far
     found = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
-    if np.median(off_mm) <= most_mm:
-        print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted"))
-        return 0
-    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted. Does the hand hold the tool as before? Then the"
-                          " tracker has moved: calibrate again"))  # fmt: skip
-    return 1
+    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted{advice}"))
+    return int(is_far)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import option, within
+from service.cli.usage import flag, option, within
 from service.contract.records import SIDES
 
 ABOUT_CALIBRATE = (
@@ -17,6 +17,7 @@ CALIBRATE_EXAMPLE = """thirdhand calibrate --config cell.toml
   thirdhand calibrate --config cell.toml --points --hand right
   thirdhand calibrate --config cell.toml --from led.mcap"""
 MAX_ACCEPTED_MM = 200.0
+METRES = within(float, -5, 5, " m")  # reads a coordinate of a point to touch
 
 
 def add_options(c: argparse.ArgumentParser) -> None:
@@ -27,22 +28,20 @@ def add_options(c: argparse.ArgumentParser) -> None:
     )
     option(c, "--config", "CELL", config)
     how = c.add_mutually_exclusive_group()
-    held = "the hand holds the tool while you lead the arm (the default)"
-    how.add_argument("--held", action="store_true", help=held)
+    flag(how, "--held", "the hand holds the tool while you lead the arm (the default)")
     points = "the tracked point of the hand touches the tool at some postures, or points given by --at; Enter each"
-    how.add_argument("--points", action="store_true", help=points)
+    flag(how, "--points", points)
     check = (
         "measure for 10 s how far the hand is from where it should be while it holds the tool; with --held, after "
         "the calibration, else by the last one"
     )
-    c.add_argument("--check", action="store_true", help=check)
+    flag(c, "--check", check)
     hand = "the hand that holds or touches (default: the one that moves with the tool)"
     option(c, "--hand", None, hand, choices=SIDES)
     recording = "use this recording of hands and joint states, instead of a running cell"
     option(c, "--from", "FILE", recording, dest="recording", type=Path)
     at = "with --points, a point to touch, in frame base [m]; may be repeated"
-    metres = within(float, -5, 5, " m")
-    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=metres, action="append", help=at)
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=at)
     option(c, "--at-file", "FILE", "with --points, a file with a point X Y Z in each line", type=Path)
     accept = "accept this standard deviation of a mapped position at the corners of the bench"
     option(c, "--accept", "MM", accept, 10.0, type=within(float, 0.1, MAX_ACCEPTED_MM, " mm"))

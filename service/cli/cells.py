@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from service.cli.status import MODE_STYLES
 from service.cli.usage import reached
 from service.client import Cell
 from service.client import cells as served_cells
@@ -26,7 +27,6 @@ from service.process import interrupt
 WATCH_S = 1.0  # interval of --watch, and the time in which a daemon has to answer
 DISAPPEARED_S = 2.5  # a cell that was not seen for this time has disappeared
 HEADS = ("cell", "mode", "rate [Hz]", "late [µs]", "missed", "hands", "skill", "version", "")
-MODE_STYLES = {"follow": "green", "hold": "yellow", "fault": "bold red"}
 MOST_LETTERS = 1000  # of a line that is not printed on a terminal
 
 

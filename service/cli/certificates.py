@@ -23,7 +23,6 @@ from service.contract.explain import ExplainedError, in_words
 from service.contract.roles import DAEMON, MOST_OF_A_ROLE, ROLES, SERVERS, names
 from service.settings.whole_file import whole
 
-DAYS = 3650
 AUTHORITY_KEY = "authority.key"
 KEPT_EXTENSIONS = (x509.ExtendedKeyUsage, x509.AuthorityKeyIdentifier, x509.SubjectAlternativeName)  # of a renewed one
 GIVEN = "given.txt"  # a file with the names of all certificates that were made
@@ -32,8 +31,6 @@ CLOCKS_DIFFER = datetime.timedelta(days=1)  # certificates are valid this long b
 
 def certificates(args: argparse.Namespace) -> int:
     """Write the certificates and return exit code 0."""
-    if not 1 <= args.days <= 10 * DAYS:
-        raise UsageError(f"--days {args.days}: 1 to {10 * DAYS} accepted")
     if args.name and not args.role:
         raise UsageError(f"--name {args.name}: --role needed with it")
     folder: Path = args.folder

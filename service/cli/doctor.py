@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import functools
 import math
-import re
 import socket
 import time
 from collections import deque
@@ -22,7 +21,7 @@ from service.cli.status import statuses
 from service.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
 from service.client import Overheard, RefusedError, StartingError, UnreachableError
 from service.contract import cdr
-from service.contract.channels import ENDPOINT, key
+from service.contract.channels import ENDPOINT, key, tcp_address
 from service.contract.explain import in_words
 from service.contract.incidents import Condition, what_to_do
 from service.contract.messages import WireError
@@ -149,13 +148,12 @@ def _span(series: Series) -> float:
 
 def unreachable(endpoint: str, error_text: str) -> Finding:
     """The reason why no session with an endpoint can be opened."""
-    match = re.fullmatch(r"(?:tcp|tls|ws)/\[?(.+?)\]?:(\d+)", endpoint)
     wanted = f"a daemon that listens on {endpoint}"
-    if match is None:
+    if (address := tcp_address(endpoint)) is None:
         return wrong("port", error_text, wanted, what_to_do(Condition.PORT_CLOSED))
-    host, port = match.groups()
+    host, port = address
     try:
-        socket.create_connection((host, int(port)), timeout=PROBE_S).close()
+        socket.create_connection(address, timeout=PROBE_S).close()
     except ConnectionRefusedError:
         return wrong("port", f"nothing listens on {host} port {port}", wanted, what_to_do(Condition.PORT_CLOSED))
     except (OSError, OverflowError) as error:

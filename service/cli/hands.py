@@ -107,8 +107,10 @@ def _token() -> str:
     try:
         path = TOKEN_FILE.expanduser()
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with contextlib.suppress(FileExistsError), open(path, "x", opener=_private, encoding="utf-8") as file:
-            file.write(new)
+        with contextlib.suppress(FileExistsError):
+            private = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with open(private, "w", encoding="utf-8") as file:
+                file.write(new)
         found = path.read_text(encoding="utf-8").strip()
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         say(f"the token of this start is not kept ({in_words(error)}): open pages need the new address")
@@ -116,10 +118,6 @@ def _token() -> str:
     if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", found):
         raise ExplainedError(f"{path}: {TOKEN_LENGTH} or more small letters and digits needed; delete it for a new one")
     return found
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
 
 
 def _name_for_browsers(host: str, certificate: ServerCertificate | None) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import calibrate_options, record_options
-from service.cli.usage import ARM_HELP, WORKERS_HELP, Parser, UsageError, add_end_with, option, reaching, within
+from service.cli.usage import ARM_HELP, WORKERS_HELP, Parser, UsageError, add_end_with, flag, option, reaching, within
 from service.client import CLIENT_FILE
 from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
@@ -98,8 +98,8 @@ def parser() -> argparse.ArgumentParser:
         "port of this machine)"
     )
     option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
-    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
-    c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    flag(c, "--open", "open the page of --mouse in this machine's browser")
+    flag(c, "--json", "print the report as one JSON object")
 
     c = command(
         "follow",
@@ -117,14 +117,12 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)
-    c.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    flag(c, "--json", "print the report as one JSON object")
     option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
     other = c.add_mutually_exclusive_group()
-    loads = "measure under each kind of load beside the loop, --seconds for each"
-    other.add_argument("--loads", action="store_true", help=loads)
-    soak = "measure memory and open files over time, with a sample every 5 s or less"
-    other.add_argument("--soak", action="store_true", help=soak)
+    flag(other, "--loads", "measure under each kind of load beside the loop, --seconds for each")
+    flag(other, "--soak", "measure memory and open files over time, with a sample every 5 s or less")
 
     c = command(
         "serve",
@@ -146,7 +144,7 @@ def parser() -> argparse.ArgumentParser:
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
     hold = "begin in hold, until `thirdhand resume`: for a service manager, which starts the daemon unattended"
-    c.add_argument("--hold", action="store_true", help=hold)
+    flag(c, "--hold", hold)
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
     check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
@@ -160,7 +158,7 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "file", "FILE", "the recording or demonstration: an MCAP file with hands/left and hands/right")
     option(c, "--speed", "X", "play this many times as fast as recorded", 1.0, type=within(float, 0.01, 100))
-    c.add_argument("--loop", action="store_true", help="start again at the end, until Ctrl-C")
+    flag(c, "--loop", "start again at the end, until Ctrl-C")
     _reach(c)
 
     c = command(
@@ -171,9 +169,8 @@ def parser() -> argparse.ArgumentParser:
         "  thirdhand hands --camera --hand-length 0.19",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
-    kinds.add_argument("--web", action="store_true", help="serve a page for the browser of a headset (WebXR)")
-    mouse = "serve a page on which both hands are dragged over the bench, seen from above"
-    kinds.add_argument("--mouse", action="store_true", help=mouse)
+    flag(kinds, "--web", "serve a page for the browser of a headset (WebXR)")
+    flag(kinds, "--mouse", "serve a page on which both hands are dragged over the bench, seen from above")
     camera = "the hands that this camera sees (default: camera 0), or a video file; needs thirdhand[camera]"
     option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
     address = "serve the page at this address; port 0: any free one; for other machines with --https"
@@ -190,7 +187,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
     gripper = "close the gripper of `[hands] gripper` with the fingers of this hand (--web)"
     c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
-    c.add_argument("--open", action="store_true", help="open the page of --mouse in this machine's browser")
+    flag(c, "--open", "open the page of --mouse in this machine's browser")
     _reach(c)
 
     c = command(
@@ -201,13 +198,12 @@ def parser() -> argparse.ArgumentParser:
         "  thirdhand replay archive/*.mcap --each --workers 8",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
-    exact = "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad"
-    c.add_argument("--exact", action="store_true", help=exact)
+    flag(c, "--exact", "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad")
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
     compared = "instead, compare the recording's settings with these, for the same hands"
     option(c, "--config", "CELL", f"{compared}: {ARM_HELP}")
-    c.add_argument("--each", action="store_true", help="replay each recording by itself; no failure stops the others")
+    flag(c, "--each", "replay each recording by itself; no failure stops the others")
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
     c = command(
@@ -224,7 +220,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--part", nargs=2, type=within(float, 0, 1e6, " s"), metavar=("FROM", "TO"), help=part)
     option(c, "--plot", "PNG", "draw the variants and the hands of a single file to this file")
     option(c, "--workers", "WORKERS", WORKERS_HELP)
-    c.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    flag(c, "--json", "print the figures as one JSON object")
 
     c = command("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
@@ -306,7 +302,7 @@ def parser() -> argparse.ArgumentParser:
     for place in (*SIDES, "tool"):
         at = f"the position of the {place}{' hand' * (place != 'tool')} in frame base [m]"
         a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
-    a.add_argument("--here", action="store_true", help="use the present positions, once hands and tool hold still")
+    flag(a, "--here", "use the present positions, once hands and tool hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     option(a, "--std", "M", "the standard deviation of the tool's position there [m]", defaults.std)
     option(a, "--radius", "M", "the via-point also holds for hands within this distance [m]", defaults.radius)
@@ -341,18 +337,18 @@ def parser() -> argparse.ArgumentParser:
     at = "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this hold)"
     c.add_argument("--tool", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
     now = "correct for the hands of this moment (default: for those at which the hold began, as leading takes a hand)"
-    c.add_argument("--now", action="store_true", help=now)
-    c.add_argument("--turned", action="store_true", help="correct the orientation of the tool too")
-    c.add_argument("--undo", action="store_true", help="undo the last correction")
+    flag(c, "--now", now)
+    flag(c, "--turned", "correct the orientation of the tool too")
+    flag(c, "--undo", "undo the last correction")
 
     c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
-    c.add_argument("--json", action="store_true", help="print <cell>/status as JSON; with --watch, one line per status")
+    flag(c, "--json", "print <cell>/status as JSON; with --watch, one line per status")
     kinds = c.add_mutually_exclusive_group()
-    kinds.add_argument("--watch", action="store_true", help="show hands, tool, target and distances as they change")
-    kinds.add_argument("--exit-code", action="store_true", help="exit with code 1 also if the cell is at fault")
+    flag(kinds, "--watch", "show hands, tool, target and distances as they change")
+    flag(kinds, "--exit-code", "exit with code 1 also if the cell is at fault")
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
-    c.add_argument("--json", action="store_true", help="print the findings as JSON")
+    flag(c, "--json", "print the findings as JSON")
     option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))
     _reach(command("hold", "Stops the arm until `resume`.", "thirdhand hold"))
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
@@ -361,10 +357,8 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
     )
-    c.add_argument(
-        "--json", action="store_true", help="print names and statuses as a JSON list; with --watch, each second"
-    )
-    c.add_argument("--watch", action="store_true", help="show all cells in a table, each second, until Ctrl-C")
+    flag(c, "--json", "print names and statuses as a JSON list; with --watch, each second")
+    flag(c, "--watch", "show all cells in a table, each second, until Ctrl-C")
     _reach(c, one=False)
 
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
@@ -422,8 +416,8 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
     option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
     renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
-    c.add_argument("--renew", action="store_true", help=renew)
-    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=int)
+    flag(c, "--renew", renew)
+    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=within(int, 1, 36500))
 
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM

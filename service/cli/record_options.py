@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from service.cli.usage import ARM_HELP, option
+from service.cli.usage import ARM_HELP, flag, option, within
 
 ABOUT_RECORD = (
     "Records a demonstration of hands and tool from a running cell, called a take, and summarizes it. Also lists, "
@@ -34,17 +34,19 @@ def add_options(c: argparse.ArgumentParser) -> None:
     )
     option(c, "--until", None, until, "key", choices=("key", "rest"))
     rest = "with --until rest, they must rest this long; slower motion than 15 mm in this time counts as rest"
-    option(c, "--rest", "S", rest, 1.0)
-    option(c, "--seconds", "S", "end the take after this time at the latest", 600.0)
-    option(c, "--wait", "S", "wait this long for hands and tool to be published", 30.0)
+    option(c, "--rest", "S", rest, 1.0, type=within(float, 0.2, 60, " s"))
+    seconds = within(float, 1, 3600, " s")
+    option(c, "--seconds", "S", "end the take after this time at the latest", 600.0, type=seconds)
+    wait = within(float, 0, 3600, " s")
+    option(c, "--wait", "S", "wait this long for hands and tool to be published", 30.0, type=wait)
     listen = "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
     option(c, "--listen", "EP", listen)
     places = "the via-points of the task in this take, as JSON that `via-points add --file` reads"
     option(c, "--places", "FILE", places)
     option(c, "--plot", "FILE", "draw the take to this .png file")
     instead = c.add_mutually_exclusive_group()
-    instead.add_argument("--list", action="store_true", help="list the takes, and record none")
-    instead.add_argument("--show", action="store_true", help="show the take of this name, and record none")
+    flag(instead, "--list", "list the takes, and record none")
+    flag(instead, "--show", "show the take of this name, and record none")
     instead.add_argument(
         "--trim",
         metavar=("FROM", "TO"),
@@ -52,4 +54,4 @@ def add_options(c: argparse.ArgumentParser) -> None:
         type=float,
         help="cut the take of this name to these seconds; the uncut take is kept beside it as NAME.mcap.uncut",
     )
-    instead.add_argument("--delete", action="store_true", help="delete the take of this name and its .uncut file")
+    flag(instead, "--delete", "delete the take of this name and its .uncut file")

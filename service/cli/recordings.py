@@ -8,7 +8,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
 
 import msgspec
 
@@ -32,7 +31,7 @@ from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.learning.records import Evidence
 from service.learning.residual_risk import LONGEST_NAME, OPTION
-from service.learning.skill_file import StoredSkill, skill_in
+from service.learning.skill_file import skill_in
 from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
@@ -144,13 +143,6 @@ def _replay_with(args: argparse.Namespace) -> int:
     return 0
 
 
-def _refined(path: Path) -> StoredSkill:
-    """The skill in a file, whose demonstrations can be read. Raises SkillError."""
-    skill = skill_in(path)
-    stored_demonstrations(skill)  # before the new ones are read
-    return skill
-
-
 def learn(args: argparse.Namespace) -> int:
     """Learn a skill; exit code 0 once it is written. An unsafe skill is not written."""
     check_writable(args.output, ".npz")
@@ -161,7 +153,8 @@ def learn(args: argparse.Namespace) -> int:
         raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
     if args.demonstrations[0].exists():  # else its reader reports the missing file
         check_count([path.stem for path in args.demonstrations], args.components)
-    refined = _refined(args.refined) if args.refined else None
+    if refined := skill_in(args.refined) if args.refined else None:
+        stored_demonstrations(refined)  # raises its errors before the new ones are read
     settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
     places = places_in(args.places) if args.places else ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import re
 import shutil
 import socket
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import Any
 from service.cli.serve import settings_of, skill_path
 from service.cli.status import in_gb
 from service.client.session import check_files, valid_until
+from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
 from service.daemon.single_instance import holder_of, state_folder
@@ -23,7 +23,6 @@ from service.settings.config import Files, Settings, robot_description, urdf_pat
 from service.settings.network import Network, is_local
 
 ROUTER_TIMEOUT_S = 2.0
-_ADDRESS = re.compile(r"((?:tcp|tls|ws)/\[?([^\]#?]+?)\]?:(\d+))([?#].*)?")  # of endpoints that can be tried
 
 
 def check(args: argparse.Namespace) -> int:
@@ -104,14 +103,14 @@ def _certificates(network: Network) -> str:
 
 def _endpoint(endpoint: str, settings: Settings | None) -> str:
     """Try to listen on the endpoint of a cell with these settings, or to connect to a router's."""
-    if (found := _ADDRESS.fullmatch(endpoint)) is None:
-        return f"{endpoint.partition('#')[0]} is not examined"
-    where, host, port = found.groups()[:3]  # the rest may hold keys
+    where, address = endpoint.partition("#")[0], tcp_address(endpoint)  # the rest may hold keys
+    if address is None:
+        return f"{where} is not examined"
     try:
         if settings is None:
-            socket.create_connection((host, port), timeout=ROUTER_TIMEOUT_S).close()
+            socket.create_connection(address, timeout=ROUTER_TIMEOUT_S).close()
             return f"{where} accepts connections"
-        family, kind, number, _, at = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, number, _, at = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(at)

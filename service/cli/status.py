@@ -28,6 +28,7 @@ LINE_S = 0.5  # interval of the lines of --watch
 SILENT_S = 2.0  # a daemon without a status for this time does not answer
 LATE_MS, AHEAD_MS = 1000.0, -5.0  # a sample's stamp beyond these shows that clocks differ
 NOTHING_DECIDED = "starting: nothing has been decided yet"
+MODE_STYLES = {"follow": "green", "hold": "yellow", "fault": "bold red"}
 STUCK = word(Flag.STUCK)  # its explanation is already in `because`
 
 
@@ -85,12 +86,13 @@ def _draw(arriving: Iterator[Status]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    colours = {"follow": "green", "hold": "yellow", "fault": "bold red"}
     with interrupt.clean_up_first(), Live(refresh_per_second=10) as live:  # it hides the cursor
         for now in arriving:
             table = Table.grid(padding=(0, 2))
             for name, text in rows(now).items():
-                table.add_row(Text(name, style="dim"), Text(text, style=colours[now.mode] if name == "mode" else ""))
+                table.add_row(
+                    Text(name, style="dim"), Text(text, style=MODE_STYLES[now.mode] if name == "mode" else "")
+                )
             live.update(table)
 
 
@@ -134,9 +136,9 @@ def rows(now: Status) -> dict[str, str]:
         "nearest": _nearest(now),
         "arm": _arm(now),
         "tool": _at(now.tool_m),
-        "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is {_off(now)} from it"
-        + _doubt(now)
-        if now.target_m is not None
+        "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is "
+        f"{1000 * math.dist(now.tool_m, now.target_m):.1f} mm from it{_doubt(now)}"
+        if now.tool_m is not None and now.target_m is not None
         else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "led by hand": "yes, as the arm's driver reports" if now.guided else "",
         "offer": now.offer,
@@ -239,12 +241,6 @@ def _arm(now: Status) -> str:
         return "assumed, not measured"
     listener = "somebody" if now.command_heard else "nobody"
     return f"{_arrival(now.sources['arm'], 'no joint states')}; {listener} listens to commands"
-
-
-def _off(now: Status) -> str:
-    assert now.tool_m is not None
-    assert now.target_m is not None
-    return f"{1000 * math.dist(now.tool_m, now.target_m):.1f} mm"
 
 
 def _turned(now: Status) -> str:

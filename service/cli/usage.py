@@ -122,6 +122,11 @@ def option(
         added.complete = COMPLETION_OF_METAVAR[metavar]  # type: ignore[attr-defined]  # as shtab reads it
 
 
+def flag(c: argparse._ActionsContainer, name: str, about: str) -> None:
+    """Add an option without a value, which is False unless given."""
+    c.add_argument(name, action="store_true", help=about)
+
+
 def check_writable(path: Path, suffix: str = "") -> None:
     """Raise UsageError if no file of this suffix can be written at a path; for a check before long
     work.

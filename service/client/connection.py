@@ -82,12 +82,10 @@ class Connection(Client, AbstractContextManager["Connection"]):
         poses = {f"hands/{side}": _pose(side, pose) for side, pose in given.items() if pose is not None}
         if not poses:
             raise ValueError("no hand given; left, right or both needed")
-        checked_frame(frame_id)
         self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
 
     def tool(self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE) -> None:
         """Publish the measured pose of the tool, for demonstrations."""
-        checked_frame(frame_id)
         self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
 
     def gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
@@ -100,17 +98,13 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Publish that the clutch is pressed, or released. While it is pressed, call this at 10 Hz
         or more.
         """
-        if not isinstance(pressed, bool):
-            raise ValueError(f"clutch: {pressed!r} given; True or False needed")
-        self._publish({"clutch": lambda _: cdr.encode_bool(pressed)}, None)
+        self._publish_bool("clutch", pressed)
 
     def guided(self, led: bool) -> None:
         """Publish that somebody leads the arm by hand, or no longer does. While it is led, call
         this with each joint state.
         """
-        if not isinstance(led, bool):
-            raise ValueError(f"guided: {led!r} given; True or False needed")
-        self._publish({"joints/guided": lambda _: cdr.encode_bool(led)}, None)
+        self._publish_bool("joints/guided", led)
 
     def wish_gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
         """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
@@ -155,6 +149,11 @@ class Connection(Client, AbstractContextManager["Connection"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _publish_bool(self, suffix: str, value: bool) -> None:
+        if not isinstance(value, bool):
+            raise ValueError(f"{suffix.removeprefix('joints/')}: {value!r} given; True or False needed")
+        self._publish({suffix: lambda _: cdr.encode_bool(value)}, None)
+
     def _publish_closure(self, suffix: str, closure: float, stamp_ns: int | None) -> None:
         (value,) = _numbers("closure", [closure], 1)
         if not 0.0 <= value <= 1.0:
@@ -187,7 +186,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
 
 def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:
-    """The encoding of a pose for a stamp [ns]."""
+    """The encoding of a pose for a stamp [ns]. Raises ValueError for what is no name of a frame."""
+    checked_frame(frame_id)
     return lambda stamp_ns: cdr.encode_pose(PoseStamped(stamp_ns, frame_id, position, orientation))
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from service.contract.channels import is_host, lacking
+from service.contract.channels import lacking, tcp_address
 from service.contract.explain import ExplainedError, in_words
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
@@ -133,22 +133,14 @@ def check_open(session: zenoh.Session) -> None:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
-def _address(endpoint: str) -> tuple[str, str, int] | None:
-    """Protocol, host and port of an endpoint to which a TCP connection leads, else None."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-    host, on_tcp = host.strip("[]"), protocol in ("tcp", "tls", "ws")
-    return (protocol, host, int(port)) if on_tcp and port.isdecimal() and is_host(host) else None
-
-
 def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
     """By endpoint, why the system connects to none of them; empty where one accepts or hangs."""
     failed: dict[str, OSError] = {}
     for endpoint in endpoints:
-        if (address := _address(endpoint)) is None:
+        if (address := tcp_address(endpoint)) is None:
             return {}
         try:
-            socket.create_connection(address[1:], timeout=ATTEMPT_S).close()
+            socket.create_connection(address, timeout=ATTEMPT_S).close()
         except TimeoutError:
             return {}
         except OSError as error:
@@ -173,7 +165,7 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
 
     In TLS 1.3 the server reports after the handshake that it refuses the client's certificate.
     """
-    if (address := _address(endpoint)) is None or address[0] != "tls":
+    if (address := tcp_address(endpoint)) is None or not endpoint.startswith("tls/"):
         return ""
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
@@ -184,8 +176,8 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         else:
             tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
         with (
-            socket.create_connection(address[1:], timeout=ATTEMPT_S) as plain,
-            tls.wrap_socket(plain, server_hostname=address[1]) as secured,
+            socket.create_connection(address, timeout=ATTEMPT_S) as plain,
+            tls.wrap_socket(plain, server_hostname=address[0]) as secured,
         ):
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
@@ -208,9 +200,8 @@ def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: 
     """The result of `attempt`, which is repeated while it raises UnreachableError.
 
     The error is raised after `timeout_s` [s] with the same message; None: never. A CertificateError
-    is raised at once. One message on
-    standard error reports the waiting unless `silent`, which by default holds if there is a
-    timeout.
+    is raised at once. One message on standard error reports the waiting unless `silent`, which by
+    default holds if there is a timeout.
     """
     begun_s, reported = time.monotonic(), ""
     silent = timeout_s is not None if silent is None else silent

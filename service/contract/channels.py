@@ -193,6 +193,14 @@ def is_host(name: str) -> bool:
     return True
 
 
+def tcp_address(endpoint: str) -> tuple[str, int] | None:
+    """Host and port of an endpoint to which a TCP connection leads; None for others."""
+    protocol, _, address = re.sub("[?#].*", "", endpoint).partition("/")
+    host, _, port = address.rpartition(":")
+    host, on_tcp = host.strip("[]"), protocol in ("tcp", "tls", "ws")
+    return (host, int(port)) if on_tcp and port.isdecimal() and is_host(host) else None
+
+
 def key(cell: str, suffix: str) -> str:
     """The key expression of one channel of a cell."""
     return suffix if suffix.startswith("/") else f"{cell}/{suffix}"

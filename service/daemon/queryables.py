@@ -42,7 +42,7 @@ from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
 from service.daemon.correcting import HOLD_ENDED, Corrections, Moment
 from service.daemon.saved_via_points import SavedViaPoints
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.skill_worker import SkillWorker, has_posture_of
 from service.daemon.status import outcome
 from service.learning.corrections import (
     LEAST_CORRECTION_M,
@@ -53,7 +53,7 @@ from service.learning.corrections import (
     offer_of,
     stage_of,
 )
-from service.learning.reach import accepted, out_of_reach
+from service.learning.reach import accepted, beyond_m, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
 from service.settings.config import Settings
@@ -184,7 +184,7 @@ class Queryables:
         self._ordering = threading.Lock()  # each of hold and resume has its own thread
         self._settings = settings
         self._skill, self._in_force = skill, in_force(skill)
-        self._skill_worker = skill_worker
+        self._skill_worker, self._beyond_m = skill_worker, functools.partial(skill_worker.compute, beyond_m)
         self._skills = skills
         self._status = status
         self._frame = frame
@@ -192,7 +192,7 @@ class Queryables:
         self._note = note
         self._keep = keep
         self._failed = failed
-        self._saved = SavedViaPoints(settings, skill_worker.beyond_m)
+        self._saved = SavedViaPoints(settings, self._beyond_m)
         self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*TOGETHER, COMPUTED)}
         self._queryables: list[zenoh.Queryable[None]] = []
 
@@ -352,7 +352,7 @@ class Queryables:
 
         Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
         """
-        distances_m = self._skill_worker.beyond_m(self._settings, skill.tool_positions)
+        distances_m = self._beyond_m(self._settings, skill.tool_positions)
         found = out_of_reach(skill, distances_m, self._settings)
         if is_loaded and found.is_refused:
             raise RequestError(found.text)
@@ -421,7 +421,8 @@ class Queryables:
         self._check([point], "$.tool")
         orientation = skill.orientation if led.orientation is None else np.array(led.orientation)
         hands = skill.conducting(led.hands).reshape(2, 3)
-        if not self._skill_worker.has_posture(self._settings, led.joints, led.tool, orientation, hands):
+        posture = self._settings, led.joints, led.tool, orientation, hands
+        if not self._skill_worker.compute(has_posture_of, *posture):
             raise RequestError(
                 f"$.tool: {list(point.tool)}: no posture of the arm has the tool there and keeps clear of these hands, "
                 "of things and of itself"
@@ -460,7 +461,7 @@ class Queryables:
                 f"{MAX_TAUGHT_POINTS} accepted"
             )
         low, high = self._skill.workspace
-        distances_m = self._skill_worker.beyond_m(self._settings, np.array([point.tool for point in added]))
+        distances_m = self._beyond_m(self._settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
             given = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
             if point.stage not in (None, *(begins := self._skill.model.names[:-1])):

@@ -35,19 +35,7 @@ DIAGNOSED = (
 )
 
 
-def _as_numbers(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
-    return cdr.encode_numbers(in_order(cdr.decode_joints(payload), names)[0])
-
-
-def _as_trajectory(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
-    return cdr.encode_trajectory(names, *in_order(cdr.decode_joints(payload), names), within_ns=period_ns)
-
-
-def _as_string(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
-    return cdr.encode_string(payload.decode())
-
-
-def _as_diagnostics(payload: bytes, names: tuple[str, ...], period_ns: int) -> bytes:
+def _diagnostics(payload: bytes) -> bytes:
     status, values = msgspec.json.decode(payload), {}
     for name in DIAGNOSED:
         inner = status[name] if isinstance(status[name], dict) else {"": status[name]}
@@ -59,12 +47,18 @@ def _as_diagnostics(payload: bytes, names: tuple[str, ...], period_ns: int) -> b
     return cdr.encode_diagnostics(status["time_ns"], DIAGNOSTIC_LEVELS[status["mode"]], name, what, values)
 
 
-_CONVERSIONS = {  # from a channel's message to a topic's, by channel and type of the topic; other topics have none
-    ("joints/command", "std_msgs/msg/Float64MultiArray"): _as_numbers,
-    ("joints/command", "trajectory_msgs/msg/JointTrajectory"): _as_trajectory,
-    ("status", "std_msgs/msg/String"): _as_string,
-    ("status", "diagnostic_msgs/msg/DiagnosticArray"): _as_diagnostics,
-}
+def _converted(payload: bytes, topic: ros2.Topic, names: tuple[str, ...], period_ns: int) -> bytes:
+    """A channel's message as that of a topic, which for most of them is the same."""
+    match topic.channel, topic.type:
+        case "joints/command", "std_msgs/msg/Float64MultiArray":
+            return cdr.encode_numbers(in_order(cdr.decode_joints(payload), names)[0])
+        case "joints/command", "trajectory_msgs/msg/JointTrajectory":
+            return cdr.encode_trajectory(names, *in_order(cdr.decode_joints(payload), names), within_ns=period_ns)
+        case "status", "std_msgs/msg/String":
+            return cdr.encode_string(payload.decode())
+        case "status", "diagnostic_msgs/msg/DiagnosticArray":
+            return _diagnostics(payload)
+    return payload
 
 
 class Ros2Domain:
@@ -125,8 +119,7 @@ class Ros2Domain:
                     continue
                 self._sent[topic.name] += 1
                 attachment = ros2.encode_attachment(self._sent[topic.name], time.time_ns(), self._gids[topic.name])
-                convert = _CONVERSIONS.get((suffix, topic.type))
-                message = convert(payload, self._names, self._period_ns) if convert else payload
+                message = _converted(payload, topic, self._names, self._period_ns)
                 self._publishers[topic.name].put(message, attachment=attachment)
 
 

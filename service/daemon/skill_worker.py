@@ -17,14 +17,13 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from service.contract.requests import ToolLimits, ViaPoint
 from service.core.frame import Vector
 from service.core.tool_limits import limits_of_task, path_of
 from service.core.way_out import WayOut
 from service.learning.corrections import Effect, corrected
-from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError, StoredSkill, decoded, skill_in
 from service.learning.via_points import MAX_GAIN, adapted
 from service.process import child
@@ -35,6 +34,7 @@ WORK_TIMEOUT_S = 25.0  # shorter than a client's timeout
 HUNG_S = 5.0  # the process hangs if it makes no progress for this time
 WORKER_POLL_S = 0.1
 STILL_STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
+Computed = TypeVar("Computed")
 
 
 class SkillWorker:
@@ -57,63 +57,21 @@ class SkillWorker:
 
     def load(self, path: Path, *, timeout_s: float = WORK_TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
-        loaded: StoredSkill = self._ask(skill_of, path, timeout_s=timeout_s)
-        return loaded
+        return self.compute(skill_of, path, timeout_s=timeout_s)
 
     def adapt(self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
         """The skill with these via-points and no others. Raises SkillError."""
-        made: StoredSkill = self._ask(skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
-        return made
+        return self.compute(skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
 
     def correct(self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
         """The skill with these via-points and no others, and what that changes at the correction
         `at`. Raises SkillError.
         """
-        arguments = skill.file, tuple(via_points), at, self._max_gain
-        made: tuple[StoredSkill, Effect] = self._ask(corrected_skill_of, *arguments)
-        return made
+        return self.compute(corrected_skill_of, skill.file, tuple(via_points), at, self._max_gain)
 
-    def way_out(self, settings: Settings, *arguments: Vector) -> list[Vector]:
-        """The result of `WayOut.find` for the cell. Raises SkillError."""
-        found: list[Vector] = self._ask(way_out_of, settings, *arguments)
-        return found
-
-    def has_posture(self, settings: Settings, *arguments: Vector) -> bool:
-        """The result of `WayOut.has_posture` for the cell. Raises SkillError."""
-        return bool(self._ask(has_posture_of, settings, *arguments))
-
-    def beyond_m(self, settings: Settings, positions: Vector) -> Vector:
-        """Distances (M,) [m] of positions (M, 3) beyond the reach, see `learning.reach.beyond_m`.
-        Raises SkillError.
-        """
-        distances: Vector = self._ask(beyond_m, settings, positions)
-        return distances
-
-    def tool_limits(self, settings: Settings, file: bytes) -> dict[str, ToolLimits]:
-        """The result of `limits_of_task` for the cell and the skill in force (the bytes of its
-        file). Raises SkillError.
-        """
-        limits: dict[str, ToolLimits] = self._ask(tool_limits_of, settings, file)
-        return limits
-
-    def close(self) -> None:
-        """End the process, also while it works."""
-        if (running := self._child) is not None and running.has_begun():
-            running.kill()
-        with self._busy:
-            self._end()
-
-    def _end(self) -> None:
-        if self._child is not None:
-            self._child.socket.close()
-            if self._child.pid is not None:  # else it ends at its start, with the closed socket
-                self._child.kill()
-                self._child.wait()
-            self._child = None
-
-    def _ask(self, work: Callable[..., Any], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Any:
-        """The value of `work(*arguments)` in the worker, for a function of an imported module.
-        Raises SkillError, also after `timeout_s` [s].
+    def compute(self, work: Callable[..., Computed], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Computed:
+        """The value of `work(*arguments)` in the worker, for a function of a module. Raises
+        SkillError, also after `timeout_s` [s].
         """
         with self._busy:
             working, end_s = self.start(), time.monotonic() + timeout_s
@@ -133,7 +91,7 @@ class SkillWorker:
                         raise TimeoutError(f"made no progress for {HUNG_S:g} s")
                     if time.monotonic() > end_s:
                         raise TimeoutError(f"did not answer within {timeout_s:g} s")
-                answer = _receive(working.socket)
+                answer: Computed | str = _receive(working.socket)
             except TimeoutError as error:
                 self._end()
                 raise SkillError(f"the skill worker {error}; nothing was changed") from None
@@ -143,6 +101,21 @@ class SkillWorker:
         if isinstance(answer, str):
             raise SkillError(answer)
         return answer
+
+    def close(self) -> None:
+        """End the process, also while it works."""
+        if (running := self._child) is not None and running.has_begun():
+            running.kill()
+        with self._busy:
+            self._end()
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.socket.close()
+            if self._child.pid is not None:  # else it ends at its start, with the closed socket
+                self._child.kill()
+                self._child.wait()
+            self._child = None
 
 
 def _send(channel: socket.socket, *parts: Any) -> None:

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from service.contract.requests import ToolLimits
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.skill_worker import SkillWorker, tool_limits_of
 from service.learning.skill_file import SkillError
 from service.settings.config import Settings
 
@@ -32,6 +32,6 @@ class TaskLimits:
 
     def _compute(self, file: bytes) -> None:
         try:
-            self._found = self._worker.tool_limits(self._settings, file)
+            self._found = self._worker.compute(tool_limits_of, self._settings, file)
         except SkillError as error:
             self._say(f"what the arm can do where the task is was not computed: {error}")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from service.core.frame import Event, Frame, Record, order
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.skill_worker import SkillWorker, way_out_of
 from service.learning.skill_file import SkillError
 from service.settings.config import Settings
 
@@ -40,7 +40,7 @@ class WayFinder:
     def _find(self, *arguments: np.ndarray) -> None:
         began_s = time.monotonic()
         try:
-            found = self._worker.way_out(self._settings, *arguments)
+            found = self._worker.compute(way_out_of, self._settings, *arguments)
         except SkillError as error:
             self._say(f"the search for a way out failed: {error}")
             return

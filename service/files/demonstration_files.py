@@ -89,11 +89,7 @@ def demonstration_paths(folder: Path) -> list[Path]:
     OSError.
     """
     paths = [path for path in folder.iterdir() if path.suffix == ".mcap"]  # glob finds nothing where it may not read
-    return sorted(paths, key=lambda path: [int(x) if x.isdigit() else 0 for x in _split(path.stem)])
-
-
-def _split(name: str) -> list[str]:
-    return re.split(r"(\d+)", name)
+    return sorted(paths, key=lambda path: [int(x) if x.isdigit() else 0 for x in re.split(r"(\d+)", path.stem)])
 
 
 def summary(path: Path, *, settings: Settings | None = None) -> Summary:

@@ -58,14 +58,11 @@ def chosen(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Se
         sources = _side_of_the_one(recorded, sources["left"])
     if len(sources) == 1:
         (conducts,) = (name for name in get_args(Hands) if name in sources)
-        hint = "" if conducts == recorded.conducts else f": there is no other (--{_other(conducts)} TOPIC names one)"
+        other = TRACK_NAMES[1 - TRACK_NAMES.index(conducts)]
+        hint = "" if conducts == recorded.conducts else f": there is no other (--{other} TOPIC names one)"
         guessed.append(f"the {conducts} hand leads alone{hint}")
     hands = [recorded.track(ENDINGS[name], source, settings) for name, source in sources.items()]
     return HandsAndTool([hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed)
-
-
-def _other(side: str) -> str:
-    return TRACK_NAMES[1 - TRACK_NAMES.index(side)]
 
 
 def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, PoseTopic]:

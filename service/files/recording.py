@@ -211,12 +211,17 @@ class Recorder(McapFile):
         super().close()
 
 
+def _summary_of(path: Path) -> Summary | None:
+    """A file's summary; None if it is missing."""
+    with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
+        return make_reader(stream).get_summary()
+    return None
+
+
 def _take_hint(path: Path) -> str:
     """The end of an error message for a file that is a take: the command that shows it."""
-    topics: list[str] = []
-    with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
-        contents = make_reader(stream).get_summary()
-        topics = [f"/{channel.topic}" for channel in contents.channels.values()] if contents else []
+    contents = _summary_of(path)
+    topics = [f"/{channel.topic}" for channel in contents.channels.values()] if contents else []
     if path.suffix != ".mcap" or not all(any(t.endswith(f"/{end}") for t in topics) for end in ENDINGS.values()):
         return ""
     name, folder = shlex.quote(path.stem), shlex.quote(str(path.parent))
@@ -270,23 +275,17 @@ class Recording:
 
     def ticks(self) -> int | None:
         """The number of ticks in the file's summary; None if the summary is missing."""
-        topics, contents = channels.keys_by_topic(self.settings.cell, ("tick",)), self._summary()
+        topics, contents = channels.keys_by_topic(self.settings.cell, ("tick",)), _summary_of(self.path)
         if contents is None or contents.statistics is None:
             return None
         numbers = [number for number, channel in contents.channels.items() if channel.topic in topics]
         return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
 
-    def _summary(self) -> Summary | None:
-        """The file's summary; None if it is missing."""
-        with self.path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
-            return make_reader(stream).get_summary()
-        return None
-
     def _read_layouts(self) -> None:
         """Put the layouts of states and frames into `recorded_as`, as far as the summary has them:
         checksums of frames come before the first frame.
         """
-        contents, joints = self._summary(), len(self.settings.joints.names)
+        contents, joints = _summary_of(self.path), len(self.settings.joints.names)
         if contents is None:
             return
         names = channels.keys_by_topic(self.settings.cell, ("state", "frame"))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any, TypeVar
 
+from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_words
 
 CLUSTERS = {"dask": "distributed", "ray": "ray"}  # back ends of joblib that are clusters, and their packages
@@ -58,10 +59,9 @@ def _try(address: str) -> None:
     """Connect to a cluster's address and leave: where nothing listens, its client would wait for
     minutes. Raises OSError, ValueError, OverflowError.
     """
-    host, _, port = address.rpartition("/")[2].rpartition(":")
-    if not port.isdecimal():
+    if (found := tcp_address(f"tcp/{address.rpartition('/')[2]}")) is None:
         raise ValueError("it has no port")
-    socket.create_connection((host.strip("[]"), int(port)), timeout=CLUSTER_TIMEOUT_S).close()
+    socket.create_connection(found, timeout=CLUSTER_TIMEOUT_S).close()
 
 
 def _connect_to_ray(address: str) -> type[Exception]:

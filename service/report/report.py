@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from service.contract.incidents import word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
@@ -248,21 +249,21 @@ def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
 def _limits(columns: Columns) -> Iterator[Limit]:
     for flag in Flag:
         raised = (columns.frames["flags"] & int(flag)) > 0
-        begins = [begin for begin, _ in runs(raised) if raised[begin]]
-        if begins:
-            lasts_s = float(raised.sum()) * columns.period_s
-            yield Limit(word(flag), lasts_s, len(begins), float(columns.times[begins[0]]))
+        if raised.any():
+            yield _limit(columns, word(flag), raised)
+
+
+def _limit(columns: Columns, name: str, met: NDArray[np.bool_]) -> Limit:
+    """A limit that was met at some frames (T,)."""
+    begins = [begin for begin, _ in runs(met) if met[begin]]
+    return Limit(name, float(met.sum()) * columns.period_s, len(begins), float(columns.times[begins[0]]))
 
 
 def _binding(columns: Columns) -> Iterator[Limit]:
     """The limits that the motion met, the one that bound longest first."""
     from service.core.tool_limits import binding  # its import is slow, and other parts of this module need none
 
-    found = []
-    for name, met in binding(columns.recording.settings, columns.frames):
-        begins = [begin for begin, _ in runs(met) if met[begin]]
-        lasts_s = float(met.sum()) * columns.period_s
-        found.append(Limit(name, lasts_s, len(begins), float(columns.times[begins[0]])))
+    found = [_limit(columns, *one) for one in binding(columns.recording.settings, columns.frames)]
     yield from sorted(found, key=lambda limit: -limit.lasts_s)
 
 

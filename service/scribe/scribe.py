@@ -35,6 +35,7 @@ NOT_RECORDED = "ticks are not recorded"
 HUNG_AFTER_S = 5.0  # a scribe that reports twice a second hangs if it made no progress for this time
 CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
 MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
+REPORTED = ("recording", "rrd", "live", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
 MAX_SENDS_PER_TICK = 8  # waiting ticks are sent faster than new ones arrive
 
 
@@ -246,13 +247,8 @@ class Scribe:
             "sent": self._sent,
             "lost": self._lost + self._lost_before + report.lost,
             "restarts": self._restarts,
-            "recording": report.recording,
-            "rrd": report.rrd,
-            "live": report.live,
             "errors": list(self._errors),
-            "free_mb": report.free_mb,
-            "mb_per_hour": report.mb_per_hour,
-            "keep_mb_left": report.keep_mb_left,
+            **{name: getattr(report, name) for name in REPORTED},
         }
 
     def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> str:

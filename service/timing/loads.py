@@ -217,15 +217,9 @@ def run(rate_hz: int, seconds: float, *, settings: Settings | None = None) -> li
 def _row(load: Load, rate_hz: int, seconds: float, skills: Path, settings: Settings | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
-        arguments = ("--joints", "assumed", "--rate", str(rate_hz), "--live", str(port))
-        cell: dict[str, Any] = {"settings": settings, "record": folder, "skills": skills, "program": load.program}
-        with (
-            launched(folder, *arguments, **cell, say=say) as service,
-            open_session(connect=[service.endpoint]) as session,
-            running_client("hands", service.endpoint),
-        ):
-            loaded = LoadedCell(service, Client(session), port)
-            until_following(loaded.client)
+        cell: dict[str, Any] = {"settings": settings, "skills": skills, "program": load.program}
+        with running_cell(folder, rate_hz, "--live", str(port), **cell) as (service, client):
+            loaded = LoadedCell(service, client, port)
             with load.put_on(loaded):
                 before = loaded.client.status()
                 time.sleep(seconds)
@@ -259,14 +253,24 @@ def _let_others_first(pid: int) -> bool:
     return had
 
 
-def until_following(client: Client) -> None:
-    """Wait until a daemon follows the hands, and LOAD_SETTLE_S more. Raises LoadError."""
-    until = time.monotonic() + 15.0
-    while (now := client.status()).mode != "follow":
-        if time.monotonic() > until:
-            raise LoadError(f"the daemon does not follow the hands: {now.mode} ({now.reason})")
-        time.sleep(0.1)
-    time.sleep(LOAD_SETTLE_S)
+@contextlib.contextmanager
+def running_cell(folder: Path, rate_hz: int, *arguments: str, **cell: Any) -> Iterator[tuple[Launched, Client]]:
+    """A daemon that records to a folder and has followed played hands for LOAD_SETTLE_S, and its
+    client; `arguments` and `cell` are as of `launched`. Raises LoadError and LaunchError.
+    """
+    rate = ("--joints", "assumed", "--rate", str(rate_hz))
+    with (
+        launched(folder, *rate, *arguments, record=folder, say=say, **cell) as service,
+        open_session(connect=[service.endpoint]) as session,
+        running_client("hands", service.endpoint),
+    ):
+        client, until = Client(session), time.monotonic() + 15.0
+        while (now := client.status()).mode != "follow":
+            if time.monotonic() > until:
+                raise LoadError(f"the daemon does not follow the hands: {now.mode} ({now.reason})")
+            time.sleep(0.1)
+        time.sleep(LOAD_SETTLE_S)
+        yield service, client
 
 
 def large_skill() -> bytes:

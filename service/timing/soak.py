@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from service.client import Client, open_session
-from service.daemon.launch import launched
 from service.process.progress import say
 from service.settings.config import Settings
-from service.timing.loads import running_client, until_following
+from service.timing.loads import running_cell
 from service.timing.probe_processes import family
 
 LONGEST_PAUSE_S = 5.0  # maximum interval of samples
@@ -31,15 +29,7 @@ def run(minutes: float, rate_hz: int, *, settings: Settings | None = None) -> di
     say(f"daemon with recorder and viewer, a tracker: {minutes:g} min")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with (
-            launched(
-                folder, "--joints", "assumed", "--rate", str(rate_hz), settings=settings, record=folder, say=say
-            ) as service,
-            open_session(connect=[service.endpoint]) as session,
-            running_client("hands", service.endpoint),
-        ):
-            client = Client(session)
-            until_following(client)
+        with running_cell(folder, rate_hz, settings=settings) as (service, client):
             processes = family(service.process.pid)
             samples: dict[str, list[tuple[float, float, int]]] = {who: [] for who in processes}
             before, began = client.status(), time.monotonic()

@@ -29,6 +29,7 @@ from service.files.dwells import REST_M
 from service.files.mcap_file import machine, whole_file
 from service.files.pose_streams import ENDINGS, GRIPPER_STATE, JOINT_STATES, PLACES_TOPIC
 from service.files.tool_poses import tool_poses
+from service.files.track import Track
 from service.settings.config import Settings, robot_description
 
 HAND_KEYS = ("hands/left", "hands/right")
@@ -69,6 +70,7 @@ class Capture:
         self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both", person: str = ""
     ) -> None:
         self.cell, self.settings, self.conducts, self.person = cell, settings, conducts, person
+        self._urdf = robot_description(settings)
         self.hands = HAND_KEYS if conducts == "both" else (ENDINGS[conducts],)
         self.samples: dict[str, list[Sample]] = {
             key: [] for key in CAPTURED_KEYS if key not in HAND_KEYS or key in self.hands
@@ -231,12 +233,15 @@ class Capture:
         """
         if lacking := self.missing:
             raise CaptureError(f"no messages on {', '.join(lacking)} arrived in time: no demonstration was written")
-        urdf = robot_description(self.settings)
         messages = [
             (sample.arrived_ns, key, sample.payload) for key, samples in self.samples.items() for sample in samples
         ]
         if not self.samples[TOOL_KEY]:
-            messages += self._tool_by_joints(urdf)
+            tool = self.tool_by(self.samples[JOINT_STATES])
+            rows = zip(tool.logged_ns.tolist(), tool.stamps_ns.tolist(), tool.poses.tolist(), strict=True)
+            for arrived_ns, stamp_ns, at in rows:
+                pose = PoseStamped(stamp_ns, BASE, tuple(at[:3]), tuple(at[3:]))
+                messages.append((arrived_ns, TOOL_KEY, channels.POSE.encode(pose)))
         if places:
             text = cdr.encode_string(encode_json(tuple(places)).decode())
             messages.append((min(messages)[0], PLACES_TOPIC, text))
@@ -245,23 +250,26 @@ class Capture:
             about = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
             file.writer.add_metadata("thirdhand", about)
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
-            file.attach("arm.urdf", urdf.encode(), now_ns)
+            file.attach("arm.urdf", self._urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
                 codec = channels.STRING if key == PLACES_TOPIC else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
 
-    def _tool_by_joints(self, urdf: str) -> list[tuple[int, str, bytes]]:
-        states = self.samples[JOINT_STATES]
-        stamps = [channels.JOINTS.decode(state.payload).stamp_ns or state.arrived_ns for state in states]
-        poses, kept = tool_poses(self.settings, urdf, np.array(stamps), np.array([state.at for state in states]))
-        return [
-            (
-                states[i].arrived_ns,
-                TOOL_KEY,
-                channels.POSE.encode(PoseStamped(stamps[i], BASE, tuple(at[:3]), tuple(at[3:]))),
-            )
-            for i, at in zip(kept, poses.tolist(), strict=True)
-        ]
+    def tool_by(self, states: Sequence[Sample]) -> Track:
+        """The tool's track in frame `base`, from states of the arm's joints by its URDF."""
+        logged = np.array([state.arrived_ns for state in states], np.int64)
+        stamps = np.array([channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64)
+        stamps, joints = np.where(stamps == 0, logged, stamps), np.array([state.at for state in states])
+        poses, kept = tool_poses(self.settings, self._urdf, stamps, joints)
+        return Track("tool", "", stamps[kept], logged[kept], poses, BASE)
+
+    def not_received(self, missing: Sequence[str], more: str = "") -> str:
+        """A message on streams that do not arrive, and what to check."""
+        unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in self.malformed.items())
+        return (
+            f"not received: {', '.join(missing)}{unreadable}{more}. Are tracker and arm running, connected to the same "
+            f"endpoint, and in cell {self.cell}?"
+        )
 
 
 def _motion(key: str, at: Vector) -> float:
@@ -296,16 +304,10 @@ def capture(
         say(f"waiting for {', '.join(captured.missing)} of cell {cell}")
         while captured.missing:
             if time.monotonic() - begun_s > wait_s or is_ended():
-                unreadable = "".join(
-                    f"; {n} messages on {key} are not readable" for key, n in captured.malformed.items()
-                )
                 meant = {channels.key(cell, key) for key in CAPTURED_KEYS}
                 elsewhere = [key for key in others.keys if key not in meant][:MAX_OTHER_KEYS]
                 instead = f"; received instead: {', '.join(elsewhere)}" if elsewhere else ""
-                raise CaptureError(
-                    f"not received: {', '.join(captured.missing)}{unreadable}{instead}. Are tracker and arm running, "
-                    f"connected to the same endpoint, and in cell {cell}?"
-                )
+                raise CaptureError(captured.not_received(captured.missing, instead))
             time.sleep(CAPTURE_POLL_S)
             captured.collect()
         others.close()

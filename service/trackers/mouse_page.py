@@ -14,7 +14,7 @@ from service.settings import palette
 from service.trackers.browser_hands import NO_TOKEN
 from service.trackers.cell_view import Latest
 from service.trackers.hands_page import HandsPage
-from service.trackers.web_server import JSON, ServerCertificate, answer
+from service.trackers.web_server import JSON, answer
 
 PAGE_COLOURS = {
     "left": palette.LEFT,
@@ -42,7 +42,9 @@ class PlayedTask:
 
 
 class MousePage(HandsPage):
-    """The page and its server; with a `task`, the page shows it and can end it."""
+    """The page and its server; with a `task`, the page shows it and can end it. Other arguments are
+    those of `HandsPage`.
+    """
 
     page, scripts, frame = "mouse.html", ("link", "controls"), BASE
 
@@ -52,10 +54,8 @@ class MousePage(HandsPage):
         client: Client,
         latest: Latest,
         *,
-        cell: str,
-        certificate: ServerCertificate | None = None,
-        token: str = "",
         task: PlayedTask | None = None,
+        **served: Any,
     ) -> None:
         async def show(_: web.Request) -> web.Response:
             assert task is not None
@@ -70,9 +70,7 @@ class MousePage(HandsPage):
 
         super().__init__(
             *(tracker, client, latest),
-            cell=cell,
-            certificate=certificate,
-            token=token,
+            **served,
             more=[web.get("/task", show), web.post("/end", end)] if task else (),
             colours=json.dumps(PAGE_COLOURS),
             left=" ".join(map(str, palette.LEFT)),

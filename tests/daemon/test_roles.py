@@ -262,7 +262,7 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
         (("--role", "tracker", "--name", "tracker"), 1, "a new name needed"),
         (("--role", "nobody"), 2, "invalid choice"),
         (("--role", "tracker", "--host", "not plain \u00fc"), 2, "a name in plain letters, or an address, needed"),
-        (("--role", "daemon", "--days", "0"), 2, "accepted"),
+        (("--role", "daemon", "--days", "0"), 2, "--days: 0 given, 1 to 36500 needed"),
     ],
 )
 def test_one_more_certificate_that_cannot_be_is_refused_in_words(

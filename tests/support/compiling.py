@@ -18,7 +18,7 @@ from pathlib import Path
 
 from service.contract.requests import ViaPoint
 from service.core import warm_up
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.skill_worker import SkillWorker, skill_of
 from service.settings.config import Settings, robot_description
 from support.arms import cell_of
 from support.paths import RECORDINGS, ROOT
@@ -70,7 +70,7 @@ def main(first: int) -> None:
     skill_worker = SkillWorker()
     for name in ("soldering.npz", "experiments/as-paper.npz"):
         loaded = skill_worker.load(RECORDINGS / name, timeout_s=120.0)
-        for one in (loaded, skill_worker.adapt(loaded, [place], tolerance=0.05, timeout_s=120.0)):
+        for one in (loaded, skill_worker.compute(skill_of, loaded.file, (place,), 0.05, timeout_s=120.0)):
             warm_up.warm_up(Settings(), one, urdf=robot_description(Settings()))
     os.close(first)
     six = cell_of("ur5")

@@ -611,7 +611,7 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
         (["--check"], 2, "--check compares with the last calibration of a cell: give its settings by --config FILE"),
         (["--at", "0", "0", "0"], 2, "--at and --at-file give points to touch: give --points too"),
         (["--points", "--at", "0", "0", "0"], 2, "1 points given; 4 or more needed"),
-        (["--points", "--at-file", "FILE"], 2, "line 2: '1 2' given; three numbers needed"),
+        (["--points", "--at-file", "FILE"], 2, "line 2: '1 2' given; three numbers from -5 to 5 m needed"),
         (["--accept", "0"], 2, "0 given, 0.1 to 200 mm needed"),
         (["--hand", "both"], 2, "invalid choice"),
         (["--config", "nowhere.toml"], 1, "cannot read configuration nowhere.toml"),

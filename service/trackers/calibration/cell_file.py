@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +19,7 @@ import tomlkit.exceptions
 from service.contract.explain import InvalidError, in_words, validated
 from service.settings.config import Settings, load, parse
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.whole_file import whole
 from service.trackers.calibration.solver import Calibration, CalibrationError
 
 
@@ -45,11 +45,7 @@ def hand_settings(calibration: Calibration, frame: str) -> dict[str, Any]:
 def lines(values: Mapping[str, Any], tracker: str = "") -> str:
     """The values of [trackers.NAME], or without a tracker of [hands], as lines of a TOML file."""
     table = f"[trackers.{tomlkit.key(tracker).as_string()}]" if tracker else "[hands]"
-    return f"{table}\n" + "".join(f"{name} = {_literal(value)}\n" for name, value in values.items())
-
-
-def _literal(value: Any) -> str:
-    return str(tomlkit.item(value).as_string())
+    return f"{table}\n" + "".join(f"{name} = {tomlkit.item(value).as_string()}\n" for name, value in values.items())
 
 
 def record_path(path: Path, tracker: str = "") -> Path:
@@ -95,8 +91,8 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
         if kept.read_bytes() != text.encode():
             kept.unlink()
             raise CalibrationError(f"{path} was changed by another program meanwhile. {by_hand}")
-        _replace(path, changed.encode(), path.stat().st_mode)
-        _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n", 0o644)
+        _replace(path, changed.encode())
+        _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n")
     except OSError as error:
         raise CalibrationError(f"{in_words(error)}. {by_hand}") from None
     return kept
@@ -116,19 +112,12 @@ def real_path(path: Path) -> Path:
     return found
 
 
-def _replace(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file at once, or leave it as it is."""
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, mode & 0o777)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+def _replace(path: Path, data: bytes) -> None:
+    """Replace a file at once, or leave it as it is; its new content is on the disk before."""
+    with whole(path) as part, part.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def recorded(path: Path, settings: Settings, tracker: str = "") -> CalibrationRecord:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import zenoh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +18,6 @@ from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.files.demonstration_reader import in_metres, is_by_tracker
 from service.files.pose_streams import ENDINGS, JOINT_STATES, PoseRecording
-from service.files.tool_poses import tool_poses
 from service.files.track import Track
 from service.settings.config import HandSettings, Settings, robot_description
 from service.trackers.calibration.solver import (
@@ -96,38 +94,19 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
     return LedTracks(hands, tool), settings
 
 
-class LiveLed:
+class LiveLed(Capture):
     """Hands and joints of a running cell, subscribed until closed."""
 
-    def __init__(self, session: zenoh.Session, cell: str, settings: Settings) -> None:
-        self._settings, self._urdf = settings, robot_description(settings)
-        self._capture = Capture(session, cell, settings)
-        self.begun_s = time.monotonic()
-
-    def close(self) -> None:
-        """End the subscriptions."""
-        self._capture.close()
-
-    def collect(self) -> None:
-        """Decode the messages since the last call."""
-        self._capture.collect()
-
-    def missing(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
+    def lacking(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
         """The required streams from which nothing arrived; without a side, one hand is enough."""
-        samples = self._capture.samples
         wanted = [ENDINGS[one] for one in SIDES if side in (None, one)]
-        lacking = [] if any(samples[key] for key in wanted) else [" or ".join(wanted)]
-        return lacking + ([JOINT_STATES] if needs_joints and not samples[JOINT_STATES] else [])
+        hands = [] if any(self.samples[key] for key in wanted) else [" or ".join(wanted)]
+        return hands + ([JOINT_STATES] if needs_joints and not self.samples[JOINT_STATES] else [])
 
     @property
     def arriving(self) -> list[str]:
         """The sides of the hands that arrive."""
-        return [side for side in SIDES if self._capture.samples[ENDINGS[side]]]
-
-    @property
-    def malformed(self) -> Mapping[str, int]:
-        """Numbers of unreadable messages, by key."""
-        return self._capture.malformed
+        return [side for side in SIDES if self.samples[ENDINGS[side]]]
 
     def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
         """The hands and the tool of the last `since_s` [s], None: all; the tool with at most
@@ -138,7 +117,7 @@ class LiveLed:
         hands: dict[str, Track] = {}
         remarks = []
         for side in self.arriving:
-            samples = _lately(self._capture.samples[ENDINGS[side]], since_s)
+            samples = _lately(self.samples[ENDINGS[side]], since_s)
             poses = [channels.POSE.decode(sample.payload) for sample in samples]
             frame = poses[-1].frame_id if poses else ""
             kept = [i for i, pose in enumerate(poses) if pose.frame_id == frame]
@@ -155,27 +134,21 @@ class LiveLed:
         return LedTracks(hands, self._tool(most_states, since_s), remarks)
 
     def _tool(self, most: int | None, since_s: float | None) -> Track:
-        states = _lately(self._capture.samples[JOINT_STATES], since_s)
+        states = _lately(self.samples[JOINT_STATES], since_s)
         if not states:
             nothing = np.zeros(0, np.int64)
             return Track("tool", "", nothing, nothing, np.zeros((0, 7)), BASE)
-        step = math.ceil(len(states) / most) if most else 1
-        states = states[::step]
-        logged = np.array([state.arrived_ns for state in states], np.int64)
-        stamps = np.array([channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64)
-        stamps = np.where(stamps == 0, logged, stamps)
-        poses, kept = tool_poses(self._settings, self._urdf, stamps, np.array([state.at for state in states]))
-        return Track("tool", "", stamps[kept], logged[kept], poses, BASE)
+        return self.tool_by(states[:: math.ceil(len(states) / most) if most else 1])
 
     def touch(self, side: str) -> Vector:
         """The position (3,) [m] of a hand that rests, in the tracker's frame. Raises
         CalibrationError.
         """
-        samples = _lately(self._capture.samples[ENDINGS[side]], TOUCH_S)
+        samples = _lately(self.samples[ENDINGS[side]], TOUCH_S)
         if len(samples) < LEAST_TOUCH_SAMPLES:
             raise CalibrationError(f"{len(samples)} samples of {ENDINGS[side]} in {TOUCH_S:g} s: is the hand seen?")
         poses = [channels.POSE.decode(sample.payload) for sample in samples]
-        at = in_metres(np.array([pose.position for pose in poses]), self._settings.hands_in(poses[-1].frame_id))
+        at = in_metres(np.array([pose.position for pose in poses]), self.settings.hands_in(poses[-1].frame_id))
         moved_m = float(np.ptp(np.sort(at, axis=0)[len(at) // 10 : len(at) - len(at) // 10], axis=0).max())
         if moved_m > MAX_TOUCH_M:
             raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
