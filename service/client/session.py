@@ -128,8 +128,12 @@ def open_session(
 
 
 def check_open(session: zenoh.Session) -> None:
-    """Raise UnreachableError for a session that was closed."""
-    if session.is_closed():
+    """Raise UnreachableError for a session that was closed, or that another thread closes."""
+    try:
+        closed = session.is_closed()
+    except RuntimeError:  # Zenoh has lent the session to the thread that closes it
+        closed = True
+    if closed:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
