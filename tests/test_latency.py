@@ -19,8 +19,8 @@ from support.cell import thirdhand
 
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
-# What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 1 and 0.
-MOST_WORK, MOST_LATENCY, MOST_LATE, MOST_MISSED = 14.0, 1.4, 10.0, 0.03
+# What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 0 and 0.
+MOST_WORK, MOST_LATENCY, MOST_LATE, MOST_MISSED = 14.0, 1.4, 0.5, 0.03
 PLANTED = """
 from service.process import one_blas_thread
 import sys, threading, time
@@ -78,10 +78,11 @@ def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def complaints(report: dict[str, Any]) -> list[str]:
     """What of the loop's time is not as it should be."""
     ratios = report["ratios"]
+    late_us = [report[kind]["lateness_us"]["p99"] for kind in ("empty", "whole")]
     found = {
         "work": (ratios["work_to_fixed_work"], MOST_WORK),
         "latency": (ratios["latency"], MOST_LATENCY),
-        "lateness": (ratios["lateness_p50"], MOST_LATE),
+        "lateness": (1e-6 * RATE_HZ * (late_us[1] - late_us[0]), MOST_LATE),  # share of a period
         "missed": (ratios["missed_more"], MOST_MISSED),
     }
     return [f"{name} {value:g}, at most {most:g}" for name, (value, most) in found.items() if value > most]

@@ -15,7 +15,7 @@ import zenoh
 
 from service.client.calls import Client
 from service.client.client_settings import client_settings
-from service.client.session import check_open
+from service.client.session import check_open, put
 from service.client.streams import UNTURNED, Watch, checked_frame, checked_stamp, publisher, wait_until_heard
 from service.contract import cdr, markers
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
@@ -170,7 +170,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
         publishers = [self._heard(suffix) for suffix in messages]
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
         for one, encode in zip(publishers, messages.values(), strict=True):
-            one.put(encode(stamp_ns))
+            put(self._session, one, encode(stamp_ns))
 
     def _heard(self, suffix: str) -> zenoh.Publisher:
         """The publisher on a channel, once somebody listens. Raises UnreachableError."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from service.client.replies import decoded
-from service.client.session import UnreachableError, check_open, tried
+from service.client.session import UnreachableError, check_open, put, tried
 from service.contract import cdr, channels
 from service.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from service.contract.printable import printable
@@ -144,7 +144,7 @@ class Tracker(AbstractContextManager["Tracker"]):
                 f"{side} hand: {reprlib.repr(position)} and {reprlib.repr(orientation)} given; a position x y z [m] "
                 "and a quaternion x y z w needed"
             ) from None
-        self._publishers[side].put(message)
+        put(self._session, self._publishers[side], message)
 
     def heard(self) -> bool:
         """True if both hands have a subscriber."""
@@ -308,7 +308,7 @@ class Follower(_Received):
                 f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and velocities of "
                 f"{len(self._names)} joints needed"
             ) from None
-        self._state.put(message)
+        put(self._session, self._state, message)
 
     def close(self) -> None:
         """End the subscription and the publisher."""

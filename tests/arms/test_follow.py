@@ -197,7 +197,7 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     six.write_text(toml_of(MODELS["ur5"]))
     with serving(tmp_path) as daemon:
         at = ("--connect", daemon.endpoint)
-        assert "is the cell's name right?" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
+        assert "only daemons of other cells run" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
         assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
         assert "the settings here have 6" in line
         assert "give the daemon's settings by --config" in line
