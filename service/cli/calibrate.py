@@ -168,7 +168,7 @@ def _live(
 def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> None:
     """Wait until hands and joints arrive. Raises CalibrationError after --wait."""
     begun_s = time.monotonic()
-    while missing := live.lacking(args.hand, needs_joints=needs_joints):
+    while missing := live.unheard(args.hand, needs_joints=needs_joints):
         if time.monotonic() - begun_s > args.wait:
             raise CalibrationError(live.not_received(missing))
         time.sleep(CALIBRATE_POLL_S)

@@ -185,7 +185,7 @@ def lacking(endpoint: str) -> str:
 
 
 def is_host(name: str) -> bool:
-    """Whether a name can be looked up: the system's resolver fails for others without a reason."""
+    """True if a host can have this name. For other names, the resolver raises UnicodeError."""
     try:
         name.encode("idna")
     except UnicodeError:

@@ -397,10 +397,11 @@ class Daemon:
         machine, scribe = self._machine, self._scribe.status()
         machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
         memory_mb = resident_mb(daemon=os.getpid(), scribe=scribe["pid"])
-        windows = []
-        for window in (self._lateness, self._work, self._latency):
+        windows = {"lateness_us": self._lateness, "work_us": self._work, "latency_ms": self._latency}
+        percentiles = {}
+        for name, window in windows.items():
             clock.between_ticks()
-            windows.append(window.percentiles())
+            percentiles[name] = window.percentiles()
         clock.between_ticks()
         known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
@@ -410,9 +411,7 @@ class Daemon:
             realtime=self._granted.realtime,
             memory_locked=self._granted.locked,
             received={key: arrivals.count for key, arrivals in self._sources.arrivals.items()},
-            lateness_us=windows[0],
-            work_us=windows[1],
-            latency_ms=windows[2],
+            **percentiles,
             scribe=scribe,
             memory_mb=memory_mb,
             command_heard=self._streams.is_followed,

@@ -97,7 +97,7 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
 class LiveLed(Capture):
     """Hands and joints of a running cell, subscribed until closed."""
 
-    def lacking(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
+    def unheard(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
         """The required streams from which nothing arrived; without a side, one hand is enough."""
         wanted = [ENDINGS[one] for one in SIDES if side in (None, one)]
         hands = [] if any(self.samples[key] for key in wanted) else [" or ".join(wanted)]
