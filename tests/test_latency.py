@@ -6,16 +6,20 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
+from service.contract import channels
 from service.files.replay import replay
 from service.timing import benchmark
-from support.cell import thirdhand
+from support.cell import Tracker, serving, thirdhand
 
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
@@ -115,3 +119,27 @@ def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
 def test_what_breaks_it_is_found(thread: bool) -> None:
     report = benchmark.run(RATE_HZ, SECONDS / 2, program=("-c", PLANTED.format(thread=thread)))
     assert complaints(report), benchmark.text(report)
+
+
+def test_busy_processes_take_no_message_from_a_subscriber(tmp_path: Path) -> None:
+    """With a sender's queue of two, one in twenty of what leaves last in a tick was lost."""
+    numbers: dict[str, list[int]] = {}
+
+    def note(sample: zenoh.Sample) -> None:
+        numbers.setdefault(str(sample.key_expr), []).append(sample.source_info.source_sn)
+
+    with serving(tmp_path, "--arm", "assumed", "--rate", str(RATE_HZ)) as daemon, Tracker(daemon.session):
+        daemon.until(lambda status: status["mode"] == "follow")
+        heard = [daemon.session.declare_subscriber(f"thirdhand/{key}/*", note) for key in ("joints", "tool")]
+        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+        try:
+            time.sleep(2 * SECONDS)
+        finally:
+            for process in busy:
+                process.kill()
+                process.wait()
+            for subscriber in heard:
+                subscriber.undeclare()
+    last = numbers["thirdhand/tool/setpoint"]
+    assert len(last) > SECONDS * RATE_HZ / channels.BY_KEY["tool/setpoint"].every
+    assert last[-1] - last[0] + 1 - len(last) < 0.01 * len(last)

@@ -103,6 +103,9 @@ def open_session(
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
         "plugins_loading/enabled": False,
         "namespace": None,  # the contract's keys are absolute
+        # [batches] A tick publishes up to four messages, each a batch of its own. With Zenoh's 2,
+        # `put` waits for the thread that sends, for 1 ms, and drops the message.
+        "transport/link/tx/queue/size/real_time": 16,
         "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
         **_tls(folder),
         **(more or {}),

@@ -79,7 +79,8 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
             return {cell.name: cell.status.mode for cell in cells(lab.session) if cell.status}
 
         others = dict.fromkeys(NAMES[1:], "hold")
-        until(lambda: modes() == {NAMES[0]: "follow"} | others and f"{NAMES[0]}/tool/target" in encodings)
+        said = {f"{NAMES[0]}/tool/{pose}" for pose in ("target", "setpoint")}
+        until(lambda: modes() == {NAMES[0]: "follow"} | others and encodings.keys() >= said)
         assert client.hold().tick > 0
         until(lambda: modes() == {NAMES[0]: "hold"} | others)
         assert client.status().reason == "operator"
