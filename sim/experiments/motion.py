@@ -53,7 +53,7 @@ from sim.experiments.results import (
     rgb,
 )
 from sim.experiments.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
-from sim.experiments.rivals.linear_filters import best_linear
+from sim.experiments.rivals.linear_filters import best_linear, error_at
 from sim.experiments.workers import shared_out
 
 SEEDS = EXPERIMENTS["motion"].seeds
@@ -341,6 +341,7 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
             kind: _compared([one for one in of if kinds[one.person] == kind]) for kind in sorted(set(kinds.values()))
         }
         results.say(f"{group}, by tracker: {brief(trackers[group])}")
+    bound = _bound(results, [one for one in hands if one.group == "recorded"], found)
     worse, of_harder = {}, _measured(harder, options)
     for group in HARDER_GROUPS:
         error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
@@ -353,10 +354,33 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
         "by_person": people,
         "by_tracker": trackers,
         "all": together,
+        "best_linear_filter": bound,
         "harder": worse,
     }
     draw_numbers(results, numbers)
     return numbers
+
+
+def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[str, dict[str, float]]:
+    """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
+    fitted to each recording; medians over recordings.
+    """
+    skill, mine = (
+        _known[SHIPPED][0],
+        {one.name: one for one in found if one.follower == "ours" and one.group == hands[0].group},
+    )
+    errors: dict[str, list[tuple[float, float]]] = {}
+    for one in hands:
+        floors = best_linear([one], skill, rate_hz=round(1 / float(np.median(np.diff(one.stamps)))))
+        pair = mine[one.name].error_rms_mm, error_at(floors, mine[one.name].jerk_ratio)
+        for kind in (one.tracker, "all"):
+            errors.setdefault(kind, []).append(pair)
+    out = {
+        kind: dict(zip(("ours", "bound"), np.median(pairs, axis=0).tolist(), strict=True))
+        for kind, pairs in errors.items()
+    }
+    results.say(f"recorded, beside the best linear filters: {brief(out)}")
+    return out
 
 
 def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:

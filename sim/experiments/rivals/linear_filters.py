@@ -4,6 +4,7 @@ arm: a bound for all linear filters.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,13 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
         ratios = (float(np.sqrt(w @ matrix @ w / of)) for matrix, of in ((push, wanted_push), (jerk, wanted_jerk)))
         found.append(Floor(1000 * float(np.sqrt(error)), *ratios))
     return found
+
+
+def error_at(floors: list[Floor], jerk_ratio: float) -> float:
+    """The error [mm] of the best filter with a jerk ratio, interpolated in its logarithm."""
+    rows = sorted((math.log(one.jerk_ratio), one.error_rms_mm) for one in floors)
+    jerks, errors = zip(*rows, strict=True)
+    return float(np.interp(math.log(jerk_ratio), jerks, errors))
 
 
 def _rows(samples: Array, outputs: Array, up: int, taps: int) -> Array:
