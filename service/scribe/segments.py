@@ -257,6 +257,8 @@ class Segments:
             return
         self._marked_pending = 0
         if recorder.kept:
+            if self._failure is not None:
+                self._say(f"recording continues in {recorder.path}; {self.lost} ticks are lost in all")
             self._full, self._failure = False, None
         lost_name = recorder.lost_name()
         if lost_name == "removed":

@@ -258,7 +258,8 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
         ballast.unlink()
         one.until(lambda status: status["state"] == "recording")
         sent = one.told
-        one.until(lambda status: status["sent"] > sent + 200)
+        status = one.until(lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1])
+        assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
     recordings = sorted(small_disk.glob("*.mcap"))
     kept, lost = accounted(recordings, one.told)
     assert kept + lost == one.told
