@@ -179,13 +179,14 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
     """The reason why a TLS handshake with an endpoint fails, in words; empty if it succeeds or
     fails for another cause. Zenoh itself gives no reason.
 
-    In TLS 1.3 the server reports after the handshake that it refuses the client's certificate.
+    In TLS 1.3 the server reports after the handshake that it refuses the client's certificate. At
+    an endpoint of `tcp`, a handshake that succeeds is the problem.
     """
-    if (address := tcp_address(endpoint)) is None or not endpoint.startswith("tls/"):
+    if (address := tcp_address(endpoint)) is None:
         return ""
-    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    tls, is_plain = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), not endpoint.startswith("tls/")
     try:
-        if folder:
+        if folder and not is_plain:
             own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
             tls.load_verify_locations(authority)
             tls.load_cert_chain(own, key)
@@ -195,11 +196,15 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
             socket.create_connection(address, timeout=ATTEMPT_S) as plain,
             tls.wrap_socket(plain, server_hostname=address[0]) as secured,
         ):
+            if is_plain:
+                return f"{endpoint} accepts TLS only: tls/{endpoint.partition('/')[2]}, and a certificate, needed"
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
         words = SERVER_PROBLEMS.get(error.verify_code, f"is not from the authority in {folder}")
         return f"the certificate of the daemon or router at {endpoint} {words}"
     except ssl.SSLError as error:
+        if is_plain:
+            return ""
         problem = CLIENT_PROBLEMS.get(str(error.reason).partition("ALERT_")[2], "")
         if folder or not problem:
             return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"

@@ -406,6 +406,12 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
             for timeout_s in (0.3, None):  # with None, other errors are waited for
                 with pytest.raises(CertificateError, match=words):
                     open_session(connect=endpoints(session), certificate=client or "", timeout_s=timeout_s)
+            (secured,) = endpoints(session)
+            plain = secured.replace("tls/", "tcp/")
+            with pytest.raises(
+                CertificateError, match=f"{plain} accepts TLS only: {secured}, and a certificate, needed"
+            ):
+                open_session(connect=[plain], certificate=client or "", timeout_s=0.3)
     with (
         open_session(listen=["tls/127.0.0.2:0"], certificate=own / "daemon") as session,
         pytest.raises(CertificateError, match=r"the certificate of the daemon .* is not for this address"),
