@@ -8,16 +8,17 @@ import logging
 import os
 import sys
 import tempfile
+import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 
 from service.cli.usage import UsageError, end_with
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
-from service.daemon.start import ahead_of_others, starting
+from service.daemon.start import AGAIN, CompilerInMemoryError, ahead_of_others, starting
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process import child
 from service.settings.config import Settings, converted
@@ -37,6 +38,9 @@ def serve(args: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
         return _run(args)
+    except CompilerInMemoryError:
+        log.info("everything is compiled; the daemon starts again, without the memory that this took")
+        _start_again()
     except Exception as error:
         if args.log != "json":
             raise
@@ -78,6 +82,14 @@ def _run(args: argparse.Namespace) -> int:
         missing = daemon.serve(settings, skill, skills=skills_folder(settings), **more)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
+
+
+def _start_again() -> NoReturn:
+    """Replace this process by one that was started in the same way."""
+    child.end_server()
+    logging.shutdown()
+    os.environ[AGAIN] = str(time.monotonic())
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def settings_of(args: argparse.Namespace) -> Settings:

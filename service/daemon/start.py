@@ -33,6 +33,11 @@ LOG_EVERY_S = 20.0  # interval of reports in the log
 MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
 AHEAD_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
+AGAIN = "THIRDHAND_STARTS_AGAIN"  # variable: when the start of a process began again [s, monotonic]
+
+
+class CompilerInMemoryError(Exception):
+    """The start compiled functions, so 600 MB of the compiler remain in the process."""
 
 
 class Startup:
@@ -45,9 +50,14 @@ class Startup:
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
         self.lock, self.session, self.systemd = lock, session, Systemd()
         self._compiled: list[str] = []  # functions in compilation, callers first; empty for a library's functions
+        self._has_compiled, again = False, os.environ.pop(AGAIN, None)
+        self._is_again = again is not None
         self._functions: list[Any] = []  # all compiled functions that the loop may call, once they are imported
         self._is_over, self._begun_s = threading.Event(), time.monotonic()
-        self._stages = [("network", time.monotonic() - _process_age_s()), ("imports", self._begun_s)]
+        self._stages = [
+            ("network", float(again) if again else time.monotonic() - _process_age_s()),
+            ("imports", self._begun_s),
+        ]
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
         self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
         self._reporter = threading.Thread(target=self._report, name="start", daemon=True)
@@ -80,14 +90,16 @@ class Startup:
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
         """A context that counts compiled functions, of those that the loop may call and that are
-        imported by now.
+        imported by now. Raises CompilerInMemoryError at its end if one was compiled, except in a
+        start that began again: if nothing can be cached, each start compiles.
         """
         from numba.core import dispatcher, event  # its import is slow, so the start reports before it
 
-        compiled = self._compiled
+        compiled, startup = self._compiled, self
 
         class Compiling(event.Listener):  # type: ignore[misc]
             def on_start(self, event: event.Event) -> None:
+                startup._has_compiled = True
                 gc.enable()  # compilations leave garbage
                 function = event.data["dispatcher"].py_func
                 name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
@@ -101,6 +113,8 @@ class Startup:
         self._functions = list(found.values())
         with event.install_listener("numba:compile", Compiling()):
             yield
+        if self._has_compiled and not self._is_again:
+            raise CompilerInMemoryError
 
     def over(self) -> None:
         """End the refusals, so that the daemon can answer; may be repeated."""

@@ -211,7 +211,8 @@ class _ForkServer:
 
 
 _server = _ForkServer()
-atexit.register(_server.close)
+end_server = _server.close
+atexit.register(end_server)
 
 
 def python(*arguments: str) -> tuple[list[str], dict[str, str]]:

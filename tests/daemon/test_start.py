@@ -32,6 +32,13 @@ from support.paths import ROOT
 
 COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
 
+COMPILES = """
+import numba
+from service.daemon import daemon
+warm_up = daemon.warm_up
+daemon.warm_up = lambda *given, **more: (numba.njit(lambda x: x + 1)(1), warm_up(*given, **more))
+"""
+
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
@@ -224,3 +231,15 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
 def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
     code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_a_start_that_compiled_begins_again_once_without_the_compilers_memory(tmp_path: Path) -> None:
+    """It compiles each time here, as where nothing can be cached."""
+    with serving(tmp_path, "--arm", "assumed", "--record", str(tmp_path / "records"), before=COMPILES) as daemon:
+        log = Path(daemon.log).read_text()
+        assert log.count("the daemon starts again") == 1
+        (took_s,) = re.findall(r"started in ([\d.]+) s: network", log)
+        process = psutil.Process(daemon.process.pid)
+        assert float(took_s) < time.time() - process.create_time()
+        assert all(child.status() != psutil.STATUS_ZOMBIE for child in process.children(recursive=True))
+    assert daemon.process.returncode == 0
