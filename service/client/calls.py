@@ -38,8 +38,8 @@ class Client:
     storage are ignored: only those of a live daemon are returned.
 
     A request waits up to 2 s for a connection that broke to return. If it breaks before the answer
-    arrives, the status and the list of via-points are requested again. Other requests are not, and
-    raise UncertainError, a subclass of UnreachableError: they may have been carried out.
+    arrives, `status`, `places` and `hold` are requested again. Other requests are not, and raise
+    UncertainError, a subclass of UnreachableError: they may have been carried out.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
@@ -133,31 +133,30 @@ class Client:
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
-        changes = suffix != "status" and payload != LIST
+        acts = suffix != "status" and payload != LIST
+        may_repeat = not acts or suffix == "hold"  # a second hold changes nothing, and a lost one must not remain so
         end_s, is_sent = time.monotonic() + min(RECONNECTED_S, self._timeout_s), False
         while True:
             check_open(self._session)
             is_sent |= is_connected(self._session)
-            if answer := self._asked(suffix, payload):
+            answer, is_stored = self._asked(suffix, payload)
+            if answer is not None:
                 return answer
-            if (is_sent and changes) or time.monotonic() > end_s:
+            is_absent = self._is_absent()
+            if is_absent or (is_sent and not may_repeat) or time.monotonic() > end_s:
                 break
-            time.sleep(RETRY_S)
-            if is_connected(self._session) and not living(self._session, self._cell):
-                break
-        is_lost = not is_connected(self._session)
         silent = f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
-        if is_sent and changes and (is_lost or living(self._session, self._cell)):
+        if is_sent and acts and not is_absent:
             raise UncertainError(f"{silent}. The request may have been carried out: the status shows it")
-        if answer is not None and not is_lost:
+        if is_stored and is_absent:
             silent += " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
         raise UnreachableError(silent)
 
-    def _asked(self, suffix: str, payload: bytes) -> bytes | None:
-        """The answer of a live daemon to one query; empty if only a storage answers, None if nobody
-        does.
+    def _asked(self, suffix: str, payload: bytes) -> tuple[bytes | None, bool]:
+        """The answer of a live daemon to one query, None if there is none; True if a storage
+        answered.
         """
-        answer = None
+        is_stored = False
         for reply in self._session.get(
             self._key(suffix),
             payload=payload,
@@ -173,12 +172,22 @@ class Client:
             if text.startswith(requests.STARTING):
                 raise StartingError(f"cell {self._cell} is {text}")
             if reply.replier_id is None or not self._is_daemon(str(reply.replier_id.zid)):
-                answer = b""
+                is_stored = True
                 continue
             if reply.ok is None:
                 raise RefusedError(text or "no reason given")
-            return reply.ok.payload.to_bytes()
-        return answer
+            return reply.ok.payload.to_bytes(), is_stored
+        return None, is_stored
+
+    def _is_absent(self) -> bool:
+        """True if the session is connected, and no daemon of the cell is seen for a while. A
+        connection that just broke still seems to exist for a moment.
+        """
+        for _ in range(ALIVE_QUERIES):
+            time.sleep(RETRY_S)
+            if not is_connected(self._session) or living(self._session, self._cell):
+                return False
+        return True
 
     def _is_daemon(self, own: str) -> bool:
         """True if a daemon of the cell has, or had, this Zenoh session.
