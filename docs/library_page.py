@@ -76,7 +76,7 @@ CLIENT_GROUPS = {
     "Hands and joints": ("Tracker", "Follower", "Command"),
     "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
-    "Errors": ("UnreachableError", "StartingError", "RefusedError", "SettingsError"),
+    "Errors": ("UnreachableError", "StartingError", "UncertainError", "RefusedError", "SettingsError"),
 }
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of service.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}

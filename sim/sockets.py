@@ -9,14 +9,14 @@ from typing import Self
 
 
 class CountingRelay:
-    """A relay between clients of `endpoint` and a target; a context."""
+    """A relay between clients of `endpoint` and a target, on a port, 0: a free one; a context."""
 
-    def __init__(self, target: str) -> None:
-        host, _, port = target.removeprefix("tcp/").rpartition(":")
-        self._target = host, int(port)
+    def __init__(self, target: str, port: int = 0) -> None:
+        host, _, target_port = target.removeprefix("tcp/").rpartition(":")
+        self._target = host, int(target_port)
         self._there = self._back = 0
         self._sockets: list[socket.socket] = []
-        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._listening = socket.create_server(("127.0.0.1", port))
         self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
         self._spawn(self._accept)
 
@@ -28,8 +28,12 @@ class CountingRelay:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for one in (self._listening, *self._sockets):
-            with contextlib.suppress(OSError):
+        self._close(self._listening, *self._sockets)
+
+    @staticmethod
+    def _close(*sockets: socket.socket) -> None:
+        for one in sockets:
+            with contextlib.suppress(OSError):  # it is closed, or was never connected
                 one.shutdown(socket.SHUT_RDWR)
             one.close()
 
@@ -54,6 +58,4 @@ class CountingRelay:
                     self._there += len(data)
                 else:
                     self._back += len(data)
-        for one in (source, sink):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+        self._close(source, sink)

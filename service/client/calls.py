@@ -8,15 +8,25 @@ from typing import Any, Literal, TypeVar
 
 import zenoh
 
-from service.client.presence import living, why_silent
+from service.client.presence import is_connected, living, why_silent
 from service.client.replies import decoded
-from service.client.session import RETRY_S, RefusedError, StartingError, UnreachableError, check_open, tried
+from service.client.session import (
+    RETRY_S,
+    RefusedError,
+    StartingError,
+    UncertainError,
+    UnreachableError,
+    check_open,
+    tried,
+)
 from service.contract import channels, requests
 from service.contract.messages import Vector3
 from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
+RECONNECTED_S = 2.0  # a connection that broke returns within this time, unless the network or the daemon is down
+LIST = requests.encode_json(requests.List())
 Answer = TypeVar("Answer")
 
 
@@ -26,12 +36,17 @@ class Client:
     Each raises RefusedError with the daemon's message, UnreachableError if no daemon answers within
     `timeout_s` [s], or its subclass StartingError while the daemon starts. Old replies from a Zenoh
     storage are ignored: only those of a live daemon are returned.
+
+    A request waits up to 2 s for a connection that broke to return. If it breaks before the answer
+    arrives, `status`, `places` and `hold` are requested again. Other requests are not, and raise
+    UncertainError, a subclass of UnreachableError: they may have been carried out.
     """
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s
+        self._daemons: set[str] = set()  # Zenoh sessions of daemons of the cell, also of those that ended
 
     def hold(self, by: str = "") -> Reply:
         """Stop the arm, which then holds; returns once that is in force. `by` names its holder."""
@@ -115,11 +130,33 @@ class Client:
             raise RefusedError(f"the answer on {self._key(suffix)} is {error}") from None
 
     def _answer(self, suffix: str, request: Any) -> bytes:
-        check_open(self._session)
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
-        kept = False  # True once a storage has answered
+        acts = suffix != "status" and payload != LIST
+        may_repeat = not acts or suffix == "hold"  # a second hold changes nothing, and a lost one must not remain so
+        end_s, is_sent = time.monotonic() + min(RECONNECTED_S, self._timeout_s), False
+        while True:
+            check_open(self._session)
+            is_sent |= is_connected(self._session)
+            answer, is_stored = self._asked(suffix, payload)
+            if answer is not None:
+                return answer
+            is_absent = self._is_absent()
+            if is_absent or (is_sent and not may_repeat) or time.monotonic() > end_s:
+                break
+        silent = f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
+        if is_sent and acts and not is_absent:
+            raise UncertainError(f"{silent}. The request may have been carried out: the status shows it")
+        if is_stored and is_absent:
+            silent += " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
+        raise UnreachableError(silent)
+
+    def _asked(self, suffix: str, payload: bytes) -> tuple[bytes | None, bool]:
+        """The answer of a live daemon to one query, None if there is none; True if a storage
+        answered.
+        """
+        is_stored = False
         for reply in self._session.get(
             self._key(suffix),
             payload=payload,
@@ -134,28 +171,36 @@ class Client:
                 continue
             if text.startswith(requests.STARTING):
                 raise StartingError(f"cell {self._cell} is {text}")
-            if reply.replier_id is None or not self._is_alive(str(reply.replier_id.zid)):
-                kept = True
+            if reply.replier_id is None or not self._is_daemon(str(reply.replier_id.zid)):
+                is_stored = True
                 continue
             if reply.ok is None:
                 raise RefusedError(text or "no reason given")
-            return reply.ok.payload.to_bytes()
-        raise UnreachableError(
-            f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
-            + " A Zenoh storage answered with an old reply, but no daemon of this cell is alive." * kept
-        )
+            return reply.ok.payload.to_bytes(), is_stored
+        return None, is_stored
 
-    def _is_alive(self, own: str) -> bool:
-        """True if a daemon of the cell has this Zenoh session.
+    def _is_absent(self) -> bool:
+        """True if the session is connected, and no daemon of the cell is seen for a while. A
+        connection that just broke still seems to exist for a moment.
+        """
+        for _ in range(ALIVE_QUERIES):
+            time.sleep(RETRY_S)
+            if not is_connected(self._session) or living(self._session, self._cell):
+                return False
+        return True
+
+    def _is_daemon(self, own: str) -> bool:
+        """True if a daemon of the cell has, or had, this Zenoh session.
 
         Tokens may be missing for a moment while other sessions join or leave, so the query is
         repeated up to ALIVE_QUERIES times.
         """
-        for _ in range(ALIVE_QUERIES):
-            if own in living(self._session, self._cell, timeout_s=self._timeout_s):
+        for attempt in range(ALIVE_QUERIES):
+            if own in self._daemons:
                 return True
-            time.sleep(RETRY_S)
-        return False
+            time.sleep(RETRY_S * (attempt > 0))
+            self._daemons |= living(self._session, self._cell, timeout_s=self._timeout_s)
+        return own in self._daemons
 
     def _key(self, suffix: str) -> str:
         return channels.key(self._cell, suffix)

@@ -30,6 +30,11 @@ class Cell(NamedTuple):
     status: Status | None
 
 
+def is_connected(session: zenoh.Session) -> bool:
+    """True while a session has a connection to another one."""
+    return bool(session.info.transports())
+
+
 def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> frozenset[str]:
     """The ids of the Zenoh sessions of the daemons that serve a cell."""
     return frozenset(own for _, own in _tokens(session, channels.presence(cell), timeout_s))
@@ -37,6 +42,8 @@ def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIM
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
     """A message with the likely reasons for a cell's silence."""
+    if not is_connected(session):
+        return "this program is not connected to a daemon or router; it restores a lost connection by itself"
     served = {name for name, _ in _tokens(session, channels.PRESENCE_OF_ALL, PRESENCE_TIMEOUT_S)}
     if cell in served:
         return (

@@ -51,6 +51,10 @@ class StartingError(UnreachableError):
     """The daemon is not ready yet; the message has the progress of its start."""
 
 
+class UncertainError(UnreachableError):
+    """No answer to a request arrived, and it may have been carried out."""
+
+
 class RefusedError(ExplainedError, ValueError):
     """The daemon refused a request; the message is its answer."""
 

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import zenoh
 
-from service.client import Client, RefusedError, decoded
+from service.client import Client, RefusedError, UncertainError, decoded
 from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.contract.incidents import ORDERS, in_brief, title
@@ -95,7 +95,7 @@ def corrected(client: Client, given: str) -> tuple[bool, str]:
             x, y, z = (float(value) for value in given.split())
             reply = client.correct((x, y, z), hands="now")
     except (ExplainedError, ValueError) as error:
-        return False, f"correct was NOT carried out: {error}"
+        return False, _failed("correct", error)
     found = reply.correction
     text = "" if found is None else f"{found.name} {'undone' if found.undone else 'in force'}: {found.text}"
     return True, f"{text}. Resume lets the tool go there" + f"; {reply.note}" * bool(reply.note)
@@ -108,7 +108,12 @@ def carried_out(client: Client, order: str, by: str = "") -> tuple[bool, str]:
     try:
         reply: Reply = getattr(client, order)(*([by] if by else []))
     except ExplainedError as error:
-        return False, f"{order} was NOT carried out: {error}"
+        return False, _failed(order, error)
     now = in_brief(reply.mode, reply.reason).replace("_", " ")
     note = f"; {reply.note}" if reply.note else ""
     return True, f"{order} carried out at tick {reply.tick}; mode then: {now}{note}"
+
+
+def _failed(order: str, error: Exception) -> str:
+    """The failure of an order, in words."""
+    return f"{order}: {error}" if isinstance(error, UncertainError) else f"{order} was NOT carried out: {error}"

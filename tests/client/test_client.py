@@ -5,6 +5,7 @@ or in words.
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,9 +14,21 @@ from typing import Any
 import pytest
 import zenoh
 
-from service.client import Client, RefusedError, UnreachableError, endpoints, living, open_session
+from service.client import (
+    Client,
+    RefusedError,
+    UncertainError,
+    UnreachableError,
+    endpoints,
+    living,
+    open_session,
+)
+from service.client.presence import is_connected
 from service.contract import channels, requests
 from service.contract.requests import ViaPoint
+from service.trackers.cell_view import carried_out
+from sim.sockets import CountingRelay
+from support.cell import until
 
 Answer = Callable[[zenoh.Query], object]
 
@@ -210,3 +223,96 @@ def test_who_does_not_answer_in_time_counts_as_unreachable(
             Client(session, "bench", timeout_s=0.2).ask("hold")
         assert len(kept) == 1
         kept[0].drop()
+
+
+# --- connections that break ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
+    """A session to the daemon, and a call that breaks its connection for 0.3 s."""
+    (target,) = endpoints(daemon)
+    relays, again = [CountingRelay(target)], list[threading.Timer]()
+    at = relays[0].endpoint
+
+    def cut() -> None:
+        relays[-1].__exit__()
+        again.append(threading.Timer(0.3, lambda: relays.append(CountingRelay(target, int(at.rpartition(":")[2])))))
+        again[-1].start()
+
+    with open_session(connect=[at]) as session:
+        yield session, cut
+    for timer in again:
+        timer.join()
+    for relay in relays:
+        relay.__exit__()
+
+
+def test_status_places_and_hold_survive_a_connection_that_breaks_before_the_answer(
+    breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
+) -> None:
+    session, cut = breaking
+    asked: list[str] = []
+
+    def cut_first(query: zenoh.Query) -> None:
+        asked.append(str(query.key_expr))
+        if asked.count(asked[-1]) == 1:
+            cut()
+        if asked[-1] == "bench/status":
+            ready(query)
+        else:
+            query.reply(query.key_expr, b'{"tick": 3}')
+
+    answering("bench/status", cut_first)
+    answering("bench/via_points", cut_first)
+    answering("bench/hold", cut_first)
+    client = Client(session, "bench")
+    assert client.status() == STATUS
+    assert client.hold() == requests.Reply(3)
+    assert client.places() == ()
+    assert client.ask("via_points", {"op": "list"}) == {"tick": 3}
+    assert asked == ["bench/status"] * 2 + ["bench/hold"] * 2 + ["bench/via_points"] * 3
+
+
+def test_an_order_whose_answer_is_lost_may_have_been_carried_out_and_is_not_repeated(
+    breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
+) -> None:
+    session, cut = breaking
+    resumed: list[str] = []
+
+    def cut_first(query: zenoh.Query) -> None:
+        resumed.append("resume")
+        if len(resumed) == 1:
+            cut()
+        query.reply(query.key_expr, b'{"tick": 3}')
+
+    answering("bench/resume", cut_first)
+    client = Client(session, "bench")
+    with pytest.raises(UncertainError, match="The request may have been carried out"):
+        client.resume()
+    assert len(resumed) == 1
+    assert client.resume() == requests.Reply(3)  # it waits for the connection
+    assert len(resumed) == 2
+    cut()
+    until(lambda: not is_connected(session))
+    assert carried_out(client, "resume")[0]
+    assert len(resumed) == 3
+
+
+def test_an_order_to_a_cell_that_nobody_serves_was_not_carried_out(session: zenoh.Session) -> None:
+    with pytest.raises(UnreachableError, match="nowhere/resume") as failed:
+        Client(session, "nowhere").resume()
+    assert not isinstance(failed.value, UncertainError)
+
+
+def test_an_answer_of_a_daemon_once_known_needs_no_further_question(
+    daemon: zenoh.Session, session: zenoh.Session
+) -> None:
+    """Its token may be out of sight at the moment of the answer, which is no less true."""
+    with daemon.declare_queryable("bench/status", lambda query: query.reply(query.key_expr, encoded)):
+        client, encoded = Client(session, "bench", timeout_s=1.0), requests.encode_json(STATUS)
+        with daemon.liveliness().declare_token(channels.presence("bench", str(daemon.zid()))):
+            assert client.wait_until_ready() == STATUS
+        assert client.status() == STATUS
+        with pytest.raises(UnreachableError, match="A Zenoh storage answered"):
+            Client(session, "bench", timeout_s=1.0).status()

@@ -18,13 +18,11 @@ import zenoh
 
 from service.cli.main import main
 from service.client import Client, open_session
-from service.client.session import tried
 from service.contract import cdr, messages
 from service.daemon.launch import Launched, launched
 from support.paths import ROOT
 
 LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
-RECONNECTED_S = 2.0  # a machine that stands still loses its connections, and has them again within this time
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
 
 
@@ -68,7 +66,7 @@ class Daemon:
     def until(self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0) -> dict[str, Any]:
         """The first status of which something is true."""
         end = time.monotonic() + timeout_s
-        while not what(status := tried(lambda: self.client.ask("status"), RECONNECTED_S)):
+        while not what(status := self.client.ask("status")):
             assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
         return status
 
