@@ -24,7 +24,8 @@ from support.cell import Tracker, serving, thirdhand
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
 # What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 0 and 0.
-MOST_WORK, MOST_LATENCY, MOST_LATE, MOST_MISSED = 14.0, 1.4, 0.5, 0.03
+MOST_WORK, MOST_LATENCY, MOST_MISSED = 14.0, 1.4, 0.03
+MOST_LATE = {"p50": 0.02, "p99": 0.5}  # shares of a period; a busy thread exceeds one of them, seldom both
 PLANTED = """
 from service.process import one_blas_thread
 import sys, threading, time
@@ -82,13 +83,14 @@ def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def complaints(report: dict[str, Any]) -> list[str]:
     """What of the loop's time is not as it should be."""
     ratios = report["ratios"]
-    late_us = [report[kind]["lateness_us"]["p99"] for kind in ("empty", "whole")]
     found = {
         "work": (ratios["work_to_fixed_work"], MOST_WORK),
         "latency": (ratios["latency"], MOST_LATENCY),
-        "lateness": (1e-6 * RATE_HZ * (late_us[1] - late_us[0]), MOST_LATE),  # share of a period
         "missed": (ratios["missed_more"], MOST_MISSED),
     }
+    for which, most in MOST_LATE.items():
+        empty, whole = (report[kind]["lateness_us"][which] for kind in ("empty", "whole"))
+        found[f"lateness, {which}"] = 1e-6 * RATE_HZ * (whole - empty), most
     return [f"{name} {value:g}, at most {most:g}" for name, (value, most) in found.items() if value > most]
 
 
