@@ -59,6 +59,7 @@ def test_a_rail_is_in_metres_and_a_missing_shape_has_a_place(tmp_path: Path) -> 
     sliding_cell(tmp_path)
     done = told("arm", str(tmp_path / "arm.urdf"), "--output", str(tmp_path / "first.toml"))
     assert done.returncode == 0, done.stderr
+    assert "no collision shape before rail_joint: a capsule of" in done.stdout
     assert "prismatic joints are in m, m/s, m/s², m/s³" in done.stdout
     assert "rad, m for prismatic joints" in done.stdout
     assert "# [rad/s²; m/s² if prismatic]" in (tmp_path / "first.toml").read_text()
