@@ -9,7 +9,6 @@ import functools
 import hashlib
 import io
 import math
-import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -127,7 +126,7 @@ def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     if scheme not in ("package", "model"):
         return [urdf.parent / rest]
     package, _, inside = rest.partition("/")
-    above, named = Path(os.path.abspath(urdf)).parents, [Path(one).expanduser() for one in packages]
+    above, named = urdf.absolute().parents, [Path(one).expanduser() for one in packages]
     return [
         *(folder / inside for folder in (*above, *named) if folder.name == package),
         *(folder / package / inside for folder in (*above, *named)),

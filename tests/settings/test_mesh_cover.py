@@ -156,13 +156,6 @@ def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Pa
         robot_description(Settings(arm=Settings().arm.__class__(urdf=str(urdf))))
 
 
-def test_folders_above_a_urdf_are_those_of_its_shortest_path(tmp_path: Path) -> None:
-    urdf = tmp_path / "cells" / ".." / "arm.urdf"
-    with pytest.raises(UrdfError) as error:
-        covered(described("package://no_arm/link.stl"), urdf)
-    assert f"in none of {tmp_path}/, {tmp_path.parent}/, " in str(error.value)
-
-
 def test_all_meshes_that_are_not_found_are_named_once(tmp_path: Path) -> None:
     urdf = tmp_path / "arm.urdf"
     lost = '<collision><geometry><mesh filename="package://no_arm/plate.stl"/></geometry></collision>'

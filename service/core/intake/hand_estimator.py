@@ -41,7 +41,6 @@ from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from service.core.vectors import squared_distance
 from service.settings.config import HandSettings
 
-LONGEST_MODEL_S = 1.0  # largest `stale_ms`: over a longer interval both hands are stale, and the model is not used
 STILL = np.ones(2)  # stillness of two hands that rest
 USUAL = HandSettings()  # default settings, for recordings without a cell's settings
 
@@ -92,14 +91,14 @@ class HandEstimator:
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
-        """The motion model over an interval of some ticks, LONGEST_MODEL_S at most, the gains of
-        `smoothing` over all of it, and the speed of a still hand, as one record (1,).
+        """The motion model and the gains of `smoothing` over an interval of some ticks, and the
+        speed of a still hand, as one record (1,). Over minutes the model's covariance would
+        overflow; beyond the intervals of `models` both hands are stale, and it is not used.
         """
         interval_s = ticks * self._period_s
         changed = smoothing(interval_s, self._hands.still_s)
-        return parameters(
-            **model(min(interval_s, LONGEST_MODEL_S)), smoothing=changed, still_speed=float(self._hands.still_speed)
-        )
+        used_s = min(ticks, len(self._models)) * self._period_s
+        return parameters(**model(used_s), smoothing=changed, still_speed=float(self._hands.still_speed))
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
