@@ -72,6 +72,11 @@ class Proposal(NamedTuple):
         """The link that carries the tool."""
         return self.settings.arm.plate
 
+    @property
+    def slides(self) -> bool:
+        """True if a joint of the chain is prismatic."""
+        return "m" in self.settings.joints.units
+
 
 def proposed(
     path: Path,
@@ -188,7 +193,10 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
     settings, arm = proposal.settings, proposal.settings.arm
     offset = settings.tool.plate_from_tool
     is_known = all(math.isfinite(joint.velocity) for joint in proposal.chain if joint.kind != "fixed")
-    velocity = "" if is_known else f"velocity = {list(settings.joints.velocity)}  # [rad/s]\n"
+    rad, rate, acceleration, jerk = (
+        f"[rad{per}; m{per} if prismatic]" if proposal.slides else f"[rad{per}]" for per in ("", "/s", "/s²", "/s³")
+    )
+    velocity = "" if is_known else f"velocity = {list(settings.joints.velocity)}  # {rate}\n"
     tool = f"[tool]  # its +z leaves the plate\nplate_from_tool = {list(offset)}\n\n" if any(offset[3:6]) else ""
     basis = "the URDF's velocities, masses and efforts" if proposal.efforts else "the URDF's velocities"
     packages = f"packages = {json.dumps(list(arm.packages))}\n" if arm.packages else ""
@@ -198,14 +206,14 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"urdf = {json.dumps(urdf, ensure_ascii=False)}{'' if Path(urdf).is_absolute() else '  # beside this file'}\n"
         f"plate = {json.dumps(arm.plate, ensure_ascii=False)}  # the link that carries the tool\n"
         f"{packages}"
-        f"posture = {list(arm.posture)}  # [rad] the tool over the table, pointing down and forward\n"
+        f"posture = {list(arm.posture)}  # {rad} the tool over the table, pointing down and forward\n"
         "\n"
         f"# A guess, from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
         "# Take the values of the maker's data sheet if you have it; begin with a tenth on a real arm.\n"
         "[joints]\n"
         f"{velocity}"
-        f"acceleration = {list(settings.joints.acceleration)}  # [rad/s²]\n"
-        f"jerk = {list(settings.joints.jerk)}  # [rad/s³]\n"
+        f"acceleration = {list(settings.joints.acceleration)}  # {acceleration}\n"
+        f"jerk = {list(settings.joints.jerk)}  # {jerk}\n"
         "\n"
         f"{tool}"
         f"# [reach] follows from the kinematics: {proposal.shell.inner:g} to {proposal.shell.outer:g} m from "

@@ -89,6 +89,7 @@ def text(proposal: Proposal, path: Path) -> str:
                 f"  {joint.name:<28} {joint.kind:<10} {limits.lower[i]:8.2f} {limits.upper[i]:8.2f} "
                 f"{limits.velocity[i]:9.2f} {limits.acceleration[i]:13.2f} {limits.jerk[i]:6.0f}"
             )
+    lines += ["  prismatic joints are in m, m/s, m/s², m/s³"] if proposal.slides else []
     lines.append("  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: from rest to full speed in")
     basis = (
         f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts" if proposal.efforts else "no efforts in the URDF"
@@ -114,15 +115,15 @@ def text(proposal: Proposal, path: Path) -> str:
         ]
     if bare:
         lines.append(
-            f"            joint {', '.join(map(str, bare))} moves no collision shape: a capsule of [arm] link_radius = "
-            f"{settings.arm.link_radius:g} m replaces it"
+            f"            no collision shape {' and '.join(_bare(limits.names, i) for i in bare)}: a capsule of [arm] "
+            f"link_radius = {settings.arm.link_radius:g} m replaces it"
         )
     x, y, z = shell.centre
     posture = ", ".join(f"{value:.3f}" for value in settings.arm.posture)
     lines += [
         f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), where z ≥ "
         f"{settings.reach.min_z:g} m and x ≥ {settings.reach.min_x:g} m",
-        f"  posture   [{posture}] rad",
+        f"  posture   [{posture}] rad{', m for prismatic joints' if proposal.slides else ''}",
         f"            the tool is {math.degrees(proposal.tilt):.0f}° from straight down, the arm "
         f"{100 * proposal.clearance[0]:.0f} cm from {proposal.clearance[1]}, and the nearest limit "
         f"{100 * proposal.margin:.0f} % of half a range away",
@@ -149,6 +150,11 @@ def text(proposal: Proposal, path: Path) -> str:
             "            15 cm; teach tasks of this arm's size (docs/tutorial.md)"
         )
     return "\n".join(lines)
+
+
+def _bare(names: tuple[str, ...], link: int) -> str:
+    """The place of a link in the chain, by the number of joints that move it."""
+    return f"after {names[link - 1]}" if link else f"before {names[0]}"
 
 
 def _length(proposal: Proposal) -> float:

@@ -55,6 +55,8 @@ def bundle(args: argparse.Namespace) -> int:
     recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
     about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
+    if not texts["status.json"].startswith("{"):
+        about += f"no status: {without_keys(texts['status.json']).strip()}\n"
     if not found:
         unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
         about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"

@@ -41,9 +41,12 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     """Write a demonstration in frame `base`.
 
     Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
-    finite.
+    finite, and for stamps that are not integers from 0 on.
     """
-    stamps_ns, left, right, tool = demonstration[:4]
+    stamps_ns, left, right, tool = np.asarray(demonstration.stamps_ns), *demonstration[1:4]
+    if stamps_ns.dtype.kind not in "iu" or np.any(stamps_ns < 0):
+        what = f"{stamps_ns.dtype} from {stamps_ns.min():g} on given"
+        raise ValueError(f"stamps_ns: {what}, integers [ns] from 0 on needed: np.round(1e9 * seconds).astype(np.int64)")
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
     gripper, count = demonstration.gripper, len(stamps_ns)
     given: list[tuple[str, Vector, tuple[int, ...]]]
@@ -60,7 +63,7 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             file.writer.add_metadata("thirdhand", about)
         streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
         for i, (stamp, *rows) in enumerate(
-            zip(np.asarray(stamps_ns).tolist(), *(stream.tolist() for _, stream in streams), strict=True)
+            zip(stamps_ns.tolist(), *(stream.tolist() for _, stream in streams), strict=True)
         ):
             for (name, _), row in zip(streams, rows, strict=True):
                 data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -82,8 +83,11 @@ class Urdf:
         link = tip
         while link != self.root:
             if link not in self._above:
-                last = ", ".join(self.leaves)
-                raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
+                near = difflib.get_close_matches(link, self._above, n=1)
+                meant = f"; did you mean {near[0]}?" if near else ""
+                raise UrdfError(
+                    f"{self.origin}: no link {link!r}; the last ones of the arm are {', '.join(self.leaves)}{meant}"
+                )
             found.append(self._above[link])
             link = found[-1].parent
         return tuple(reversed(found))

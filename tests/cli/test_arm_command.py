@@ -11,6 +11,7 @@ from PIL import Image
 from service.settings.config import Settings, load
 from support.cell import told
 from support.paths import ROOT
+from support.turning import sliding_cell
 
 UR5 = ROOT / "service" / "arms" / "ur5.urdf"
 
@@ -54,6 +55,16 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
         assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20  # something is drawn
 
 
+def test_a_rail_is_in_metres_and_a_missing_shape_has_a_place(tmp_path: Path) -> None:
+    sliding_cell(tmp_path)
+    done = told("arm", str(tmp_path / "arm.urdf"), "--output", str(tmp_path / "first.toml"))
+    assert done.returncode == 0, done.stderr
+    assert "no collision shape before rail_joint: a capsule of" in done.stdout
+    assert "prismatic joints are in m, m/s, m/s², m/s³" in done.stdout
+    assert "rad, m for prismatic joints" in done.stdout
+    assert "# [rad/s²; m/s² if prismatic]" in (tmp_path / "first.toml").read_text()
+
+
 def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     folder, _ = made
     before = {file: file.read_bytes() for file in folder.iterdir()}
@@ -67,6 +78,7 @@ def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     [
         (("nowhere.urdf",), 2, "cannot read nowhere.urdf"),
         ((str(UR5), "--plate", "hand"), 1, "no link 'hand'; the last ones of the arm are tool0"),
+        ((str(UR5), "--plate", "tool"), 1, "the last ones of the arm are tool0; did you mean tool0?"),
         ((str(UR5), "--output", "cell.txt"), 2, "cell.txt: a name that ends in .toml needed"),
         ((str(UR5), "--at", "9", "0", "0"), 2, "9 given, -3 to 3 needed"),
         ((str(UR5), "--at", "-2", "0", "0"), 2, "no posture found with the tool at"),

@@ -123,6 +123,7 @@ def test_without_a_daemon_the_archive_says_so_and_has_the_newest_recording(tmp_p
         os.utime(tmp_path / "recordings" / f"{name}.mcap", (0, 0))
     done = told("bundle", "--output", str(output), "--config", str(config), "--connect", "tcp/127.0.0.1:1")
     assert done.returncode == 0, done.stderr
+    assert "no status: nothing listens at tcp/127.0.0.1:1" in done.stdout
     found = unpacked(output)
     assert "nothing listens" in found["status.json"].decode()
     assert "nothing listens" in found["doctor.txt"].decode()

@@ -82,6 +82,15 @@ def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
     np.testing.assert_allclose(many.state["mode_covariances"], one.state["mode_covariances"], rtol=1e-9, atol=1e-15)
 
 
+def test_a_hand_stands_where_it_was_after_a_pause_of_minutes() -> None:
+    """Over which the covariance of the motion model overflows."""
+    hands = Hands()
+    follow(hands, reach, until_s=1.5)
+    before = hands.state["hands"][LEFT, 0].copy()
+    hands.intake.advance(hands.state, round(300.0 / PERIOD_S))
+    np.testing.assert_array_equal(hands.state["hands"][LEFT], [before, np.zeros(3), np.zeros(3)])
+
+
 def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() -> None:
     hands = Hands()
     random = np.random.default_rng(3)

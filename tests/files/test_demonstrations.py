@@ -148,6 +148,9 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
         read_demonstration(tmp_path / "a.mcap")
     with pytest.raises(ValueError, match=r"hands/right: shape \(4, 7\) given"):
         write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, good[1], good[1][:4], good[1]))
+    for wrong, what in ((stamps * 1e-9, "float64 from 0 on"), (stamps - 1, "int64 from -1 on")):
+        with pytest.raises(ValueError, match=rf"stamps_ns: {what} given, integers \[ns\] from 0 on needed"):
+            write_demonstration(tmp_path / "b.mcap", Demonstration(wrong, *[good[1]] * 3))
 
 
 def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(tmp_path: Path) -> None:

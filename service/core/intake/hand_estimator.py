@@ -92,11 +92,13 @@ class HandEstimator:
 
     def _model_over(self, ticks: int) -> Records:
         """The motion model and the gains of `smoothing` over an interval of some ticks, and the
-        speed of a still hand, as one record (1,).
+        speed of a still hand, as one record (1,). Over minutes the model's covariance would
+        overflow; beyond the intervals of `models` both hands are stale, and it is not used.
         """
         interval_s = ticks * self._period_s
         changed = smoothing(interval_s, self._hands.still_s)
-        return parameters(**model(interval_s), smoothing=changed, still_speed=float(self._hands.still_speed))
+        used_s = min(ticks, len(self._models)) * self._period_s
+        return parameters(**model(used_s), smoothing=changed, still_speed=float(self._hands.still_speed))
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
