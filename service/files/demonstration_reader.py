@@ -45,8 +45,11 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
     """
     stamps_ns, left, right, tool = np.asarray(demonstration.stamps_ns), *demonstration[1:4]
     if stamps_ns.dtype.kind not in "iu" or np.any(stamps_ns < 0):
-        what = f"{stamps_ns.dtype} from {stamps_ns.min():g} on given"
-        raise ValueError(f"stamps_ns: {what}, integers [ns] from 0 on needed: np.round(1e9 * seconds).astype(np.int64)")
+        lowest = f" from {stamps_ns.min():g} on" if stamps_ns.size else ""
+        raise ValueError(
+            f"stamps_ns: {stamps_ns.dtype}{lowest} given, integers [ns] from 0 on needed: "
+            "np.round(1e9 * seconds).astype(np.int64)"
+        )
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
     gripper, count = demonstration.gripper, len(stamps_ns)
     given: list[tuple[str, Vector, tuple[int, ...]]]
