@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
 import errno
 import os
 import re
@@ -19,7 +18,7 @@ import zenoh
 
 from service.client import ClientSettings, UnreachableError, client_settings, open_session
 from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
-from service.contract.explain import in_file, in_words
+from service.contract.explain import did_you_mean, in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
 from service.process.parallel import CLUSTERS
 from service.settings.config import RATES_HZ
@@ -56,8 +55,7 @@ class Parser(argparse.ArgumentParser):
         """Print usage and message, and exit with code 2."""
         found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         words = re.findall(r"[\w-]+", found[2]) if found else []
-        near = difflib.get_close_matches(found[1], words, n=1, cutoff=0.5) if found else []
-        super().error(message + (f"; did you mean {near[0]}?" if near else ""))
+        super().error(message + (did_you_mean(found[1], words, cutoff=0.5) if found else ""))
 
 
 def within(kind: type[float], low: float, high: float, unit: str = "") -> Callable[[str], float]:

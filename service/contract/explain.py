@@ -6,6 +6,7 @@ import copy
 import difflib
 import errno
 import re
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import msgspec
@@ -138,9 +139,8 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
         known = _known(node)
-        near = difflib.get_close_matches(unknown[1], known, n=1)
         problem = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(known) or 'none'}"
-        return problem + (f"; did you mean {near[0]}?" if near else "")
+        return problem + did_you_mean(unknown[1], known)
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
     if (
@@ -153,6 +153,14 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
             return f"{path}: {len(value) or 'none'} {counted}, {needed}"
         return f"{path}: {_short(value)} given; {needed}"
     return f"{path}: {message[:MAX_MESSAGE]}"
+
+
+def did_you_mean(given: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """The end of a message that names the most similar known word; empty if no word is similar
+    enough, 0 to 1.
+    """
+    near = difflib.get_close_matches(given, list(known), n=1, cutoff=cutoff)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _with_name(path: str, given: Any, kind: Any) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, did_you_mean
 from service.contract.messages import Quaternion, Transform, Vector3
 from service.settings.link_tree import root_of
 from service.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three
@@ -83,11 +82,8 @@ class Urdf:
         link = tip
         while link != self.root:
             if link not in self._above:
-                near = difflib.get_close_matches(link, self._above, n=1)
-                meant = f"; did you mean {near[0]}?" if near else ""
-                raise UrdfError(
-                    f"{self.origin}: no link {link!r}; the last ones of the arm are {', '.join(self.leaves)}{meant}"
-                )
+                last = ", ".join(self.leaves) + did_you_mean(link, self._above)
+                raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
             found.append(self._above[link])
             link = found[-1].parent
         return tuple(reversed(found))

@@ -365,10 +365,8 @@ def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[
     """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
     fitted to each recording; medians over recordings.
     """
-    skill, mine = (
-        _known[SHIPPED][0],
-        {one.name: one for one in found if one.follower == "ours" and one.group == hands[0].group},
-    )
+    skill = _known[SHIPPED][0]
+    mine = {one.name: one for one in found if one.follower == "ours" and one.group == hands[0].group}
     errors: dict[str, list[tuple[float, float]]] = {}
     for one in hands:
         floors = best_linear([one], skill, rate_hz=round(1 / float(np.median(np.diff(one.stamps)))))
