@@ -12,7 +12,7 @@ LEAST_SLOPE = 1e-10  # a constraint with a smaller slope in the free directions 
 TICK_ROUNDING = 1e-6  # [ticks] rounding of a duration, as sums of periods are not exact
 PROBABILITY_ROUND_TO = 1e12  # probabilities are rounded, so that a replay on another kind of CPU agrees
 GAIN_DECIMALS = 6  # gains are rounded, so that a replay on another kind of CPU agrees
-SLOWEST_PER_S = 0.2  # [1/s] the tracker's Riccati equation is not solved reliably for a lower rate
+SLOWEST_PER_S = 0.2  # [1/s] lowest rate of the setpoint's tracker
 
 LEAST_PULL_VARIANCE_SHARE = 1e-6  # added variance, so that exact via-points remain solvable
 # Steps that are fine enough: half and twice of them change nothing that is measured.
@@ -30,6 +30,7 @@ MAX_ERROR_M = 10.0  # [m, m/s] errors and velocities of the tool
 MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow as integers
 
 # Iterations.
+SERIES_TERMS = 18  # of an exponential series of at most 1/2: the next one is below 2^-19 / 19! = 1.6e-23
 BOUND_ROUNDS = 12  # largest number of rounds in which a joint is held at its bound or released
 CONSTRAINT_ROUNDS = 40  # largest number of rounds in which an inequality is added or removed
 BELIEF_PERIODS = 20  # number of updates after which the belief of hands at rest has converged

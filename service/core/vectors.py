@@ -1,10 +1,12 @@
 """Compiled arithmetic on vectors (3,). Each sum starts from 0 and adds the axes in order, which
-fixes its last bit.
+fixes its last bit, which that of BLAS is not: it differs between processors.
 """
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Vector
@@ -29,6 +31,16 @@ def square(a: Vector) -> float:
 def norm(a: Vector) -> float:
     """Euclidean norm |a|."""
     return math.sqrt(dot(a, a))
+
+
+@compiled
+def times(matrix: Vector, vector: Vector) -> Vector:
+    """Product (N,) of a matrix (N, M) and a vector (M,)."""
+    product = np.zeros(len(matrix))
+    for row in range(len(matrix)):
+        for column in range(len(vector)):
+            product[row] += matrix[row, column] * vector[column]
+    return product
 
 
 @compiled

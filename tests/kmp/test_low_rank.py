@@ -247,10 +247,14 @@ def correlated(seed, count, outputs, spread):
 def test_correlations_of_any_outputs_count_with_any_kernel(one, outputs, spread):
     t, reference = correlated(outputs, 150, outputs, spread)
     dense, low = of_both(t, reference, kernel=one, lambda_mean=10.0)
+    backward = Gaussians(reference.mean[::-1], reference.covariance[::-1])
+    again, _ = of_both(t[::-1], backward, kernel=one, lambda_mean=10.0)
     via = t[50:51] + 0.004, Gaussians(reference.mean[50:51] + 0.01, reference.covariance[70:71])
-    for a, b in ((dense, low), (dense.adapt(*via, tolerance=0.02), low.adapt(*via, tolerance=0.02))):
-        error = np.linalg.norm(b.mean(dense.inputs) - a.mean(dense.inputs), axis=1).max()
-        assert error < 1e-5
+    for a, b, c in ((dense, low, again), (each.adapt(*via, tolerance=0.02) for each in (dense, low, again))):
+        error = np.linalg.norm(b.mean(t) - a.mean(t), axis=1).max()
+        # The same points in another order differ by what rounding does to the dense solution.
+        rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
+        assert error < max(1e-5, 2.0 * rounding)
         assert error <= b.error_bound_at_points
         scale = np.abs(a.predict(t).covariance).max()
         np.testing.assert_allclose(b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale)

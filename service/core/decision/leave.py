@@ -10,6 +10,7 @@ from service.contract import cdr
 from service.core.codes import HELD
 from service.core.decision.tuning import WAY_NEAR_RAD, WAY_SLOW_RAD, WAY_START_RAD
 from service.core.frame import Event, Record, Vector
+from service.core.vectors import norm, times
 from service.settings.config import PRISMATIC_M, Settings
 
 
@@ -60,4 +61,4 @@ class WayOut:
         far = float((np.abs(off) / self._per_rad).max())
         velocity: Vector = off * (self._radps * min(1.0, far / WAY_SLOW_RAD) / max(far, WAY_NEAR_RAD))
         state["way_next"] += far < WAY_NEAR_RAD
-        return velocity / max(1.0, float(np.linalg.norm(tasks[:3] @ velocity)) / self._mps)
+        return velocity / max(1.0, norm(times(tasks[:3], velocity)) / self._mps)

@@ -21,9 +21,9 @@ a motion would be reported although the next sample may only be late.
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
-from scipy.linalg import expm
 
 from service.core.frame import Records, Vector, structured
 from service.core.intake import MODES, TREMOR_RATES
@@ -35,6 +35,7 @@ from service.core.intake.tuning import (
     TREMOR_RATES_PER_S,
     VELOCITY_KEPT_S,
 )
+from service.core.numerics import SERIES_TERMS
 
 REST, REACH, CHANGE = range(MODES)  # a hand rests, reaches, or changes its motion
 STEADY = MODES  # motion of the bank of tremor filters: REACH that does not end
@@ -61,7 +62,7 @@ def models(period_s: float, count: int) -> Records:
     for mode in (REACH, CHANGE):
         fades = MODE_ACCELERATION_REVERSIONS_PER_S[mode]
         ending = _over(_motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], fades), times_s - kept_on_s)[0]
-        out["onward"][:, mode] = ending @ _over(_motion(0.0, fades), kept_on_s)[0]
+        out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), kept_on_s)[0])
     out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
@@ -112,11 +113,31 @@ def _over(dynamics: Vector, interval_s: Vector) -> tuple[Vector, Vector]:
     n = len(dynamics)
     whole = np.zeros((2 * n, 2 * n))
     whole[:n, :n], whole[n - 1, 2 * n - 1], whole[n:, n:] = -dynamics, 1.0, dynamics.T
-    grown = expm(whole * interval_s[..., None, None])
+    grown = _exponential(whole * interval_s[..., None, None])
     transition = np.swapaxes(grown[..., n:, n:], -1, -2)
-    return _to_digits(transition), _to_digits(transition @ grown[..., :n, n:])
+    return np.ascontiguousarray(transition), _product(transition, grown[..., :n, n:])
 
 
-def _to_digits(values: Vector) -> Vector:
-    """Round to 12 significant digits, because the last ones of LAPACK differ between CPUs."""
-    return np.array([float(f"{value:.11e}") for value in values.ravel().tolist()]).reshape(values.shape)
+def _exponential(matrices: Vector) -> Vector:
+    """Matrix exponentials (..., N, N) by squaring, with the same bits on every processor.
+
+    exp(M) = (sum of (M / 2^s)^k / k!, k = 0 ... SERIES_TERMS)^(2^s),   |M| / 2^s < 1/2
+    """
+    largest = float(np.abs(matrices).sum(axis=-1).max(initial=0.0))
+    squarings = max(0, math.frexp(2.0 * largest)[1])
+    scaled = matrices * 0.5**squarings
+    identity = np.eye(matrices.shape[-1])
+    power = np.broadcast_to(identity, matrices.shape)
+    for term in range(SERIES_TERMS, 0, -1):
+        power = identity + _product(scaled, power) / term
+    for _ in range(squarings):
+        power = _product(power, power)
+    return power
+
+
+def _product(left: Vector, right: Vector) -> Vector:
+    """Products (..., N, N) of matrices, whose sums are in order: those of BLAS are not."""
+    product: Vector = left[..., :, :1] * right[..., :1, :]
+    for k in range(1, left.shape[-1]):
+        product = product + left[..., :, k, None] * right[..., None, k, :]
+    return product

@@ -31,6 +31,7 @@ from service.core.separation.tuning import (
     PLANNED_MARGIN_M,
     PLANNED_REACTION_S,
 )
+from service.core.vectors import times
 from service.settings.config import Settings
 
 CONTACT = np.dtype([("hands", np.float64, (2, 3)), ("radius", np.float64), ("side", np.int64)])
@@ -161,5 +162,5 @@ class Separation:
         excess, k = excess_of(self.constraints, self.count, velocity, acceleration, self._jerk)
         row = self.constraints["row"][k]
         change = self._weights * row
-        slower: Vector = velocity - excess / (row @ change) * change
+        slower: Vector = velocity - excess / times(row[None], change)[0] * change
         return slower

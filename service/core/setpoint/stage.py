@@ -38,6 +38,7 @@ from service.core.setpoint.tracker import gains_for, waiting
 from service.core.setpoint.tuning import ENGAGED_GAP_M, GAP_STOPPED_M, GAP_WAITING_M, HULL_TIME_S
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER, decided
+from service.core.vectors import times
 from service.settings.config import Settings
 
 
@@ -98,7 +99,8 @@ class SetpointGenerator:
         return int(lead(as_array(state), *motion, self.limits(state), box, costs, slow))
 
     def stretched(self, box: Vector, setpoint: Vector) -> Vector:
-        """Workspace (2, 3) [m], extended so that a setpoint (3, 3) can stop inside of it.
+        """Workspace (2, 3) [m], extended so that a setpoint (3, 3) can stop inside of it. Read-only
+        as the workspace of a skill is, for which the step is compiled.
 
         A setpoint outside of its workspace that waits for its tool then need not return.
         """
@@ -106,7 +108,9 @@ class SetpointGenerator:
         ends = np.array(
             [[-farthest(setpoint, i, -1.0, *limits, 0.0), farthest(setpoint, i, 1.0, *limits, 0.0)] for i in range(3)]
         )
-        return np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
+        stretched = np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
+        stretched.setflags(write=False)
+        return stretched
 
     def name_of_broken_bound(self, state: Record, before: Vector, box: Vector) -> str:
         """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
@@ -126,9 +130,9 @@ class SetpointStage:
     def begin(self, state: Record, frame: Record, here: Kinematics, *, engages: bool = True) -> None:
         """Start the setpoints where the commanded joints place the tool, at the tool's velocity."""
         velocities = state["joints"][1]
-        moving = np.stack([here.position, here.tasks[:3] @ velocities, np.zeros(3)])
+        moving = np.stack([here.position, times(here.tasks[:3], velocities), np.zeros(3)])
         self._position.begin(state, moving, engages=engages)
-        self._orientation.begin(state, here.rotation, here.jacobian[3:] @ velocities)
+        self._orientation.begin(state, here.rotation, times(here.jacobian[3:], velocities))
         write(as_array(state), as_array(frame))
 
     def step(self, state: Record, frame: Record, wanted: Wanted, here: Kinematics, box: Vector, share: float) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from service.core.frame import Vector
 from service.core.intake.motion_model import REACH
@@ -14,6 +13,7 @@ from service.core.joint_limits import acceleration_rate
 from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
 from service.core.setpoint.tuning import GAP_STOPPED_M, GAP_WAITING_M, STIFFEST_PER_M, TRACKER_RATE_SHARE
 from service.core.skill.model import Target
+from service.core.vectors import dot, norm
 from service.settings.config import Settings
 
 
@@ -40,29 +40,31 @@ def gains_for(settings: Settings) -> Vector:
 def tracker_gains(jerk_weight: float) -> Vector:
     """Gains k (5,) of the linear-quadratic tracker, rounded to GAIN_DECIMALS.
 
-    On each axis, with x the setpoint, r the target, and z = (r - x, r', r'', x', x''):
+    On each axis, with x the setpoint, p the target, and z = (p - x, p', p'', x', x''):
 
-        jerk = k · z    minimises    integral of (r - x)² + jerk_weight jerk² dt
+        jerk = k · z    minimises    integral of (p - x)² + jerk_weight jerk² dt
 
-    jerk_weight is in s⁶. The target is assumed to move as a hand that reaches, r''' = -k_v r' - k_a
-    r'' with the reversions of `motion_model`. The gains solve the continuous algebraic Riccati
-    equation, whose dynamics are shifted by -1e-6 /s: the target's motion is not controllable.
+    jerk_weight is in s⁶. The target is assumed to move as a hand that reaches, p''' = -k_v p' - k_a
+    p'' with the reversions of `motion_model`. With the rate r = jerk_weight^(-1/6) [1/s] and
+    F = [[0, 1], [-k_v, -k_a]] for the motion of the target:
+
+        gains on (p - x, x', x'')  =  r³, -2 r², -2 r
+        gains on (p', p'')         =  r³ [1 0] (F² - 2 r F + 2 r²) (r³ - 2 r² F + 2 r F² - F³)^-1
+
+    The second line solves the Sylvester equation that couples the target to the setpoint in the
+    algebraic Riccati equation. By F² = -k_a F - k_v its inverted factor is m_0 + m_1 F.
     """
-    a = np.zeros((5, 5))  # dz/dt = a z + b jerk
-    a[0, 1], a[0, 3], a[1, 2], a[2, 1], a[2, 2], a[3, 4] = (
-        1.0,
-        -1.0,
-        1.0,
-        -MODE_VELOCITY_REVERSIONS_PER_S2[REACH],
-        -MODE_ACCELERATION_REVERSIONS_PER_S[REACH],
-        1.0,
-    )
-    b = np.zeros((5, 1))
-    b[4, 0] = 1.0
-    cost = np.zeros((5, 5))
-    cost[0, 0] = 1.0
-    riccati = solve_continuous_are(a - 1e-6 * np.eye(5), b, cost, np.array([[jerk_weight]]))
-    return np.ascontiguousarray(np.round(-(b.T @ riccati / jerk_weight)[0], GAIN_DECIMALS))
+    rate = jerk_weight ** (-1.0 / 6.0)
+    k_v = MODE_VELOCITY_REVERSIONS_PER_S2[REACH]
+    k_a = MODE_ACCELERATION_REVERSIONS_PER_S[REACH]
+    m_0 = rate**3 - 2.0 * rate * k_v - k_a * k_v
+    m_1 = k_v - 2.0 * rate**2 - 2.0 * rate * k_a - k_a**2
+    determinant = m_0 * (m_0 - k_a * m_1) + k_v * m_1**2
+    row = 2.0 * rate**2 - k_v, -2.0 * rate - k_a  # [1 0] (F² - 2 r F + 2 r²)
+    on_velocity = (row[0] * (m_0 - k_a * m_1) + row[1] * k_v * m_1) / determinant
+    on_acceleration = (row[1] * m_0 - row[0] * m_1) / determinant
+    gains = rate**3, rate**3 * on_velocity, rate**3 * on_acceleration, -2.0 * rate**2, -2.0 * rate
+    return np.round(gains, GAIN_DECIMALS)
 
 
 def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
@@ -74,8 +76,8 @@ def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
     A target in whose direction the setpoint would approach its tool is returned unchanged.
     """
     ahead, to_target = setpoint[0] - tool, target.position - setpoint[0]
-    gap = float(np.linalg.norm(ahead))
-    if ahead @ to_target <= 0.0:
+    gap = norm(ahead)
+    if dot(ahead, to_target) <= 0.0:
         return target
     share = min(max((GAP_STOPPED_M - gap) / (GAP_STOPPED_M - GAP_WAITING_M), 0.0), 1.0)
     still = np.zeros(3)

@@ -118,7 +118,8 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
     """
     for _ in range(20 if len(normals) > 1 else 1):
         for normal in normals:
-            vector = vector - max(float(vector @ normal), 0.0) * normal
+            along = vector * normal
+            vector = vector - max(float(along[0] + along[1] + along[2]), 0.0) * normal
     return vector
 
 
