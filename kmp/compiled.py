@@ -12,6 +12,8 @@ from typing import Any, TypeVar, cast
 try:
     from numba import config, njit
     from numba.core import event
+
+    from kmp.compiled_cache import CompiledCache
 except ImportError:
     njit = None
 
@@ -31,10 +33,10 @@ def compiled(function: F) -> F:
     """
     if njit is None:
         return function
-    try:
-        return cast(F, njit(cache=True)(function))
-    except RuntimeError:
-        return cast(F, njit(function))
+    dispatcher = njit(function)
+    if not PLAIN and (cache := CompiledCache.of(function)) is not None:
+        dispatcher._cache = cache  # noqa: SLF001  # Numba's own cache misses changes of what a function calls
+    return cast(F, dispatcher)
 
 
 if njit is not None:

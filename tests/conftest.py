@@ -6,6 +6,8 @@ from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,52 +15,114 @@ import pytest
 from service.core.skill.skill import Skill
 from service.files.replay import replay
 from service.learning.skill_file import decoded
+from service.process.child import python
 from service.viewer import vulkan
-from support import compiling, tiers
+from support import busy, forked, tiers
 from support.paths import RECORDINGS, ROOT
 
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of a thousand processes would compile what it imports
+sys.dont_write_bytecode = False
 
-
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Where only what is timed is asked for, what holds none of it is not imported."""
-    only_timed = config.option.markexpr.startswith("timed") and collection_path.suffix == ".py"
-    return True if only_timed and "mark.timed" not in collection_path.read_text(encoding="utf-8") else None
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what is quick and what is research, and puts first what needs nothing compiled, then
-    the files that take longest.
-    """
-    for item in items:
-        for marker in tiers.markers(_where(item), timed=item.get_closest_marker("timed") is not None):
-            item.add_marker(marker)
-    items.sort(key=lambda item: tiers.begins(_where(item)))
-
-
-def _where(item: pytest.Item) -> str:
-    """The test as `tiers` names it."""
-    return str(item.path.relative_to(ROOT / "tests")) + "::" + item.nodeid.split("::", 1)[-1]
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Wait until the functions that the test calls are compiled."""
-    if not tiers.is_among(_where(item), tiers.UNCOMPILED):
-        compiling.wait(six="ur5" in item.nodeid)
+PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begins to compile in a checkout fresh to this Python, once for all workers.
+    """Begin to compile what the tests call, beside their collection; cached functions take 2 s.
 
     Files are begun in the order of the tests, not the one with the most tests first.
     """
     config.option.loadscopereorder = False
-    if not hasattr(config, "workerinput") and compiling.is_needed():
-        process = compiling.begun()
-        config.add_cleanup(lambda: compiling.end(process))
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Instantly(config), "instantly")
+        command, environment = python("-m", "service", "prepare", "--config", "wam", "ur5")
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+        config.stash[PREPARING] = process
+        config.add_cleanup(process.kill)
+    config.add_cleanup(forked.close)
+
+
+class _Instantly:
+    """Prints a failure when it happens, so that a run that is cut tells what failed."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Print a failure with what the test printed and logged."""
+        terminal = self._config.pluginmanager.get_plugin("terminalreporter")
+        if terminal is not None and report.failed:
+            terminal.ensure_newline()
+            terminal.section(f"{report.nodeid} failed in {report.when}", sep="_")
+            terminal._outrep_summary(report)  # noqa: SLF001  # as at the end of the run
+        elif terminal is not None and (words := busy.note(report)) and report.when == "call":
+            terminal.ensure_newline()
+            terminal.write_line(f"{report.nodeid} failed: {words}")
+
+    def pytest_sessionfinish(self) -> None:
+        """Leave failures out of the end, where only their names are wanted."""
+        self._config.option.tbstyle = "no"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> None:
+    """Begin no test before everything is compiled; workers wait for the process that they serve."""
+    preparing = session.config.stash.get(PREPARING, None)
+    if preparing is not None and preparing.wait() != 0:
+        pytest.exit("`thirdhand prepare` failed; its output is above", returncode=1)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only what is timed, or only what is quick, is asked for, no other file is imported."""
+    wanted = config.option.markexpr
+    if collection_path.suffix != ".py" or wanted not in {"timed", "quick"}:
+        return None
+    is_wanted = f"mark.{wanted}" in collection_path.read_text(encoding="utf-8")
+    return None if is_wanted or (wanted == "quick" and tiers.is_quick_file(collection_path)) else True
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is quick and what is thorough, and put first the files that take longest."""
+    begun: set[str] = set()
+    for item in items:
+        test = item.nodeid.partition("[")[0]
+        if item.get_closest_marker("one_case") and test in begun:
+            item.add_marker("thorough")
+        begun.add(test)
+        has_tier = any(item.get_closest_marker(tier) for tier in ("thorough", "timed"))
+        if not has_tier and tiers.is_quick_file(item.path):
+            item.add_marker("quick")
+    items.sort(key=lambda item: tiers.order(_file(item)))
+
+
+def _file(item: pytest.Item) -> str:
+    """The file of a test, below the folder of the tests."""
+    return str(item.path.relative_to(ROOT / "tests"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Fork the commands of a test, unless it is about their start or their timing."""
+    forked.use(_file(item) not in tiers.REAL_STARTS)
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
+    """Run a test, twice if it fails while the machine is busy."""
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for report in busy.run(item, nextitem):
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
+    """Count what passed when the machine was less busy apart from what passed at once."""
+    if report.when == "call" and report.passed and busy.note(report):
+        return busy.BUSY, "B", "BUSY"
+    return None
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ import pytest
 
 from support.paths import ROOT
 
-PARTS = ("the README's tests", "research", "a newer Python")
+PARTS = ("the README's tests", "thorough", "timed", "a newer Python")
 
 
 def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
@@ -38,8 +38,9 @@ def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
     [
         ("true", "exit 0", ()),
         ("echo wrong; exit 3", "exit 0", PARTS[:1]),
-        ("true", 'case "$*" in *"-m research"*) exit 1;; esac', PARTS[1:2]),
-        ("true", 'case "$*" in demo*) exit 1;; esac', PARTS[2:]),
+        ("true", 'case "$*" in *"-m thorough and"*) exit 1;; esac', PARTS[1:2]),
+        ("true", 'case "$*" in *"-m timed"*) exit 1;; esac', PARTS[2:3]),
+        ("true", 'case "$*" in demo*) exit 1;; esac', PARTS[3:]),
         ("false", "exit 1", PARTS),
     ],
 )

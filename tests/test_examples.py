@@ -29,6 +29,7 @@ def example(name: str) -> ModuleType:
     return module
 
 
+@pytest.mark.thorough
 def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Once more with twice the time where a busy machine did not let them."""
     said, ended = "", dict[str, Any]()

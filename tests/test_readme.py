@@ -63,7 +63,10 @@ def test_the_environment_is_activated_before_the_first_bare_command() -> None:
 
 
 def test_the_two_commands_have_the_form_that_programs_look_for() -> None:
-    for name, last in (("run", ".venv/bin/thirdhand demo"), ("test", "-m 'timed and not research'")):
+    for name, last in (
+        ("run", ".venv/bin/thirdhand demo"),
+        ("test", ".venv/bin/python -m pytest tests/test_latency.py"),
+    ):
         (command,) = re.findall(rf"^<!-- {name} -->\n```sh\n(.*)\n```$", README, re.MULTILINE)
         assert command.startswith("python3.11 -m venv .venv && ")
         assert command.endswith(last)

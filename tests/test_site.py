@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import jinja2
+import matplotlib
 import numpy as np
 import pytest
 
@@ -99,6 +100,7 @@ def test_the_index_and_the_navigation_have_every_page() -> None:
 def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawing = program(f"{name}_picture")
     monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")
+    matplotlib.rcdefaults()  # experiments, which this process may have run before, have a style of their own
     drawing.main()
     assert (tmp_path / "drawn.png").stat().st_size > 20_000
 

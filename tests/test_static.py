@@ -13,8 +13,8 @@ from support.paths import ROOT
 @pytest.mark.parametrize(
     "command",
     [
-        ["ruff", "check", "."],
-        ["ruff", "format", "--check", "."],
+        pytest.param(["ruff", "check", "."], marks=pytest.mark.quick),
+        pytest.param(["ruff", "format", "--check", "."], marks=pytest.mark.quick),
         ["mypy"],
     ],
     ids=["lint", "format", "types"],

@@ -27,6 +27,7 @@ from service.contract.incidents import Condition, what_to_do
 from service.contract.messages import WireError
 from service.contract.printable import printable_lines
 from service.contract.ros2 import NO_TYPE_HASH
+from service.process import bytecode
 
 PROBE_S = 1.0
 MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
@@ -92,6 +93,8 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
         travels=travel.of_joints(),
         lag_ms=travel.lag_ms(),
     )
+    if uncompiled := bytecode.missing():
+        yield Finding("note", "bytecode", uncompiled)
 
 
 class Travel:

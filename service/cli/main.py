@@ -375,9 +375,9 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
 
-    about = "Compiles, once on a machine, what a daemon needs, so that `serve` starts at once."
-    c = command("prepare", about, "thirdhand prepare --config cell.toml")
-    option(c, "--config", "CELL", f"the cell, as its arm's number of joints matters: {ARM_HELP}")
+    about = "Compiles, once on a machine, what daemons need, so that `serve` starts at once."
+    c = command("prepare", about, "thirdhand prepare --config /etc/thirdhand/*.toml")
+    option(c, "--config", "CELL", f"the cells, as their arms' numbers of joints matter: {ARM_HELP}", nargs="+")
     option(c, "--skill", "FILE", "the skill of the cell (default: the shipped soldering skill)", type=Path)
 
     c = command(

@@ -1,23 +1,38 @@
-"""`thirdhand prepare`: compilation of what a daemon needs, before its first start."""
+"""`thirdhand prepare`: compilation of what daemons need, before their first start."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process.progress import progress
-from service.settings.config import robot_description
+from service.settings.config import Settings
 
 
 def prepare(args: argparse.Namespace) -> int:
-    """Compile and cache the functions of a cell's loop; exit code 0. Raises SkillError."""
-    begun_s, settings = time.monotonic(), cell_of(str(args.config or "wam"))
-    with progress("compiling, for some minutes on a new machine", unit="skills"):
-        from service.core.warm_up import warm_up  # slow imports
-        from service.daemon.daemon import load_skill
-
-        path = args.skill or skills_folder(settings) / SHIPPED_SKILL
-        warm_up(settings, load_skill(path, settings).for_loop(), urdf=robot_description(settings))
-    print(f"compiled for an arm with {len(settings.joints.names)} joints in {time.monotonic() - begun_s:.0f} s")
+    """Compile and cache the functions of the loops of cells, once for each number of joints; exit
+    code 0. Raises SkillError.
+    """
+    cells = {len(cell.joints.names): cell for cell in map(cell_of, args.config or ["wam"])}
+    for _, settings in sorted(cells.items()):
+        print(compiled_for(settings, args.skill or skills_folder(settings) / SHIPPED_SKILL), flush=True)
     return 0
+
+
+def compiled_for(settings: Settings, skill: Path) -> str:
+    """Compile for a cell with the skill in a file; what was done, in words. Raises SkillError."""
+    begun_s, joints = time.monotonic(), len(settings.joints.names)
+    compiled: set[str] = set()
+    with progress(f"compiling for an arm with {joints} joints, a minute or more", unit="functions") as show:
+        from service.daemon.compilation import compile_loop  # slow imports
+        from service.daemon.skill_worker import skill_of
+
+        def report(function: str, is_ready: bool) -> None:
+            compiled.update([function] * is_ready)
+            show(len(compiled))
+
+        skill_of(skill)  # raises what is wrong with it
+        compile_loop(settings, skill, report)
+    return f"{joints} joints: {len(compiled)} functions compiled in {time.monotonic() - begun_s:.0f} s"

@@ -8,19 +8,19 @@ import logging
 import os
 import sys
 import tempfile
-import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import msgspec
 
 from service.cli.usage import UsageError, end_with
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
-from service.daemon.start import AGAIN, CompilerInMemoryError, ahead_of_others, starting
+from service.daemon.start import starting
 from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
 from service.process import child
+from service.process.priority import ahead_of_others
 from service.settings.config import Settings, converted
 from service.settings.file_content import SettingsError, UnreadableError
 
@@ -38,9 +38,6 @@ def serve(args: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
         return _run(args)
-    except CompilerInMemoryError:
-        log.info("everything is compiled; the daemon starts again, without the memory that this took")
-        _start_again()
     except Exception as error:
         if args.log != "json":
             raise
@@ -62,7 +59,7 @@ def _run(args: argparse.Namespace) -> int:
     if folder is not None or args.live is not None:
         child.preload("service.scribe.process")  # in parallel to the imports of this process
     with starting(settings) as start:
-        gc.disable()  # a start leaves no garbage unless it compiles, and collections would take a tenth of its time
+        gc.disable()  # a start leaves no garbage, and collections would take a tenth of its time
         with ahead_of_others():
             from service.daemon import daemon  # a slow import, during which `start` answers requests
             from service.scribe.scribe import Scribe
@@ -82,14 +79,6 @@ def _run(args: argparse.Namespace) -> int:
         missing = daemon.serve(settings, skill, skills=skills_folder(settings), **more)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
-
-
-def _start_again() -> NoReturn:
-    """Replace this process by one that was started in the same way."""
-    child.end_server()
-    logging.shutdown()
-    os.environ[AGAIN] = str(time.monotonic())
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def settings_of(args: argparse.Namespace) -> Settings:

@@ -18,6 +18,7 @@ from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
 from service.daemon.single_instance import holder_of, state_folder
+from service.process import bytecode
 from service.scribe.paths import MB, existing_folder
 from service.settings.config import Files, Settings, robot_description, urdf_path
 from service.settings.network import Network, is_local
@@ -54,7 +55,10 @@ def check(args: argparse.Namespace) -> int:
         *(("port", _endpoint, endpoint, settings) for endpoint in (*network.listen, *live)),
         *(("router", _endpoint, endpoint, None) for endpoint in network.connect),
     ]
-    return 1 if [one for one in conditions if not is_met(*one)] else 0
+    is_wrong = bool([one for one in conditions if not is_met(*one)])
+    if uncompiled := bytecode.missing():
+        print(f"note   {'bytecode':<14} {printable(uncompiled)}", flush=True)
+    return int(is_wrong)
 
 
 def _arm(settings: Settings) -> str:

@@ -14,19 +14,24 @@ from service.contract.messages import JointState, PoseStamped
 from service.contract.records import SIDES
 from service.core.arm.stage import Arm
 from service.core.controller import Controller
-from service.core.frame import Event, Tick, Vector, as_array, order
+from service.core.frame import Event, Tick, Vector, as_array, blank, frame_layout, order, state_layout
 from service.core.intake.arm_samples import still_ticks
 from service.core.intake.hand_estimator import STILL
-from service.core.limiter.stage import Limiter
+from service.core.intake.stage import Intake
+from service.core.limiter.stage import Limiter, LimiterStage
 from service.core.separation.stage import Separation
+from service.core.setpoint.stage import SetpointStage
+from service.core.setpoint.tracker import waiting
 from service.core.skill import ORDER, TURNS
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import delayed, moving_features, turning
+from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
 from service.core.skill.stages import MOST_STAGES
 from service.core.skill.support import error_table, local_scatter
 from service.core.skill.unseen import deviation_m
+from service.core.vectors import norm, times
 from service.settings.config import Settings
 
 FLAT: dict[str, Any] = {"kernel": GaussianKernel(1.0), "lambda_mean": 1.0}
@@ -42,34 +47,63 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     later may contain an orientation and a gripper, and may be of another kind. The rehearsal
     therefore runs with and without them, and predicts with a skill without via-points too.
     """
-    arm = msgspec.structs.replace(settings.arm, source="state")
     plain = replace(skill, threshold=math.inf)
-    skill = replace(
-        plain,
-        turn=skill.turn or LearnedOrientation(_flat(skill, 3), skill.orientation),
-        gripper=skill.gripper or LearnedGripper(_flat(skill, 1)),
-    )
-    for one in (plain, skill):
-        one.predict(*np.zeros((3, 2, 3)))
+    turn = skill.turn or LearnedOrientation(_flat(skill, 3), skill.orientation)
+    gripper = skill.gripper or LearnedGripper(_flat(skill, 1))
+    extended = replace(plain, turn=turn, gripper=gripper)
+    for variant in (plain, extended):
+        variant.predict(*np.zeros((3, 2, 3)))
     plain.model.elsewhere(np.zeros((3, 6)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
     other = replace(plain, model=HandsKMP(KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)))
     other.predict(*np.zeros((3, 2, 3)))
     other.model.mean(np.zeros((1, 6)))
-    _rarely(settings, urdf)
-    _follow(msgspec.structs.replace(settings, arm=arm), skill, plain, urdf)
+    rehearse_motion(settings, urdf)
+    _follow(settings, extended, plain, urdf)
 
 
-def _rarely(settings: Settings, urdf: str) -> None:
-    """Call the functions that the loop needs rarely.
+def rehearse_intake(settings: Settings) -> None:
+    """Take in one sample of each hand."""
+    intake = Intake(settings)
+    joints = len(settings.joints.names)
+    state = blank(state_layout(joints))
+    intake.begin(state)
+    sample = PoseStamped(1, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    hands = [Event(f"hands/{side}", b"", sample) for side in SIDES]
+    intake.step(state, blank(frame_layout(joints)), 1, hands)
+
+
+def rehearse_motion(settings: Settings, urdf: str) -> None:
+    """Move the arm from its posture by the stages after the decision, without a skill; then call
+    the functions that the loop needs rarely.
 
     They run only near the tool's largest speed, on a way out, and with a skill that depends on the
     past or whose teacher was late.
     """
-    limiter, posture = Limiter(settings.joints, settings.period_s), np.array(settings.arm.posture)
+    arm, separation = Arm(settings, urdf), Separation(settings, urdf)
+    setpoint, limiter = SetpointStage(settings, arm), LimiterStage(settings, arm)
+    posture = np.array(settings.arm.posture)
     still = np.zeros(len(posture))
-    limiter.together(posture, still, still, still)
-    limiter.speed_in_stop(limiter.stop(posture, still, still), Arm(settings, urdf).at(posture))
-    Separation(settings, urdf).share(still)
+    state, frame = blank(state_layout(len(posture))), blank(frame_layout(len(posture)))
+    limiter.begin(state, posture)
+    here = arm.at(posture)
+    solution = arm.follow(state, here, separation)
+    position, velocity, acceleration = np.zeros((3, 3))
+    target = Target(position, velocity, acceleration, clamped=False)
+    wanted = Wanted(target, np.zeros(4), np.zeros(3), 0.0, is_ambiguous=False, needs_unseen_hand=False)
+    setpoint.begin(state, frame, here)
+    workspace = np.zeros((2, 3))
+    workspace.setflags(write=False)
+    setpoint.step(state, frame, wanted, here, workspace, 1.0)
+    waiting(target, state["setpoint"], here.position)
+    limiter.step(state, frame, solution.velocity, solution.acceleration, separation)
+    separation.step(state, frame, here.record)
+    separation.share(still)
+    separation.less(still, still)
+    norm(times(here.tasks[:3], still))
+
+    joints_limiter = Limiter(settings.joints, settings.period_s)
+    joints_limiter.together(posture, still, still, still)
+    joints_limiter.speed_in_stop(joints_limiter.stop(posture, still, still), here)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
     local_scatter(np.zeros(6), np.zeros(6), error_table(np.zeros((1, 6)), np.zeros((1, 3))), 1.0, np.empty((3, 3)))
@@ -80,6 +114,8 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
     """Wait for hands, follow two resting ones for FOLLOWED_TICKS with each of two skills, lose
     sight of one, and hold.
     """
+    arm = msgspec.structs.replace(settings.arm, source="state")
+    settings = msgspec.structs.replace(settings, arm=arm)
     controller = Controller(settings, skill, urdf=urdf)
     names, trusted = settings.joints.names, still_ticks(settings)
     change, count = trusted + FOLLOWED_TICKS, trusted + 2 * FOLLOWED_TICKS

@@ -40,6 +40,7 @@ from service.daemon.clock import (
     ask_for_real_time,
     run_beside_real_time,
 )
+from service.daemon.compilation import NotCompiledError, compile_loop
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
@@ -48,13 +49,14 @@ from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.side_streams import side_streams
 from service.daemon.skill_worker import SkillWorker, skill_of
-from service.daemon.start import Startup, ahead_of_others
+from service.daemon.start import Startup
 from service.daemon.status import CellStatus, MeasuredArm, outcome
 from service.daemon.task_limits import TaskLimits
 from service.daemon.way_finder import WayFinder
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import SkillError, StoredSkill
 from service.process.pages import release_start_memory
+from service.process.priority import ahead_of_others
 from service.scribe.protocol import pack
 from service.scribe.scribe import Scribe
 from service.settings.config import Settings, robot_description
@@ -458,12 +460,16 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     return restored
 
 
-def rehearse(settings: Settings, stored: StoredSkill) -> None:
-    """Load or compile what the loop calls, and release what only that used."""
+def rehearsed(settings: Settings, skill_path: Path, start: Startup) -> StoredSkill:
+    """The skill in a file, and all that the loop calls with it loaded. Raises SkillError."""
+    start.stage("skill")
+    stored = load_skill(skill_path, settings)
+    start.stage("rehearsal")
     skill, urdf = stored.for_loop(), robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
-    release_start_memory()  # the compiler and what only imports used: 150 MB
+    release_start_memory()  # what only imports used: 150 MB
     warm_up(settings, skill, urdf=urdf)  # maps again what the loop calls, before its memory is locked
+    return stored
 
 
 def serve(
@@ -485,11 +491,15 @@ def serve(
     skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
-        with start.counting(), ahead_of_others():
-            start.stage("skill")
-            skill = load_skill(skill_path, settings)
-            start.stage("rehearsal")
-            rehearse(settings, skill)
+        with ahead_of_others():
+            try:
+                with start.counting(may_compile=False):
+                    skill = rehearsed(settings, skill_path, start)
+            except NotCompiledError:
+                start.stage("compilation")
+                compile_loop(settings, skill_path, start.note)
+                with start.counting(may_compile=True):
+                    skill = rehearsed(settings, skill_path, start)
         start.stage("loop")
         daemon = Daemon(
             settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold

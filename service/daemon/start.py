@@ -24,6 +24,7 @@ from service.contract.requests import STARTING
 from service.contract.roles import access_control
 from service.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
 from service.daemon.systemd import Systemd
+from service.process.priority import ahead_of_others
 from service.process.progress import say
 from service.settings.config import Settings
 
@@ -31,13 +32,7 @@ log = logging.getLogger("thirdhand")
 REPORT_EVERY_S = 1.0  # interval of reports on a terminal
 LOG_EVERY_S = 20.0  # interval of reports in the log
 MAX_PAUSE_US = 60_000_000  # systemd waits this long for a start's next progress
-AHEAD_NICE = -15  # 28 times the weight of an ordinary thread
 LOOPED = ("kmp.", "service.core.")  # the loop runs functions of these modules
-AGAIN = "THIRDHAND_STARTS_AGAIN"  # variable: when the start of a process began again [s, monotonic]
-
-
-class CompilerInMemoryError(Exception):
-    """The start compiled functions, so 600 MB of the compiler remain in the process."""
 
 
 class Startup:
@@ -49,13 +44,12 @@ class Startup:
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
         self.lock, self.session, self.systemd = lock, session, Systemd()
-        self._compiled: list[str] = []  # functions in compilation, callers first; empty for a library's functions
-        self._has_compiled, again = False, os.environ.pop(AGAIN, None)
-        self._is_again = again is not None
-        self._functions: list[Any] = []  # all compiled functions that the loop may call, once they are imported
+        self._compiling: list[str] = []  # functions in compilation, callers first
+        self._compiled: set[str] = set()  # functions that were compiled, here or by other processes
+        self._functions: dict[str, Any] = {}  # all that the loop may call, once they are imported
         self._is_over, self._begun_s = threading.Event(), time.monotonic()
         self._stages = [
-            ("network", float(again) if again else time.monotonic() - _process_age_s()),
+            ("network", time.monotonic() - _process_age_s()),
             ("imports", self._begun_s),
         ]
         keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
@@ -79,42 +73,46 @@ class Startup:
         """A message on the present step and its progress."""
         if not self._functions:
             return f"{STARTING}importing, {len(sys.modules)} modules so far"
-        named = [name for name in self._compiled.copy() if name]
-        doing = f"compiling {named[-1]}" if named else "loading compiled functions"
+        compiling = [name for name in self._compiling.copy() if name in self._functions]
+        doing = f"compiling {_short(compiling[-1])}" if compiling else "loading compiled functions"
         return f"{STARTING}{doing}, {self._ready} of {len(self._functions)} functions are ready"
 
     @property
     def _ready(self) -> int:
-        return sum(bool(function.signatures) for function in self._functions)
+        return sum(name in self._compiled or bool(one.signatures) for name, one in self._functions.items())
+
+    def note(self, function: str, is_ready: bool) -> None:
+        """Note that the compilation of a function begins, or that it is ready."""
+        if not is_ready:
+            self._compiling.append(function)
+        elif function in self._compiling:
+            self._compiling.remove(function)
+            self._compiled.add(function)
 
     @contextlib.contextmanager
-    def counting(self) -> Iterator[None]:
-        """A context that counts compiled functions, of those that the loop may call and that are
-        imported by now. Raises CompilerInMemoryError at its end if one was compiled, except in a
-        start that began again: if nothing can be cached, each start compiles.
+    def counting(self, *, may_compile: bool) -> Iterator[None]:
+        """A context that counts the compiled functions that the loop may call and that are imported
+        by now. Raises NotCompiledError at the first compilation, unless it `may_compile`.
         """
         from numba.core import dispatcher, event  # its import is slow, so the start reports before it
 
-        compiled, startup = self._compiled, self
+        from service.daemon.compilation import Compilations, NotCompiledError
 
-        class Compiling(event.Listener):  # type: ignore[misc]
-            def on_start(self, event: event.Event) -> None:
-                startup._has_compiled = True
-                gc.enable()  # compilations leave garbage
-                function = event.data["dispatcher"].py_func
-                name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
-                compiled.append(name if f"{function.__module__}.".startswith(LOOPED) else "")
+        def begun(name: str) -> None:
+            if not may_compile:
+                raise NotCompiledError(name)
+            gc.enable()  # compilations leave garbage
+            self.note(name, False)
 
-            def on_end(self, event: event.Event) -> None:
-                compiled.pop()
-
-        modules = [vars(module) for name, module in sys.modules.copy().items() if name.startswith(LOOPED)]
-        found = {id(one): one for names in modules for one in names.values() if isinstance(one, dispatcher.Dispatcher)}
-        self._functions = list(found.values())
-        with event.install_listener("numba:compile", Compiling()):
+        self._functions = {
+            f"{function.py_func.__module__}.{function.py_func.__name__}": function
+            for module_name, module in sys.modules.copy().items()
+            if module_name.startswith(LOOPED)
+            for function in vars(module).values()
+            if isinstance(function, dispatcher.Dispatcher)
+        }
+        with event.install_listener("numba:compile", Compilations(begun, lambda name: self.note(name, True))):
             yield
-        if self._has_compiled and not self._is_again:
-            raise CompilerInMemoryError
 
     def over(self) -> None:
         """End the refusals, so that the daemon can answer; may be repeated."""
@@ -143,6 +141,11 @@ class Startup:
             self._is_over.wait(REPORT_EVERY_S)
         if terminal:
             print(CLEAR, end="", file=sys.stderr, flush=True)
+
+
+def _short(function: str) -> str:
+    """The name of a function with its module, without packages."""
+    return ".".join(function.split(".")[-2:])
 
 
 def _process_age_s() -> float:
@@ -176,21 +179,3 @@ def starting(settings: Settings) -> Iterator[Startup]:
                 yield start
             finally:
                 start.over()
-
-
-@contextlib.contextmanager
-def ahead_of_others() -> Iterator[None]:
-    """A context in which this thread, and threads that it starts, get a higher weight than other
-    processes, if granted.
-
-    It is for the start, and for the network's threads, which otherwise wait up to 100 ms on a busy
-    machine. They get no real-time scheduling, because a flood of messages could use up the
-    real-time share.
-    """
-    before = os.getpriority(os.PRIO_PROCESS, 0)
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, min(before, AHEAD_NICE))
-    try:
-        yield
-    finally:
-        os.setpriority(os.PRIO_PROCESS, 0, before)

@@ -151,14 +151,24 @@ def _activity(pid: int) -> tuple[str, float]:
     return state, (int(numbers[10]) + int(numbers[11])) / os.sysconf("SC_CLK_TCK")
 
 
-class _ForkServer:
-    """This process's end of its fork server, which starts at the first request."""
+class ForkServer:
+    """This process's end of a fork server, which starts at the first request."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._modules: dict[str, None] = {}  # ordered by their first request
+
+    def start(self, name: str, module: str, kind: socket.SocketKind) -> Child:
+        """A child that calls `run(socket)` of a module. Never waits.
+
+        The operating system lists it under the first 15 characters of `name`. A terminal's Ctrl-C
+        does not reach it: it must end when its socket closes.
+        """
+        own, theirs = socket.socketpair(socket.AF_UNIX, kind)
+        with theirs:
+            return Child(own, self.request(module, name, descriptors=[theirs.fileno()]))
 
     def request(self, module: str, *more: str, descriptors: Iterable[int] = ()) -> subprocess.Popen[bytes]:
         """Have the server import a module and, with a descriptor, fork a child that runs it."""
@@ -210,7 +220,7 @@ class _ForkServer:
             self._end()
 
 
-_server = _ForkServer()
+_server = ForkServer()
 end_server = _server.close
 atexit.register(end_server)
 
@@ -223,21 +233,15 @@ def python(*arguments: str) -> tuple[list[str], dict[str, str]]:
 
 
 def preload(module: str) -> None:
-    """Have the fork server import a module, so that a child that runs it starts at once. Never
-    waits.
+    """Have this process's fork server import a module, so that a child that runs it starts at once.
+    Never waits.
     """
     _server.request(module)
 
 
 def start(name: str, module: str, kind: socket.SocketKind) -> Child:
-    """A child that calls `run(socket)` of a module. Never waits.
-
-    The operating system lists it under the first 15 characters of `name`. A terminal's Ctrl-C does
-    not reach it: it must end when its socket closes.
-    """
-    own, theirs = socket.socketpair(socket.AF_UNIX, kind)
-    with theirs:
-        return Child(own, _server.request(module, name, descriptors=[theirs.fileno()]))
+    """A child of this process's fork server; see `ForkServer.start`."""
+    return _server.start(name, module, kind)
 
 
 def _serve(control: socket.socket) -> None:

@@ -69,6 +69,7 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ARMS)
+@pytest.mark.one_case
 def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name: str, tmp_path: Path) -> None:
     where, plate = ARMS[name]
     path = where()

@@ -145,6 +145,7 @@ fault_error_rad = 0.5
 """
 
 
+@pytest.mark.thorough
 def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(tmp_path: Path) -> None:
     killed_and_started_again(tmp_path, "simulated", PATIENT)
 
@@ -204,6 +205,7 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
         assert "give --config with its own URDF" in refused("franka", *at)
 
 
+@pytest.mark.thorough
 def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> None:
     at = f"tcp/127.0.0.1:{free_port()}"
     with following("simulated", "--connect", at) as running:
@@ -215,6 +217,7 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("program", ["follow", "sim"])
+@pytest.mark.one_case
 def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program: str, tmp_path: Path) -> None:
     with serving(tmp_path, "--rate", "50") as daemon, Tracker(daemon.session):
         done = thirdhand(program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint)

@@ -127,6 +127,7 @@ restarts = st.tuples(
 @pytest.mark.parametrize("limits", DRIVES.values(), ids=DRIVES)
 @settings(derandomize=True, deadline=None, max_examples=40)
 @given(wishes, late, clocks, st.lists(st.tuples(st.floats(0.0, 0.4), hostile), max_size=6), st.none() | restarts)
+@pytest.mark.one_case
 def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
     limits: JointSettings,
     period: float,

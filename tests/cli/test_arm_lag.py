@@ -65,6 +65,7 @@ def simulated(
 @pytest.mark.parametrize("lag_ms", LAGS_MS)
 @pytest.mark.parametrize("servo", SERVOS)
 @pytest.mark.parametrize(("state_hz", "noise_rad"), [(500, 0.0), (500, 0.001), (50, 0.001), (100, 0.003)])
+@pytest.mark.one_case
 def test_the_lag_of_a_servo_is_measured(servo: str, lag_ms: int, state_hz: float, noise_rad: float) -> None:
     """Within 1 ms; a servo is late by up to 2 % less than its constant at these frequencies."""
     errors_ms = []

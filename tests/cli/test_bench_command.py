@@ -12,6 +12,7 @@ pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.mark.timed
+@pytest.mark.thorough
 def test_what_happens_beside_the_loop_is_put_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "LOADS", tuple(load for load in loads.LOADS if load.what == "scribe killed"))
     monkeypatch.setattr(loads, "large_skill", bytes)
@@ -35,6 +36,7 @@ def test_a_leak_is_told_from_noise() -> None:
 
 
 @pytest.mark.timed
+@pytest.mark.thorough
 def test_soak_reports_each_process() -> None:
     report = soak.run(0.12, 500)
     assert set(report["processes"]) == {"daemon", "fork server", "scribe", "skill worker"}

@@ -55,6 +55,7 @@ def everything_in(name: str, content: bytes, folder: Path) -> bytes:
     return b"".join([content, data, *messages.attachments.values(), repr(messages.metadata).encode()])
 
 
+@pytest.mark.thorough
 def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, output = tmp_path / "bench.toml", tmp_path / "bundle.tar.gz"
     config.write_text(f"# {SECRET}\n" + CELL.format(folder=tmp_path, secret=SECRET))

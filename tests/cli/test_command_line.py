@@ -164,6 +164,7 @@ def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch
         (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("sim", "--arm", "panda")),
     ],
 )
+@pytest.mark.one_case
 def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, ...], tmp_path: Path) -> None:
     done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
     assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
@@ -171,6 +172,7 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.thorough
 def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
     done = thirdhand("status", *NOBODY)
     assert (done.returncode, done.stdout) == (1, "")

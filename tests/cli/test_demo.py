@@ -91,6 +91,7 @@ def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) 
 
 
 @timed
+@pytest.mark.thorough
 def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) -> None:
     """The scribe of the nominal scene is killed; another one takes its place. On a busy machine the
     events may be missed besides: that missing ticks alone fail a demo is tested below.

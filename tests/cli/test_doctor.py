@@ -91,6 +91,7 @@ def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> 
     return code, [finding for finding in told if finding["what"] not in OF_THE_MACHINE]
 
 
+@pytest.mark.thorough
 def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own_arm = template()
     with (

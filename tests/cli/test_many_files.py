@@ -74,6 +74,7 @@ def named_failures(errors: str) -> list[str]:
 
 
 @pytest.mark.parametrize("command", [("replay", "--each", "--exact"), ("report",)], ids=["replay", "report"])
+@pytest.mark.one_case
 def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neither(
     command: tuple[str, ...], files: list[str]
 ) -> None:
@@ -91,6 +92,7 @@ def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neith
 
 
 @pytest.mark.parametrize(("package", "cluster"), [("distributed", DASK), ("ray", RAY)], ids=["dask", "ray"])
+@pytest.mark.thorough
 def test_a_cluster_of_two_workers_prints_the_same(package: str, cluster: str, files: list[str], tmp_path: Path) -> None:
     pytest.importorskip(package)
     script = tmp_path / "with_a_cluster.py"

@@ -65,6 +65,7 @@ class Shell:
 
 
 @pytest.mark.timeout(300)  # it takes a quarter of a minute where nothing else runs
+@pytest.mark.thorough
 def test_the_tutorial_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

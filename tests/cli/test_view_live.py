@@ -143,6 +143,7 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     page.daemon.until(lambda status: status["mode"] == "follow")
 
 
+@pytest.mark.thorough
 def test_clients_that_are_slow_or_leave_cost_no_thread_and_no_traceback(page: Page) -> None:
     stream = f"POST {STREAM} HTTP/1.1\r\nHost: {{}}\r\nContent-Type: application/grpc-web+proto\r\n"
     stream += "Content-Length: 5\r\n\r\n\0\0\0\0\0"
@@ -212,6 +213,7 @@ def test_the_page_follows_the_live_view_where_the_scribe_is_started_again(page: 
     connection.close()
 
 
+@pytest.mark.thorough
 def test_a_viewer_is_sent_little_more_than_it_has_drawn(page: Page) -> None:
     connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
     known = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1", "Referer": f"{page.url}viewer/?0.5"}
@@ -290,6 +292,7 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
 
 
 @pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
+@pytest.mark.thorough
 def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_served_anew(
     page: Page, tmp_path: Path
 ) -> None:

@@ -171,6 +171,7 @@ def started() -> Iterator[list[Example]]:
         one.process.wait()
 
 
+@pytest.mark.thorough
 def test_the_examples_wait_for_record_and_are_recorded(file: Path, tmp_path: Path, started: list[Example]) -> None:
     """The tutorial's first step with a tracker and an arm of one's own, all started before it."""
     at = f"tcp/127.0.0.1:{free_port()}"

@@ -33,6 +33,7 @@ if "THIRDHAND_EXAMPLES" in os.environ:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], seed) for seed in SEEDS])
+@pytest.mark.one_case
 def test_every_bound_is_kept_whatever_comes_in(arm: str, seed: int) -> None:
     played = play(seed, arm, **LENGTH)
     happened = "\n  ".join(played.what_happens)
@@ -43,6 +44,7 @@ def test_every_bound_is_kept_whatever_comes_in(arm: str, seed: int) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], 500 + seed) for seed in SEEDS[:9]])
+@pytest.mark.one_case
 def test_every_bound_is_kept_while_the_setpoint_engages_and_a_clutch_chatters(arm: str, seed: int) -> None:
     played = play(seed, arm, **LENGTH, engages=True)
     passed = "\n  ".join(broken(played.session))

@@ -77,6 +77,7 @@ def test_the_task_takes_a_joint_over_the_seam(reference: Vector) -> None:
     ("turns", "how"),
     [(0, "counted"), (1, "counted"), (-3, "counted"), (-900, "counted"), (0, "wrapped"), (40, "wrapped")],
 )
+@pytest.mark.one_case
 def test_an_arm_in_any_turn_is_commanded_in_its_own_and_goes_as_from_the_first(
     cell: Settings, skill: Skill, turns_on: Vector, reference: Vector, turns: int, how: str
 ) -> None:

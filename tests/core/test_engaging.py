@@ -66,6 +66,7 @@ def reached(taught: Skill) -> tuple[Vector, Vector]:
 
 @pytest.mark.parametrize("rate_hz", LOOP_HZ)
 @pytest.mark.parametrize("apart_m", [0.1, 0.3, 0.6])
+@pytest.mark.one_case
 def test_after_a_hold_the_tool_comes_slowly_to_where_the_hands_have_gone(
     taught: Skill, reached: tuple[Vector, Vector], rate_hz: int, apart_m: float
 ) -> None:
@@ -133,6 +134,7 @@ def test_every_following_begins_slowly_also_after_a_fault(taught: Skill) -> None
         (0.3, {0.2: "fault", 0.25: "reset"}, True),
     ],
 )
+@pytest.mark.one_case
 def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
     taught: Skill, unseen_s: float, orders: dict[float, str], anew: bool
 ) -> None:

@@ -39,6 +39,7 @@ def event(key: str, payload: bytes) -> Event | None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.one_case
 def test_a_session_of_spoilt_bytes_replays_within_every_bound(seed: int, skill: Skill, tmp_path: Path) -> None:
     traffic, path = Traffic(seed), tmp_path / "fuzzed.mcap"
     traffic.joints = np.array(SETTINGS.arm.posture)

@@ -132,6 +132,7 @@ def order(skill: StoredSkill) -> int:
     return skill.model.order
 
 
+@pytest.mark.thorough
 def test_learn_remembers_where_hands_alone_tell_too_little_and_nowhere_else() -> None:
     skill = learn(takes(8, remembers=True))
     assert order(skill) == ORDER

@@ -212,6 +212,7 @@ QUICK = {
 
 
 @pytest.mark.parametrize("name", QUICK)
+@pytest.mark.one_case
 def test_a_quick_reach_is_no_fault_and_passes_no_speed(taught: Skill, name: str) -> None:
     cell, first = QUICK[name]
     for seed in range(first, first + (MANY or 1)):
@@ -223,6 +224,7 @@ def test_a_quick_reach_is_no_fault_and_passes_no_speed(taught: Skill, name: str)
 
 
 @pytest.mark.parametrize("seed", range(MANY or 8))
+@pytest.mark.one_case
 def test_legal_hands_and_a_lowered_speed_never_fault(skill: Skill, taught: Skill, seed: int) -> None:
     """As at the first start of a new arm, whose joints docs/hardware.md slows to a tenth."""
     random = np.random.default_rng(seed)
@@ -284,6 +286,7 @@ def test_a_tool_of_little_jerk_comes_to_rest(taught: Skill, rate_hz: int, tool: 
 
 
 @pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10: once swung for ever
+@pytest.mark.one_case
 def test_whatever_the_cell_the_arm_comes_to_rest(taught: Skill, number: int) -> None:
     random, cell = np.random.default_rng(number), cell_of(("wam", "panda", "ur5")[number % 3])
     rate_hz, slower = int(random.choice([250, 500, 1000])), float(random.choice([0.3, 1.0]))
@@ -304,6 +307,7 @@ def test_whatever_the_cell_the_arm_comes_to_rest(taught: Skill, number: int) -> 
 
 @pytest.mark.parametrize("name", ["wam", "panda", "ur5"])
 @pytest.mark.parametrize("rate_hz", [250, 500, 1000])
+@pytest.mark.one_case
 def test_the_arm_rests_at_a_target_on_a_side_of_the_workspace(name: str, rate_hz: int, skill: Skill) -> None:
     """The box is drawn so that the target of resting hands lies beyond one, two or three sides."""
     random = np.random.default_rng(rate_hz + len(name))
@@ -330,6 +334,7 @@ def reach() -> Skill:
 
 
 @pytest.mark.parametrize("arm", ["wam", *MODELS])
+@pytest.mark.one_case
 def test_moving_targets_are_followed_to_half_a_millimetre(arm: str, reach: Skill, tmp_path: Path) -> None:
     cell, ticks = cell_of(arm), list(ticks_of(HandScript(Scene(), seed=3)))
     found = played(cell, reach, ticks)

@@ -218,6 +218,7 @@ def test_distance_and_limit_are_in_the_frame(taught: Skill) -> None:
 
 
 @pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.one_case
 def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(taught: Skill, arm: str) -> None:
     """A table so high that the glass is in it, and a box before the handover."""
     cell = cell_of(arm)

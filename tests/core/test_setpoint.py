@@ -94,6 +94,7 @@ def test_an_axis_that_wild_ones_starve_comes_back(
 
 @pytest.mark.parametrize("rate_hz", [30, 60, 100, 250, 500])
 @pytest.mark.parametrize("apart_m", [0.02, 0.09, 0.3])
+@pytest.mark.one_case
 def test_what_alternates_is_followed_no_farther_than_it_goes(rate_hz: int, apart_m: float) -> None:
     every = 500 // rate_hz
     way = np.array([0.0, apart_m, 0.0])

@@ -75,6 +75,7 @@ def session(
 
 
 @pytest.mark.parametrize(("name", "seed"), [("wam", 1), ("panda", 2), ("ur5", 3)])
+@pytest.mark.one_case
 def test_from_any_free_start_the_tool_comes_to_its_target(taught: Skill, name: str, seed: int) -> None:
     cell = replace(cell_of(name), rate_hz=250)
     random, hands = np.random.default_rng(seed), taught.hands.reshape(-1, 2, 3)

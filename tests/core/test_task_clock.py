@@ -122,6 +122,7 @@ def test_the_intake_finds_when_hands_begin_to_move() -> None:
         assert shown.seconds[np.argmax(moves)] - 0.1 < starts_s < shown.seconds[np.argmax(moves)] + 0.2
 
 
+@pytest.mark.thorough
 def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
     skill = learn(takes(6, timetable=True))
     figures = msgspec.json.decode(skill.figures, type=Figures)

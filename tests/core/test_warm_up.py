@@ -98,6 +98,7 @@ def test_a_rehearsal_leaves_nothing_to_compile() -> None:
 
 
 @pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
+@pytest.mark.one_case
 def test_neither_does_a_skill_that_another_process_gave_back(file: str) -> None:
     done_in_a_process(FROM_THE_SKILL_WORKER, str(RECORDINGS / file))
 

@@ -46,6 +46,7 @@ def following(status: dict[str, Any]) -> bool:
     return bool(status["mode"] == "follow")
 
 
+@pytest.mark.quick
 def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     """Hands are followed, lost, and followed again; places are taught; SIGTERM ends it all, and
     what was recorded replays identically.

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 import zenoh
 
 from service.contract import cdr
@@ -20,6 +21,7 @@ SECONDS, INTERVAL_S = 5.0, 0.01
 INPUTS = ("hands/left", "hands/right", "joints/state")
 
 
+@pytest.mark.thorough
 def test_a_daemon_under_spoilt_bytes_keeps_every_bound(tmp_path: Path) -> None:
     traffic = Traffic(seed=3)
     traffic.joints = np.array(Settings().arm.posture)

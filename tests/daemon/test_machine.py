@@ -8,6 +8,8 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
+
 from service.cli.demo import too_busy
 from service.cli.status import rows
 from service.contract.evidence import Evidence, explained
@@ -88,6 +90,7 @@ def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
     assert "busy" not in explained(Reason.STALE_HAND, seen._replace(sources={"left": refused})).why
 
 
+@pytest.mark.thorough
 def test_a_service_that_stood_still_names_the_machine_before_the_tracker(tmp_path: Path) -> None:
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as tracker:
         daemon.until(lambda status: status["mode"] == "follow", timeout_s=60.0)

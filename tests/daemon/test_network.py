@@ -102,6 +102,7 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
     assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
 
 
+@pytest.mark.thorough
 def test_cells_are_watched_as_lines_and_one_that_ends_is_gone() -> None:
     """The daemon of one is a publisher of a token, which then disappears."""
     with (

@@ -80,6 +80,7 @@ REQUESTS: list[tuple[str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize("way", ["queryable", "Client", "published"])
+@pytest.mark.one_case
 def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -> None:
     published: list[dict[str, Any]] = []
     subscriber = daemon.session.declare_subscriber(

@@ -69,6 +69,7 @@ CASES: dict[str, Callable[[int], list[JointState]]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.one_case
 def test_the_arm_is_found_whatever_else_its_topic_carries(daemon: Daemon, case: str) -> None:
     daemon.until(lambda now: now["reason"] == "arm_not_ready")
     before = daemon.client.status().rejected

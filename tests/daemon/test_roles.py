@@ -107,6 +107,7 @@ def guarded(secrets: Path) -> Iterator[Guarded]:
 
 
 @pytest.mark.parametrize("name", ROLES)
+@pytest.mark.one_case
 def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path, name: str) -> None:
     role = ROLES[name]
     full = {key: channels.key(CELL, key) for key in REQUESTS}
@@ -227,6 +228,7 @@ def serving_cell(secrets: Path, cell: str, *, listen: Iterable[str] = (), connec
 
 @pytest.mark.parametrize("by_router", [True, False], ids=["by a router", "directly"])
 @pytest.mark.parametrize("listens", [True, False], ids=["listening", "connecting only"])
+@pytest.mark.one_case
 def test_every_role_sees_all_cells_that_are_connected(secrets: Path, by_router: bool, listens: bool) -> None:
     here = ["tls/127.0.0.1:0"]
     with contextlib.ExitStack() as stack:
@@ -373,6 +375,7 @@ def test_a_certificate_that_ends_soon_is_reported_by_daemon_doctor_and_cells(tmp
         until(lambda: "the certificate ends on" in service.log.read_text())
 
 
+@pytest.mark.thorough
 def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
     secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -419,6 +422,7 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
         open_session(connect=endpoints(session), certificate=own / "operator", timeout_s=0.3)
 
 
+@pytest.mark.thorough
 def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path, tmp_path: Path) -> None:
     """Of which one connects to the other; a third is of another authority, a fourth has none."""
     at, operator = "", ("--certificate", str(secrets / "operator"))

@@ -56,6 +56,7 @@ DEFINITIONS = {  # of what this project says and never reads
 
 
 @pytest.mark.parametrize("ends", ["stop", "failure"])
+@pytest.mark.one_case
 def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, ends: str) -> None:
     """Stopped while it moves, and with a loop that fails for good while it moves."""
     sabotage = f"""

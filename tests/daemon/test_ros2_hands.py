@@ -130,6 +130,7 @@ MALFORMED = (
 )
 
 
+@pytest.mark.thorough
 def test_frames_are_hands_amid_many_others_and_bad_ones_are_refused(tmp_path: Path, router: zenoh.Session) -> None:
     (at,) = endpoints(router)
     (tmp_path / "tf.toml").write_text(CELL.format(router=at, state=tmp_path))

@@ -81,6 +81,7 @@ def router() -> Iterator[zenoh.Session]:
         ZenohSession.get_instance().close()
 
 
+@pytest.mark.thorough
 def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path, router: zenoh.Session) -> None:
     (at,) = endpoints(router)
     (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=at, state=tmp_path))

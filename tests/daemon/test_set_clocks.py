@@ -79,6 +79,7 @@ def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(tmp_path: Path, monk
     assert_replays(records)
 
 
+@pytest.mark.thorough
 def test_a_tracker_whose_clock_is_set_is_named_and_its_hands_are_taken_again(tmp_path: Path) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--rate", str(RATE_HZ), "--record", str(records)) as daemon:

@@ -139,7 +139,7 @@ def test_a_slow_workshop_is_waited_for_and_what_it_has_imported_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fork server of its own, which has to import all: as on a machine that is busy."""
-    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    monkeypatch.setattr(child, "_server", server := child.ForkServer())
     worker = SkillWorker()
     try:
         said: list[str] = []

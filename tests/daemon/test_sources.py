@@ -145,6 +145,7 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
 
 
 @pytest.mark.parametrize("rate_hz", [3, 5, 8])
+@pytest.mark.one_case
 def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: int) -> None:
     cell, told_of = Cell(skill), set()
     for k in range(2500):

@@ -151,6 +151,7 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]])
+@pytest.mark.one_case
 def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: list[int]) -> None:
     """`resume` is asked all the while: nobody cancels the stop of a daemon that ends."""
     records = tmp_path / "records"
@@ -224,6 +225,7 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
+@pytest.mark.thorough
 def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(tmp_path: Path) -> None:
     """Also beside a scribe that does not begin: the loop does not wait for it."""
     go, records = tmp_path / "go", tmp_path / "records"
@@ -317,6 +319,7 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("streams", ["> /dev/full", "2> /dev/full", "> >(true)", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.one_case
 def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path: Path, streams: str) -> None:
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -64,6 +64,7 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
         yield found
 
 
+@pytest.mark.thorough
 def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
     manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,7 +23,7 @@ from service.client import Client, RefusedError, UnreachableError, open_session
 from service.contract import channels
 from service.daemon.daemon import MAX_NOTES_PER_S
 from service.daemon.single_instance import MAX_SESSIONS
-from service.daemon.start import AHEAD_NICE
+from service.process.priority import AHEAD_NICE
 from support.cell import Daemon, serving
 from support.paths import ROOT
 

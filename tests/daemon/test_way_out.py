@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from support.cell import Tracker, serving
 
 STUCK = [1.66, 0.73, 1.61, -0.13, 0.1, -0.97, -2.26]  # [rad] joints come to their ends from there
 
 
+@pytest.mark.thorough
 def test_an_arm_that_is_stuck_says_so_and_comes_out(tmp_path: Path) -> None:
     config = tmp_path / "stuck.toml"
     files = f"[files]\nstate = {json.dumps(str(tmp_path / 'state'))}\n"

@@ -57,6 +57,7 @@ def named(said: list[str]) -> list[tuple[str, float, float]]:
 
 
 @pytest.mark.parametrize("spoil", SPOILS, ids=lambda spoil: str(spoil.__name__))
+@pytest.mark.one_case
 def test_a_stretch_that_is_wrong_is_named_and_left_out_and_the_rest_is_as_it_was(
     spoil: spoiled.Spoil, clean: list[Demonstration], tmp_path: Path
 ) -> None:

@@ -52,6 +52,7 @@ def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked
 
 
 @pytest.mark.timeout(500)  # it compiles all anew
+@pytest.mark.thorough
 def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units() -> None:
     done = command(str(GOLDEN), "--exact", NUMBA_CPU_NAME="generic", timeout_s=480)
     assert "10000 ticks, 10000 frames identical" in done.stdout or "largest differences" in done.stdout
@@ -59,6 +60,7 @@ def test_the_golden_session_replays_bit_for_bit_as_on_a_cpu_without_vector_units
     assert done.stdout.splitlines()[-1] == native.stdout.splitlines()[-1]
 
 
+@pytest.mark.thorough
 def test_a_thin_recording_is_small_and_replays_bit_for_bit(golden: Path, tmp_path: Path) -> None:
     old = Recording.open(golden)
     path = thin(golden, tmp_path / "thin.mcap")
@@ -297,6 +299,7 @@ def checked(recorded: Path, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.quick
 def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
     recorded: Path, checked: Path, tmp_path: Path
 ) -> None:

@@ -119,6 +119,7 @@ def clean() -> list[Demonstration]:
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 240])
+@pytest.mark.one_case
 def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
     take = tracked(demonstrate(Scene(), seed=3, rate_hz=rate_hz), 5e-4, rate_hz)
     assert all(retained.all() for _, retained in checked(streams_of(take)))
@@ -133,6 +134,7 @@ def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
 
 
 @pytest.mark.timeout(600)
+@pytest.mark.thorough
 def test_each_constant_matters_and_none_is_better_halved_or_doubled(
     clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch
 ) -> None:

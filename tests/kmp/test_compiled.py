@@ -65,6 +65,7 @@ print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex
 """
 
 
+@pytest.mark.thorough
 def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
     """Not rounded: the golden session, whose states are, is replayed so at length."""
     here = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
@@ -106,16 +107,16 @@ def test_exponentials_are_right_to_a_unit_in_the_last_place():
     assert found[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
-LISTENS = "from numba.core import dispatcher, event"  # to what is compiled, of which a start tells
+LISTENS = r"from numba.core import (dispatcher, )?event"  # to compilations, of which a start reports
 
 
 def test_nothing_is_compiled_otherwise():
     for room in ("kmp", "service", "sim"):
         for path in sorted((ROOT / room).rglob("*.py")):
-            text = path.read_text(encoding="utf-8").replace(LISTENS, "")
+            text = re.sub(LISTENS, "", path.read_text(encoding="utf-8"))
             found = re.findall(r"^.*\b(?:numba|njit)\b.*$", text, re.MULTILINE)
             assert (
                 not found
-                or path.name in {"compiled.py", "sensitivity.py"}
+                or path.name in {"compiled.py", "compiled_cache.py", "sensitivity.py"}
                 or not any("import" in line for line in found)
             ), path

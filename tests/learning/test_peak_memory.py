@@ -35,6 +35,7 @@ print(before, peak_mb())
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.thorough
 def test_many_takes_are_learned_in_little_memory() -> None:
     done = subprocess.run(
         [sys.executable, "-c", CODE],

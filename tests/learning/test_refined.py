@@ -121,6 +121,7 @@ def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
     assert chosen({1.0: 0.03, 4.0: 0.02, np.inf: 0.025}) == (4.0, ("4", {"1": 0.03, "4": 0.02, "yours alone": 0.025}))
 
 
+@pytest.mark.thorough
 def test_which_hand_leads_is_chosen_over_all_takes_and_not_by_three_of_one_person() -> None:
     of_others = learn([one.demonstration for one in takes("path", people=range(4), each=2)], name="others")
     mine = learn([one.demonstration for one in takes("path", people=[32], each=3)], name="mine", refined=of_others)

@@ -21,6 +21,8 @@ from support import spoiled
 from support.cell import told
 from support.paths import RECORDINGS
 
+pytestmark = pytest.mark.thorough
+
 TAUGHT, HELD_OUT = range(1, 7), range(7, 11)  # of the shipped people, two takes each
 SIDES = ("left", "right", "tool")
 

@@ -253,6 +253,7 @@ def test_a_hand_that_the_tool_follows_leads_if_that_predicts_better(on_path: lis
     assert figures.tried_mm[figures.taken] < figures.tried_mm["positions"]
 
 
+@pytest.mark.thorough
 def test_a_hand_leads_only_where_it_is_followed_or_was_ahead(on_path: list[Demonstration]) -> None:
     """Unless somebody shows it, the tool waits for the other hand."""
     free = [without_follow(one) for one in on_path]
@@ -278,6 +279,7 @@ def carried() -> StoredSkill:
     return learn([without_follow(take.demonstration) for take in takes("heading", people=range(4), each=2)])
 
 
+@pytest.mark.thorough
 def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carried: StoredSkill) -> None:
     figures = msgspec.json.decode(carried.figures, type=Figures)
     assert figures.taken == "orientation of the left hand"

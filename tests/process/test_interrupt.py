@@ -100,6 +100,7 @@ def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: 
     ("name", "delay_s"),
     [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],
 )
+@pytest.mark.one_case
 def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
     (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
     arguments = {
@@ -131,6 +132,7 @@ def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
     assert not skill.exists()
 
 
+@pytest.mark.thorough
 def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
     said, skill = tmp_path / "said", tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
@@ -143,6 +145,7 @@ def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Pat
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+@pytest.mark.thorough
 def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals) -> None:
     said = tmp_path / "said"
     process = begun(["demo", "--output", str(tmp_path / "demo")], said)

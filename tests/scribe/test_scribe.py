@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 from service.contract.images import CompressedImage, encode_image
@@ -166,10 +165,7 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp
 
 def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> None:
     """Also where the process that it is forked from has to import all again."""
-    for process in psutil.Process().children():
-        if "service.process.child" in process.cmdline():
-            process.kill()
-            process.wait(10)
+    child.end_server()
     one = Scribe(SETTINGS, folder=tmp_path)
     began = time.perf_counter()
     one.start(skill=SKILL, state=state_after(-1))
@@ -242,7 +238,7 @@ def run(channel):
 def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Child]]:
     """Children that compute for so long, and then do something, with a fork server of their own."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
-    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    monkeypatch.setattr(child, "_server", server := child.ForkServer())
     started: list[Child] = []
 
     def begun(busy: float, then: str) -> Child:
@@ -260,6 +256,7 @@ def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
     server.close()
 
 
+@pytest.mark.thorough
 def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(slow_child: Callable[..., Child]) -> None:
     """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
 
@@ -301,7 +298,7 @@ def test_exit_codes_of_children_are_those_of_the_operating_system(slow_child: Ca
 def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(child, "_server", server := type(child._server)())  # noqa: SLF001
+    monkeypatch.setattr(child, "_server", server := child.ForkServer())
     one = child.start("none", "no_such_module_anywhere", socket.SOCK_STREAM)
     assert one.wait(60)
     assert (one.pid, one.returncode) == (None, child.NOT_STARTED)

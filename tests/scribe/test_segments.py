@@ -242,6 +242,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", folder], check=True, timeout=10)
 
 
+@pytest.mark.thorough
 def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> None:
     ballast = small_disk / "ballast"
     with session(msgspec.structs.replace(CELL, files=Files(rerun=True)), folder=small_disk) as one:

@@ -102,6 +102,7 @@ def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
     return seen
 
 
+@pytest.mark.quick
 def test_a_tool_that_goes_as_taught_does_the_task(bench: Bench) -> None:
     play(bench)
     events = bench.events()

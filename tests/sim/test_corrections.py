@@ -53,6 +53,7 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.thorough
 def test_a_tool_that_was_led_goes_there_from_then_on_and_back_when_it_is_undone(tmp_path: Path) -> None:
     settings, records = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), tmp_path / "records"
     with (

@@ -52,6 +52,7 @@ def test_both_engines_give_the_same_scores_and_the_arm_goes_the_same_way() -> No
     assert 0.0 < apart_mm.max() < 1.0, f"{apart_mm.max():.3f} mm"
 
 
+@pytest.mark.quick
 def test_the_arm_follows_moving_commands_within_a_millimetre(bench: Bench) -> None:
     start, wrong = np.array(bench.observe().joints), []
     for tick in range(1000):

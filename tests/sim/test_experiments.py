@@ -69,6 +69,7 @@ def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
 
 
 @pytest.mark.usefixtures("close_figures")
+@pytest.mark.thorough
 class TestExperiments:
     """One test each."""
 
@@ -235,6 +236,7 @@ def grey(path: Path) -> Array:
 
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.usefixtures("close_figures")
+@pytest.mark.one_case
 def test_the_shipped_figures_are_of_the_shipped_numbers(name: str, tmp_path: Path) -> None:
     shutil.copy(SHIPPED / f"{name}.json", tmp_path)
     assert main([name, "--output", str(tmp_path), "--redraw", "--quiet"]) == 0

@@ -43,6 +43,8 @@ from sim.script import HandScript
 from sim.sessions import session
 from sim.teach import by_people, places_of
 
+pytestmark = pytest.mark.thorough
+
 PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "gate_m")
 ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
 

@@ -33,6 +33,7 @@ def with_gripper(folder: Path) -> Settings:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("made", [continuous_cell, sliding_cell, with_gripper])
+@pytest.mark.one_case
 def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engine: str) -> None:
     cell = made(tmp_path)
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()

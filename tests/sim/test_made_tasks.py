@@ -10,6 +10,8 @@ from service.settings.config import Reach
 from sim.made_tasks import CARRIED_M, LEAD_S, REACTION_S, TAKE_HZ, TASK_KINDS, run, takes
 from sim.sessions import along
 
+pytestmark = pytest.mark.thorough
+
 
 def test_takes_are_the_same_from_the_same_numbers_and_differ_between_people_takes_and_seeds() -> None:
     for kind in TASK_KINDS[:3]:

@@ -36,6 +36,8 @@ from sim.experiments.rivals.partners import (
 )
 from sim.made_tasks import takes
 
+pytestmark = pytest.mark.thorough
+
 
 def of_kind(kind: str, people: range) -> list[LeftOut]:
     return [left_out(f"{t.person}", "", t.demonstration) for t in takes(kind, people=people, each=1)]

@@ -25,6 +25,8 @@ from sim.people import Group, Person, person
 from sim.scene import TOOL_FROM_HAND
 from sim.sessions import BREAKING, MISTAKES, Session, breaking, demonstrations, played, session
 
+pytestmark = pytest.mark.thorough
+
 GROUPS: tuple[Group, ...] = ("demonstrations", "tuning", "test")
 
 

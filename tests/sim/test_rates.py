@@ -38,6 +38,7 @@ def assert_succeeded(run: Played, rate_hz: int, bench_hz: int | None = None) -> 
     ("rate_hz", "arm", "engine"),
     [(100, "ur5", "mujoco"), (250, "franka", "pybullet"), (700, "ur5", "pybullet"), (1000, "wam", "mujoco")],
 )
+@pytest.mark.one_case
 def test_the_demo_succeeds_at_other_rates(rate_hz: int, arm: str, engine: str) -> None:
     assert_succeeded(done(rate_hz, arm, engine), rate_hz)
 
@@ -50,6 +51,7 @@ def test_a_bench_of_another_rate_follows_the_service_at_its_own_pace(rate_hz: in
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.thorough
 def test_the_demo_succeeds_at_every_rate_with_every_arm_in_every_engine(rate_hz: int, engine: str, arm: str) -> None:
     assert_succeeded(done(rate_hz, arm, engine), rate_hz)
 

@@ -64,6 +64,7 @@ def off_mm(found: Array, true: Array) -> float:
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("name", PATHS)
+@pytest.mark.one_case
 def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
     for seed in range(2):
         t, _, seen = hands(PATHS[name], tracker, seed)
@@ -76,6 +77,7 @@ def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("name", ["rest", "reach at 1 m/s", "reach at 2 m/s"])
 @pytest.mark.parametrize("offsets_mm", [(60,), (68, 80), (70, 70, 70), (70, 70, 70, 70, 70), (150, -60, 90)])
+@pytest.mark.one_case
 def test_jumps_are_taken_out_of_the_truth(name: str, tracker: str, offsets_mm: tuple[int, ...]) -> None:
     for seed, begin_s in enumerate((-0.1, 0.2)):
         t, true, seen = hands(PATHS[name], tracker, seed)

@@ -16,12 +16,13 @@ from typing import Any
 
 import msgspec
 
-from service.daemon.daemon import Daemon, rehearse
+from service.core.warm_up import warm_up
+from service.daemon.daemon import Daemon
 from service.daemon.skill_worker import SkillWorker
 from service.daemon.start import starting
 from service.files.shipped import recordings, shipped_skill
 from service.scribe.scribe import Scribe
-from service.settings.config import ArmSettings, Files, Settings
+from service.settings.config import ArmSettings, Files, Settings, robot_description
 from service.settings.network import Network
 
 RATE_HZ, ROS2_DOMAIN = 50, 7
@@ -30,7 +31,7 @@ RATE_HZ, ROS2_DOMAIN = 50, 7
 def main(folder: Path, endpoint: str, *cells: str) -> None:
     """Serves the cells; each says its name once it is announced."""
     skill, skill_worker = shipped_skill(), SkillWorker()
-    rehearse(Settings(), skill)
+    warm_up(Settings(), skill.for_loop(), urdf=robot_description(Settings()))
     daemons, held = [], contextlib.ExitStack()
     for cell in cells:
         settings = Settings(

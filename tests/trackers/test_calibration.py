@@ -74,6 +74,7 @@ def held_by(kind: str, *, arm: str = "wam", seed: int = 0, rate_hz: float = 50) 
 @pytest.mark.parametrize(
     ("kind", "median_mm", "worst_mm"), [("mocap", 0.6, 1.2), ("headset", 10, 16), ("camera", 35, 55)]
 )
+@pytest.mark.one_case
 def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: float, worst_mm: float) -> None:
     """And how accurately it does: errors are about as large as they are expected to be."""
     errors, shares = [], []
@@ -108,6 +109,7 @@ def spoilt(held: HeldTool, how: str) -> HeldTool:
 
 
 @pytest.mark.parametrize("how", ["outliers", "lost samples", "slow joints"])
+@pytest.mark.one_case
 def test_spoilt_samples_cost_little(how: str) -> None:
     errors = [1e3 * error_m(solve_held(spoilt(held_by("headset", seed=seed), how), CORNERS)) for seed in SEEDS]
     assert np.median(errors) < 10, errors
@@ -695,6 +697,7 @@ POINTS = ((0.5, -0.3, 0.05), (0.5, 0.3, 0.05), (0.9, 0.3, 0.1), (0.9, -0.3, 0.1)
 
 
 @pytest.mark.timeout(600)
+@pytest.mark.thorough
 def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,6 +82,7 @@ def send_more(tab: Tab, count: int) -> None:
     tab.until(f"link.sent >= {sent(tab) + count}")
 
 
+@pytest.mark.thorough
 def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_right(
     hearing: tuple[zenoh.Session, str], tmp_path: Path, record_property: Any
 ) -> None:
@@ -166,6 +167,7 @@ class Stalling:
         self.flows.set()
 
 
+@pytest.mark.thorough
 def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
     hearing: tuple[zenoh.Session, str], tmp_path: Path
 ) -> None:
@@ -200,6 +202,7 @@ def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
     assert max(ages_s) < 2.0  # the server drops from 0.5 s on; more only by a busy machine
 
 
+@pytest.mark.thorough
 def test_the_page_goes_on_by_itself_where_the_server_is_started_again(
     hearing: tuple[zenoh.Session, str], tmp_path: Path
 ) -> None:
@@ -220,6 +223,7 @@ def test_the_page_goes_on_by_itself_where_the_server_is_started_again(
                 assert sent(tab) > count
 
 
+@pytest.mark.thorough
 def test_recentring_renames_the_frame_and_an_anchor_makes_it_harmless(
     hearing: tuple[zenoh.Session, str], tmp_path: Path
 ) -> None:
@@ -269,6 +273,7 @@ def test_recentring_renames_the_frame_and_an_anchor_makes_it_harmless(
             assert newest().frame_id == "webxr1"
 
 
+@pytest.mark.thorough
 def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_there(tmp_path: Path) -> None:
     at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up

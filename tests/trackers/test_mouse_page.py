@@ -99,6 +99,7 @@ def until_arrived(received: Received, side: str, to: tuple[float, float, float],
         time.sleep(0.02)
 
 
+@pytest.mark.thorough
 def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_drawn(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
@@ -162,6 +163,7 @@ def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
     return x, y, z
 
 
+@pytest.mark.thorough
 def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_undone(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
@@ -280,6 +282,7 @@ def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None
         tab.until(f"at('why').textContent === {json.dumps(NO_TOKEN)}")
 
 
+@pytest.mark.thorough
 def test_open_without_a_page_for_a_mouse_is_refused() -> None:
     done = thirdhand("demo", "--open")
     assert (done.returncode, done.stdout) == (2, "")

@@ -50,6 +50,7 @@ def span_s(view: Any, part: str) -> tuple[float, float]:
 
 
 @pytest.mark.usefixtures("drawing")
+@pytest.mark.thorough
 def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(600):
@@ -141,6 +142,7 @@ def opacity(colour: int) -> int:
 
 
 @pytest.mark.usefixtures("drawing")
+@pytest.mark.thorough
 def test_of_several_files_the_last_is_pictured_and_that_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,8 @@ from service.settings.config import WAM, Settings
 from service.viewer.stream import Viewer, rerun_program
 from support.recorded import at_ns, drawn, ticks, values
 
+pytestmark = pytest.mark.thorough
+
 TIMES_REAL, SCENE_S = 4, 48  # of 500 ticks
 BOUND_MB = 100.0
 TIMEOUT_S = 60.0

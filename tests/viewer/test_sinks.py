@@ -61,6 +61,7 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
 
 
 @pytest.mark.parametrize(("rate_hz", "mb_per_hour"), [(500, 200.0), (1000, 200.0), (500, 100.0)])
+@pytest.mark.one_case
 def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
     tmp_path: Path, rate_hz: int, mb_per_hour: float
 ) -> None:

@@ -1,0 +1,107 @@
+"""Compilation of the loop's functions by two processes. The compiler's memory, 600 MB, ends with
+them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import selectors
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+from numba.core import event
+
+from service.core.warm_up import rehearse_intake, rehearse_motion, warm_up
+from service.daemon.skill_worker import skill_of
+from service.process import child
+from service.process.priority import ahead_of_others
+from service.settings.config import Settings, robot_description
+
+MAX_WORK_BYTES = 65536
+BEGIN_POLL_S = 1.0
+COMPILED = "is compiled"
+
+
+class NotCompiledError(BaseException):
+    """A function is not in the cache; no handler of unreadable files may catch this."""
+
+
+class Compilations(event.Listener):  # type: ignore[misc]
+    """Calls one function where a compilation begins and another where it ends, with the function's
+    name, `package.module.function`.
+    """
+
+    def __init__(self, begun: Callable[[str], object], ended: Callable[[str], object] = lambda name: None) -> None:
+        self._begun, self._ended = begun, ended
+
+    def on_start(self, event: event.Event) -> None:
+        """A compilation begins."""
+        self._begun(_name(event))
+
+    def on_end(self, event: event.Event) -> None:
+        """A compilation ends."""
+        self._ended(_name(event))
+
+
+def _name(event: event.Event) -> str:
+    function = event.data["dispatcher"].py_func
+    return f"{function.__module__}.{function.__name__}"
+
+
+def compile_loop(settings: Settings, skill: Path, report: Callable[[str, bool], object]) -> None:
+    """Compile what the loop of a cell calls with the skill in a file, and wait for it.
+
+    `report(function, is_ready)` is called where a compilation begins and where it ends. What a
+    process that fails has not compiled is compiled by whoever calls it.
+    """
+    compilers = [child.start("compiler", __name__, socket.SOCK_SEQPACKET) for _ in range(2)]
+    with selectors.DefaultSelector() as selector:
+        for is_first, compiler in zip((True, False), compilers, strict=True):
+            while not compiler.has_begun(BEGIN_POLL_S) and compiler.returncode is None:
+                pass
+            with contextlib.suppress(OSError):  # it has ended
+                compiler.socket.send(pickle.dumps((settings, skill, is_first)))
+            selector.register(compiler.socket, selectors.EVENT_READ, compiler)
+        while selector.get_map():
+            for key, _ in selector.select():
+                message = _received(key.data.socket)
+                if message:
+                    name, _, state = message.partition(" ")
+                    report(name, state == COMPILED)
+                else:
+                    selector.unregister(key.fileobj)
+    for compiler in compilers:
+        compiler.wait()
+        compiler.socket.close()
+
+
+def _received(channel: socket.socket) -> str:
+    """The next message of a process; empty once it has ended."""
+    try:
+        return channel.recv(MAX_WORK_BYTES).decode()
+    except OSError:
+        return ""
+
+
+def run(channel: socket.socket) -> None:
+    """Compile in a child: the first compiles the intake, the second the motion of the arm, which
+    each take a third of the time; then the first compiles the rest.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    child.end_with_parent()
+    settings, skill, is_first = pickle.loads(channel.recv(MAX_WORK_BYTES))
+    urdf = robot_description(settings)
+
+    def send(*words: str) -> None:
+        channel.send(" ".join(words).encode())
+
+    listener = Compilations(lambda name: send(name, "is being compiled"), lambda name: send(name, COMPILED))
+    with event.install_listener("numba:compile", listener), ahead_of_others():
+        if is_first:
+            rehearse_intake(settings)
+            warm_up(settings, skill_of(skill).for_loop(), urdf=urdf)
+        else:
+            rehearse_motion(settings, urdf)

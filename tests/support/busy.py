@@ -1,0 +1,57 @@
+"""Tests that fail while the machine is busy are run again, and counted apart if they then pass.
+
+A process of the tests that waits for a processor as long as it has one shares it with others that
+these tests did not start: two workers and their daemons on two idle cores wait for a third of that.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+WAITING_SHARE = 0.5  # of the time in which a process could have run; see the module's text
+BUSY = "busy"
+SCHEDULED = Path("/proc/self/schedstat")  # of the main thread [ns]: on a processor, and waiting for one
+
+
+def run(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
+    """The reports of a test; of its second run if the machine was too busy for the first one."""
+    before_ns = _scheduled_ns()
+    reports = runtestprotocol(item, nextitem=nextitem, log=False)
+    failures = [report for report in reports if report.failed]
+    share = _waiting_share(before_ns)
+    if not failures or share < WAITING_SHARE:
+        return reports
+    item.session._setupstate.teardown_exact(None)  # noqa: SLF001  # as a plug-in that runs tests again has to
+    item._initrequest()  # type: ignore[attr-defined]  # noqa: SLF001
+    again = runtestprotocol(item, nextitem=nextitem, log=False)
+    words = f"its process waited for a processor {100 * share:.0f} % of the time that it could have run"
+    for report in again:
+        if any(other.failed for other in again):
+            report.sections.append((f"run twice, as {words}; the first failure", failures[0].longreprtext))
+        else:
+            report.user_properties.append((BUSY, f"{words}; it passed when it was run again"))
+    return again
+
+
+def note(report: pytest.TestReport) -> str:
+    """Why a test that passed was run twice; empty if it was not."""
+    return str(dict(report.user_properties).get(BUSY, ""))
+
+
+def _scheduled_ns() -> tuple[int, int]:
+    try:
+        running_ns, waiting_ns, _ = SCHEDULED.read_text(encoding="ascii").split()
+    except OSError:  # not Linux, or a kernel without it
+        return 0, 0
+    return int(running_ns), int(waiting_ns)
+
+
+def _waiting_share(before_ns: tuple[int, int]) -> float:
+    """Share of the time since `before_ns` in which the process could run and waited."""
+    now_ns = _scheduled_ns()
+    running_ns = now_ns[0] - before_ns[0]
+    waiting_ns = now_ns[1] - before_ns[1]
+    return waiting_ns / max(running_ns + waiting_ns, 1)
