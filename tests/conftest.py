@@ -17,7 +17,7 @@ from service.files.replay import replay
 from service.learning.skill_file import decoded
 from service.process.child import python
 from service.viewer import vulkan
-from support import busy, forked, tiers
+from support import forked, tiers
 from support.paths import RECORDINGS, ROOT
 
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
@@ -26,6 +26,7 @@ os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of a thousand processes would compile what it imports
 sys.dont_write_bytecode = False
 
+pytest_plugins = ["support.busy"]
 PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
@@ -53,6 +54,8 @@ class _Instantly:
     @pytest.hookimpl(trylast=True)
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Print a failure with what the test printed and logged."""
+        from support import busy  # after pytest has loaded it as a plug-in
+
         terminal = self._config.pluginmanager.get_plugin("terminalreporter")
         if terminal is not None and report.failed:
             terminal.ensure_newline()
@@ -107,22 +110,6 @@ def _file(item: pytest.Item) -> str:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Fork the commands of a test, unless it is about their start or their timing."""
     forked.use(_file(item) not in tiers.REAL_STARTS)
-
-
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-    """Run a test, twice if it fails while the machine is busy."""
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for report in busy.run(item, nextitem):
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
-    """Count what passed when the machine was less busy apart from what passed at once."""
-    if report.when == "call" and report.passed and busy.note(report):
-        return busy.BUSY, "B", "BUSY"
-    return None
 
 
 @pytest.fixture(scope="session")

@@ -48,7 +48,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
-    "set up": ("prepare", "arm", "calibrate", "certificates", "completion"),
+    "set up": ("prepare", "arm", "calibrate", "certificates"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -441,11 +441,6 @@ def parser() -> argparse.ArgumentParser:
     option(browser, "--web", "[HOST:]PORT", web, nargs="?", const="127.0.0.1:0")
     _reach(c)
 
-    about = "Prints or writes a script with which a shell completes these commands, their options and files."
-    example = "thirdhand completion bash --output ~/.local/share/bash-completion/completions/thirdhand"
-    c = command("completion", about, example)
-    c.add_argument("shell", choices=("bash", "zsh", "tcsh"))
-    option(c, "--output", "FILE", "write the script to this file; missing folders are made")
     top.groups = {
         title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
     }

@@ -101,12 +101,6 @@ WORKERS_HELP = (
 )
 ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
 
-FILE_COMPLETION = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-COMPLETION_OF_METAVAR: dict[str | None, dict[str, str]] = {  # the functions with which a shell completes a value
-    **dict.fromkeys(("FILE", "PNG", "DEMO", "FILE|live", "ARM", "CELL"), FILE_COMPLETION),
-    "DIR": {"bash": "_shtab_compgen_dirs", "zsh": "_files -/", "tcsh": "d"},
-}
-
 
 def option(
     c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
@@ -115,9 +109,7 @@ def option(
     if default is not None:
         about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
     more = {"type": TYPE_OF_METAVAR.get(metavar, str), **more}
-    added = c.add_argument(name, metavar=metavar, help=about, default=default, **more)
-    if metavar in COMPLETION_OF_METAVAR:
-        added.complete = COMPLETION_OF_METAVAR[metavar]  # type: ignore[attr-defined]  # as shtab reads it
+    c.add_argument(name, metavar=metavar, help=about, default=default, **more)
 
 
 def flag(c: argparse._ActionsContainer, name: str, about: str) -> None:

@@ -166,18 +166,6 @@ def decode(data: bytes, layout: DType) -> Record:
     return record
 
 
-def converted(record: Record, layout: DType) -> Record:
-    """A record in another layout: the fields of the same name. Fields that it lacks are 0. A record
-    that has this layout is returned as it is.
-    """
-    if record.dtype == layout:
-        return record
-    out = blank(layout)
-    for name in set(layout.names or ()) & set(record.dtype.names or ()):
-        out[name] = record[name]
-    return out
-
-
 def differences(a: Record, b: Record) -> dict[str, float]:
     """Fields in which two records of one layout differ bit for bit, each with the largest
     difference.

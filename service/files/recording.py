@@ -26,18 +26,16 @@ from service.contract import cdr, channels
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.images import COMPRESSED_IMAGE, CompressedImage, decode_image
 from service.contract.messages import SceneObject, WireError
-from service.core.frame import DType, Outputs, Record, Tick, encode
+from service.core.frame import Outputs, Record, Tick, encode
 from service.core.transforms import Frames
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from service.files.mcap_reader import FileFault, Messages, full_name
 from service.files.pose_streams import ENDINGS
-from service.files.steps import REPLAYED, Gap, Step, checksum, layout_in, steps
+from service.files.steps import REPLAYED, Gap, Step, checksum, steps
 from service.files.urdf_markers import with_markers
 from service.settings.config import Settings, robot_description, without_secrets
 
 OBJECTS_NOTE = "objects"
-# Settings that earlier recordings lack, with the values at which these versions behaved.
-EARLIER_SETTINGS = {"tool": {"engage_speed": 0.0}}
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
 DECISIONS = ("mode", "reason", "flags", "commanded", "stage")  # a frame that changes one of these is kept
 NOTED_US = 1000.0  # the timing of a tick that begins or ends this late is kept
@@ -237,7 +235,6 @@ class Recording:
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
         self.faults: list[FileFault] = []  # complete once all steps are read
-        self.recorded_as: dict[str, DType] = {}  # the layouts of its states and frames, once one is read
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -264,11 +261,7 @@ class Recording:
                 f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by another version?"
             )
         try:
-            given = msgspec.json.decode(parts["settings.json"])
-            for section, values in EARLIER_SETTINGS.items():
-                if isinstance(given, dict) and isinstance(given.get(section), dict):
-                    given[section] = values | given[section]
-            settings = validated(given, Settings)
+            settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
         except (msgspec.DecodeError, InvalidError) as error:
             raise RecordingError(f"the settings in {path} are not valid: {in_words(error, named=False)}") from None
         return cls(path, settings, parts, about)
@@ -280,18 +273,6 @@ class Recording:
             return None
         numbers = [number for number, channel in contents.channels.items() if channel.topic in topics]
         return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
-
-    def _read_layouts(self) -> None:
-        """Put the layouts of states and frames into `recorded_as`, as far as the summary has them:
-        checksums of frames come before the first frame.
-        """
-        contents, joints = _summary_of(self.path), len(self.settings.joints.names)
-        if contents is None:
-            return
-        names = channels.keys_by_topic(self.settings.cell, ("state", "frame"))
-        for channel in contents.channels.values():
-            if (name := names.get(channel.topic)) is not None:
-                self.recorded_as[name] = layout_in(contents.schemas.get(channel.schema_id), joints, name)
 
     def steps(self, *, outputs: bool = True, whole: bool = True) -> Iterator[Step]:
         """Every recorded tick in order, after the initial state if there is one.
@@ -305,10 +286,9 @@ class Recording:
                 f"{self.path} has checksums instead of frames: thirdhand replay {shlex.quote(str(self.path))} "
                 "--output whole.mcap writes a recording with all frames"
             )
-        self._read_layouts()
         messages = Messages(self.path)
         whole = not self.checksums
-        yield from steps(messages, self.settings, outputs=outputs, whole=whole, recorded_as=self.recorded_as)
+        yield from steps(messages, self.settings, outputs=outputs, whole=whole)
         self.faults = messages.faults
         self.truncated = any(fault.cut for fault in messages.faults)
 

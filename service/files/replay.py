@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from service.contract import channels
 from service.contract.messages import WireError
 from service.core.controller import Controller, outgoing, run
-from service.core.frame import Event, Frame, Tick, converted, differences, encode
+from service.core.frame import Event, Frame, Tick, differences, encode
 from service.files.mcap_file import RecordingError, machine
 from service.files.recording import Recorder, Recording
 from service.files.steps import Gap, Step, checksum
@@ -254,16 +254,13 @@ class _Comparison:
         """Compare the newest tick's frame, and the state after it, with the recorded ones."""
         step, result, checksums = self.last, self.result, self.recording.checksums
         assert step is not None
-        seen = converted(frame, self.recording.recorded_as.get("frame", frame.dtype))
-        different = {} if step.frame is None else differences(converted(step.frame, seen.dtype), seen)
+        different = {} if step.frame is None else differences(step.frame, frame)
         state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
-        then = state if state is None else converted(state, self.recording.recorded_as.get("state", state.dtype))
-        if step.state is not None and then is not None:
-            recorded = converted(step.state, then.dtype)
-            different |= {f"state.{name}": value for name, value in differences(recorded, then).items()}
+        if step.state is not None and state is not None:
+            different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
         outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
-        same = not different and (not checksums or checksums.get(tick.index) == checksum(seen, outputs, then))
-        same = same and step.checksum in (None, checksum(seen))
+        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        same = same and step.checksum in (None, checksum(frame))
         if self.recorder:
             self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
         result.ticks += 1

@@ -9,22 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from mcap.records import Schema
-
 from service.contract import cdr, channels
 from service.contract.messages import WireError
-from service.contract.records import definition
 from service.core.frame import (
-    FRAME,
-    STATE,
     TIMING,
-    DType,
     Frame,
     Outputs,
     Record,
-    converted,
     decode,
-    dtype_of,
     encode,
     frame_layout,
     state_layout,
@@ -34,17 +26,6 @@ from service.files.mcap_reader import Messages
 from service.settings.config import Settings
 
 _RECORDS = ("frame", "timing", "state")
-# Fields of a State or a Frame that recordings of earlier versions lack: these versions behaved as
-# with a 0.
-LATER_FIELDS = {
-    *("clutch_until_tick", "gripper_wish", "engaging", "followed_tick", "task_clock"),
-    *("known_gate_m", "unprimed_belief", "error_probability"),
-    *("guided_until_tick", "guided_tick", "held", "held_tick", "held_stage", "held_hands"),
-    *("tremor_rate", "trembles", "tremors", "bank_stamps_ns", "bank_ticks", "bank_means", "bank_covariances"),
-    *("bank_evidence", "bank_variances", "stale_ticks", "longest_delay_ticks", "corrected_tick", "doubted_samples"),
-    "hand_doubt_m",
-}
-_LAYOUTS = {"state": STATE, "frame": FRAME}
 REPLAYED = {*channels.EVENT_NUMBERS, *_RECORDS, "tick", "skill_in_force"}
 
 
@@ -97,24 +78,10 @@ def checksum(frame: Frame, outputs: Outputs = (), state: Record | None = None) -
     return zlib.crc32(b"".join(parts))
 
 
-def layout_in(schema: Schema | None, joints: int, name: str) -> DType:
-    """The layout of a recording's states or frames (`name`), by the definition in it: today's, or
-    one of an earlier version, without some of LATER_FIELDS.
-    """
-    today = _LAYOUTS[name]
-    text = schema.data.decode(errors="replace") if schema else ""
-    then = tuple(field for field in today if field.name not in LATER_FIELDS or f" {field.name}\n" in text)
-    return dtype_of(then if definition(then, joints) == text else today, joints)
-
-
-def steps(
-    messages: Messages, settings: Settings, *, outputs: bool, whole: bool, recorded_as: dict[str, DType]
-) -> Iterator[Step]:
+def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
     """Every complete tick in order, after the initial state if there is one.
 
-    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. The
-    layouts in which states and frames were recorded are put into `recorded_as`; they are converted
-    from it.
+    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame.
     Raises RecordingError for messages that cannot be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
@@ -138,7 +105,7 @@ def steps(
         yield Step(**step | {"events": tuple(step["events"])})
 
     try:
-        for schema, channel, message in messages:
+        for _, channel, message in messages:
             if len(messages.faults) > seen:
                 yield from finished()
                 damage = "; ".join(str(fault) for fault in messages.faults[seen:])
@@ -147,12 +114,6 @@ def steps(
             if name is None or (name in _RECORDS and not outputs):
                 continue
             data = message.data
-            if name in _LAYOUTS:
-                if name not in recorded_as:
-                    recorded_as[name] = layout_in(schema, joints, name)
-                then = recorded_as[name]
-                if then != layouts[name]:
-                    data = encode(converted(decode(data, then), layouts[name]))
             if name == "tick":
                 yield from finished()
                 index, kinds, lost, recorded_sum = cdr.decode_tick(data)

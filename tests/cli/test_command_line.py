@@ -1,4 +1,4 @@
-"""The command line as a whole: groups, one word for one thing, completion, and exit codes."""
+"""The command line as a whole: groups, one word for one thing, and exit codes."""
 
 from __future__ import annotations
 
@@ -247,44 +247,6 @@ def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
     assert "thirdhand view live --web" in text
 
 
-# --- completion -----------------------------------------------------------------------------------
-
-BASH = """
-source "$1"
-COMP_WORDS=({words})
-COMP_CWORD={last}
-COMP_LINE="{words}"
-_shtab_thirdhand thirdhand
-printf '%s\\n' "${{COMPREPLY[@]}}"
-"""
-
-
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("thirdhand via", {"via-points"}),
-        ("thirdhand via-points l", {"list"}),
-        ("thirdhand status --wat", {"--watch"}),
-        ("thirdhand record --f", {"--folder"}),
-        ("thirdhand serve --joints a", {"assumed"}),
-    ],
-)
-def test_a_shell_completes_commands_options_and_choices(words: str, found: set[str], tmp_path: Path) -> None:
-    pytest.importorskip("shtab", reason="shtab, which writes the shells' scripts, is not installed")
-    script = tmp_path / "thirdhand"
-    done = told("completion", "bash")
-    assert done.returncode == 0, done.stderr
-    script.write_text(done.stdout)
-    program = BASH.format(words=words, last=len(words.split()) - 1)
-    written = tmp_path / "missing" / "folders" / "thirdhand"
-    assert told("completion", "bash", "--output", str(written)).returncode == 0
-    assert written.read_text() == script.read_text().removesuffix("\n")
-    asked = subprocess.run(
-        ["bash", "-c", program, "bash", str(script)], capture_output=True, text=True, timeout=30, check=False
-    )
-    assert set(asked.stdout.split()) == found, asked.stderr
-
-
 @pytest.mark.parametrize(
     "command",
     ["certificates /dev/full", "demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
@@ -298,12 +260,12 @@ def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> Non
 
 def test_that_the_output_is_full_is_said_in_words() -> None:
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "service", "completion", "bash"]
+        command = [sys.executable, "-m", "service", "serve", "--check"]
         done = subprocess.run(
             command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=ROOT
         )
     assert done.returncode == 1
-    assert done.stderr == "thirdhand completion: No space left on device; room on that disk needed\n"
+    assert done.stderr == "thirdhand serve: No space left on device; room on that disk needed\n"
 
 
 def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:

@@ -10,19 +10,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
-from service.contract.records import Mode, Reason, definition
-from service.core.controller import Controller, outgoing, run
-from service.core.frame import STATE, Event, Frame, Tick, converted, definitions, dtype_of
+from service.contract.records import Mode, Reason
+from service.core.controller import Controller, run
+from service.core.frame import Event, Frame, Tick
 from service.core.skill.skill import Skill
-from service.files import mcap_file
 from service.files.mcap_file import RecordingError
-from service.files.recording import DECISIONS, EARLIER_SETTINGS, Recorder, Recording
+from service.files.recording import DECISIONS, Recorder, Recording
 from service.files.replay import replay, ticks
-from service.files.steps import LATER_FIELDS, checksum
 from service.learning.via_points import adapted
 from sim.closed_loop import joints_event
 from sim.golden import ENCODED, ENCODED_SPEED, refresh
@@ -156,56 +153,6 @@ def test_what_was_recorded_replays_identically(recorded: Path) -> None:
     result = replay(recorded)
     assert result.exact
     assert result.text() == "1000 ticks, 1000 frames identical"
-
-
-def test_a_recording_without_the_later_fields_of_a_state_replays_identically(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As an earlier version wrote it: fewer fields in states, and checksums of them."""
-    recording, path = Recording.open(recorded), tmp_path / "earlier.mcap"
-    fields = tuple(field for field in STATE if field.name not in LATER_FIELDS)
-    earlier, now = dtype_of(fields, 7), definitions(7)
-    monkeypatch.setattr(mcap_file, "definitions", lambda joints: now | {"thirdhand/State": definition(fields, joints)})
-    start, *steps = recording.steps()
-    assert start.state is not None
-    sums = np.zeros(len(steps), "<u4")
-    for step in steps:
-        assert step.frame is not None
-        outputs = outgoing(step.frame, step.time_ns, recording.settings.joints.names)
-        state = None if step.state is None else converted(step.state, earlier)
-        sums[step.tick] = checksum(step.frame, outputs, state)
-    for checksums in (b"", sums.tobytes()):
-        settings, state = recording.settings, converted(start.state, earlier)
-        with Recorder(path, settings=settings, skill=recording.skill, state=state, checksums=checksums) as recorder:
-            for tick, step in zip(ticks(recording), steps, strict=True):
-                assert step.frame is not None
-                kept = step.frame if not checksums or step.state is not None else None
-                state = None if step.state is None or checksums else converted(step.state, earlier)
-                recorder.write(tick, kept, time_ns=step.time_ns, state=state)
-        result = replay(path)
-        assert result.exact, result.text()
-        assert result.ticks == len(steps)
-
-
-def test_settings_that_an_earlier_recording_lacks_are_as_they_were_then(
-    tmp_path: Path, skill: Skill, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    attach = Recorder.attach
-
-    def attach_fewer(self: Recorder, name: str, data: bytes, time_ns: int) -> None:
-        if name == "settings.json":
-            settings = msgspec.json.decode(data)
-            for section, values in EARLIER_SETTINGS.items():
-                settings[section] = {key: value for key, value in settings[section].items() if key not in values}
-            data = msgspec.json.encode(settings)
-        attach(self, name, data, time_ns)
-
-    monkeypatch.setattr(Recorder, "attach", attach_fewer)
-    slow = msgspec.structs.replace(ASSUMED, tool=msgspec.structs.replace(ASSUMED.tool, max_speed=0.1))
-    Recorder(tmp_path / "earlier.mcap", settings=slow, skill=skill.file).close()
-    earlier = Recording.open(tmp_path / "earlier.mcap").settings
-    assert slow.tool.engage_speed > slow.tool.max_speed
-    assert earlier.tool == msgspec.structs.replace(slow.tool, engage_speed=0.0)
 
 
 def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:

@@ -16,7 +16,21 @@ BUSY = "busy"
 SCHEDULED = Path("/proc/self/schedstat")  # of the main thread [ns]: on a processor, and waiting for one
 
 
-def run(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
+    """Run a test, twice if it fails while the machine is busy."""
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for report in _reports(item, nextitem):
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
+    """Count what passed when it was run again apart from what passed at once."""
+    return (BUSY, "B", "BUSY") if report.when == "call" and report.passed and note(report) else None
+
+
+def _reports(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
     """The reports of a test; of its second run if the machine was too busy for the first one."""
     before_ns = _scheduled_ns()
     reports = runtestprotocol(item, nextitem=nextitem, log=False)
