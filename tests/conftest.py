@@ -58,11 +58,11 @@ class _Instantly:
 
         terminal = self._config.pluginmanager.get_plugin("terminalreporter")
         if terminal is not None and report.failed:
-            terminal.ensure_newline()
+            terminal.write("\n")
             terminal.section(f"{report.nodeid} failed in {report.when}", sep="_")
             terminal._outrep_summary(report)  # noqa: SLF001  # as at the end of the run
         elif terminal is not None and (words := busy.note(report)) and report.when == "call":
-            terminal.ensure_newline()
+            terminal.write("\n")
             terminal.write_line(f"{report.nodeid} failed: {words}")
 
     def pytest_sessionfinish(self) -> None:

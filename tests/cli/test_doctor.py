@@ -230,6 +230,7 @@ def test_words_that_are_not_known_are_answered_with_the_nearest(capsys: pytest.C
     assert "did you mean" not in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_an_arm_whose_drives_are_off_is_told_with_a_joints_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,6 +30,7 @@ def rows(path: Path) -> list[list[str]]:
         return list(csv.reader(file))
 
 
+@pytest.mark.thorough
 def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,7 @@ from support.wam import STATE
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)])
 @pytest.mark.parametrize("distance_m", [0.01, 0.1, 0.3])
+@pytest.mark.one_case
 def test_a_jump_is_approached_without_overshoot(direction: tuple[float, ...], distance_m: float) -> None:
     way = distance_m * np.array(direction) / np.linalg.norm(direction)
     states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 2000)

@@ -257,6 +257,7 @@ def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
 
 
 @pytest.mark.parametrize("change_m", [0.0, 0.002])
+@pytest.mark.one_case
 def test_compiled_and_plain_functions_agree(change_m: float) -> None:
     random = np.random.default_rng(4)
     root = random.normal(size=(MODES, STATES, STATES))

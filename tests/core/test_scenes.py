@@ -224,7 +224,7 @@ def test_a_quick_reach_is_no_fault_and_passes_no_speed(taught: Skill, name: str)
 
 
 @pytest.mark.parametrize("seed", range(MANY or 8))
-@pytest.mark.one_case
+@pytest.mark.thorough
 def test_legal_hands_and_a_lowered_speed_never_fault(skill: Skill, taught: Skill, seed: int) -> None:
     """As at the first start of a new arm, whose joints docs/hardware.md slows to a tenth."""
     random = np.random.default_rng(seed)

@@ -158,6 +158,7 @@ def named(count: int, *, timetable: bool) -> list[Demonstration]:
     return out
 
 
+@pytest.mark.thorough
 def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     shown = named(6, timetable=True)
     skill = learn(shown)

@@ -278,6 +278,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     shared_daemon.client.ask("resume")
 
 
+@pytest.mark.thorough
 def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

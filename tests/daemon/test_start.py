@@ -97,6 +97,7 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
             del sys.modules[name]
 
 
+@pytest.mark.thorough
 def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

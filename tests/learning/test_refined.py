@@ -70,6 +70,7 @@ def test_takes_that_do_it_as_the_others_did_count_as_theirs(others: StoredSkill)
     assert found.weights_mm[found.weight] < 0.9 * found.weights_mm["yours alone"]
 
 
+@pytest.mark.thorough
 def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_theirs() -> None:
     shown = [one.demonstration.every(3) for one in takes("three", people=range(3), each=2)]
     shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]

@@ -56,6 +56,7 @@ def moved(places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]
     )
 
 
+@pytest.mark.thorough
 def test_places_of_a_hand_that_are_one_are_found(between: Skill) -> None:
     assert isinstance(between.model, StagedKMP)
     task = between.model.task
@@ -246,6 +247,7 @@ def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
     return skill.model.task.leads, msgspec.json.decode(skill.figures, type=Figures)
 
 
+@pytest.mark.thorough
 def test_a_hand_that_the_tool_follows_leads_if_that_predicts_better(on_path: list[Demonstration]) -> None:
     leads, figures = lead_of(on_path)
     assert leads == LEFT
@@ -292,6 +294,7 @@ def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carrie
     assert with_file(replace(again, file=b"")).file == carried.file
 
 
+@pytest.mark.thorough
 def test_its_velocity_is_that_of_the_turning_hand_and_without_orientation_it_moves_only(carried: StoredSkill) -> None:
     model, still = carried.model, np.zeros((2, 3))
     hands, belief = model.hands[1].reshape(2, 3), model.belief(model.hands[1])

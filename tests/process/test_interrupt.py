@@ -122,6 +122,7 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
     assert "Traceback" not in text
 
 
+@pytest.mark.thorough
 def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
     said, skill = tmp_path / "said", tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
