@@ -87,10 +87,6 @@ class CompiledCache:
                 file.write(hashlib.sha256(payload).digest() + payload)
             os.replace(file.name, path)
 
-    def is_filled(self) -> bool:
-        """True if the function is cached for any signature."""
-        return any(self._folder.glob(f"{self._name}-*"))
-
     def flush(self) -> None:
         """Remove what is cached of this function."""
         for path in self._folder.glob(f"{self._name}-*"):

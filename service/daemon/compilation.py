@@ -34,7 +34,7 @@ class Compilations(event.Listener):  # type: ignore[misc]
     name, `package.module.function`.
     """
 
-    def __init__(self, begun: Callable[[str], object], ended: Callable[[str], object] = lambda name: None) -> None:
+    def __init__(self, begun: Callable[[str], object], ended: Callable[[str], object]) -> None:
         self._begun, self._ended = begun, ended
 
     def on_start(self, event: event.Event) -> None:

@@ -1,4 +1,4 @@
-"""Whether Python finds compiled bytecode; without it, a daemon's start takes twice as long."""
+"""Packages without compiled bytecode, with which a daemon's start takes twice as long."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was compiled is kept for the same sources, wherever they are, and for no others."""
+"""Compiled code is kept for the same sources, wherever they are, and for no others."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Checkout:
         path.write_text(path.read_text().replace(before, after) + "# of another length, as bytecode is trusted by it\n")
 
     def result(self) -> list[float]:
-        """What the outer function returns for 1, and how many functions a new process compiled."""
+        """The outer function's result for 1, and the number of functions compiled for it."""
         return self.run(CALLED)
 
     def run(self, program: str, *arguments: str) -> list[float]:
