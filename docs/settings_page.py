@@ -52,14 +52,6 @@ values that would have been accepted.
   and `zenoh_config` start from the folder of the file, those of `[files]` from the folder where the
   command runs.
 """
-RETIRED_HEAD = """
-## Retired settings
-
-A file may still hold these. The daemon accepts them with a warning, and they have no effect.
-
-| setting | instead |
-|---|---|
-"""
 
 
 def page() -> str:
@@ -73,8 +65,6 @@ def page() -> str:
             for kind, name in _tables(field)
             for part in _section(kind, name)
         )
-        + RETIRED_HEAD
-        + "".join(f"| `[{table}] {name}` | {advice} |\n" for (table, name), advice in config.RETIRED.items())
     )
 
 
@@ -93,8 +83,7 @@ def _section(kind: Any, name: str) -> Iterator[str]:
         yield f"\n## [{name}]\n\n{_paragraphs(kind)}\n"
     yield "\n| setting | default | accepted | meaning |\n|---|---|---|---|\n"
     for field in types.type_info(kind).fields:  # type: ignore[attr-defined]
-        is_retired = (name, field.name) in config.RETIRED
-        if not is_retired and not isinstance(field.type, types.StructType | types.DictType):
+        if not isinstance(field.type, types.StructType | types.DictType):
             cells = (f"`{field.name}`", _value(_default(field)), _accepted(field.type), comments.get(field.name, ""))
             yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
 

@@ -25,7 +25,6 @@ references in other ways; `orientation`, `constraints`, `plot`, `estimator`; `st
 `named_arrays` write files.
 """
 
-import sys
 import typing
 
 from kmp.arrays.checks import RankReached, ViaPointMissed
@@ -79,19 +78,6 @@ __all__ = [
     "save",
     "superposed",
 ]
-
-# Pickles of earlier versions name modules that have moved.
-_MOVED_MODULES = {
-    "affine_mean": "problem.hyperparameters",
-    "compiled_query": "loops.query",
-    "correlation": "references.correlation",
-    "database": "problem.database",
-    "gmm": "mixture",
-    "hyperparameters": "problem.hyperparameters",
-    "inner": "predictor",
-    "inverse_cholesky": "arrays.inverse_cholesky",
-}
-sys.modules.update({f"kmp.{old}": sys.modules[f"kmp.{new}"] for old, new in _MOVED_MODULES.items()})
 
 
 def __getattr__(name: str) -> typing.Any:

@@ -73,7 +73,7 @@ def load(path: str | Path) -> Stored:
     """The value that `save` wrote, and the units; a primitive predicts the same, bit for bit.
 
     Raises OSError if the file cannot be read, and ValueError if `save` did not write it or it was
-    changed since. Files of earlier versions have no checksum, and load without.
+    changed since.
     """
     check_kind("path", str(path) if isinstance(path, Path) else path, str, "the file's name")
     try:
@@ -87,7 +87,7 @@ def load(path: str | Path) -> Stored:
         raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again.")
     if (given := arrays["kmp_format"].tolist()) != _FORMAT:
         raise ValueError(f"{path}: format {brief(given)} given, {_FORMAT} needed. Load it with the kmp that wrote it.")
-    if "checksum" in arrays and str(arrays["checksum"]) != checksum(arrays):
+    if str(arrays.get("checksum")) != checksum(arrays):
         raise ValueError(
             f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."
         )

@@ -64,7 +64,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--once", action="store_true", help=once)
     output = "write reports to this file, one JSON object per line; - is standard output"
     option(p, "--output", "FILE", output, type=str)
-    p.add_argument("--json", dest="output", help=argparse.SUPPRESS)  # an option of earlier versions, like --duration
     p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
     p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     option(p, "--wait", "S", "wait this long for the first command, and again for tracked hands", 60.0)

@@ -226,7 +226,7 @@ def measured(count: int, seconds: float) -> dict[str, Any]:
         for one in routers.values():
             stack.callback(one.kill)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.enter_context(launched(folder, "--arm", "assumed", network=config))
+        stack.enter_context(launched(folder, "--joints", "assumed", network=config))
         session = stack.enter_context(open_session(connect=[b.endpoint]))
         client = Client(session, REAL_CELL)
         client.wait_until_ready(timeout_s=OPEN_S)

@@ -178,7 +178,7 @@ def refresh(path: Path) -> dict[str, float]:
     except RecordingError:  # frames or states had another layout, and cannot be compared
         before = []
     beside = path.with_suffix(".new")
-    frames = record(beside, old.settings, decoded(old.skill, origin=str(path), recorded=True), ticks(old))
+    frames = record(beside, old.settings, decoded(old.skill, origin=str(path)), ticks(old))
     beside.replace(path)
     now = {int(frame["tick"]): frame for frame in frames}
     checksums = Recording.open(path).checksums

@@ -6,6 +6,7 @@ from service.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,7 @@ for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of a thousand processes would compile what it imports
 sys.dont_write_bytecode = False
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's `&` has it ignored, and children inherit that
 
 pytest_plugins = ["support.busy"]
 PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()

@@ -162,28 +162,6 @@ def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() 
     assert panels(layout["layout"]) == set(layout["configById"])
 
 
-# In the code still, and being replaced: once one is gone, it belongs into the glossary's table.
-RETIRING = ("rehearse", "FASTEST", "Placed")
-
-
-def with_word(word: str) -> list[str]:
-    """Sources and pages that contain a whole word; without the glossary."""
-    pattern = re.compile(rf"(?<!\w){re.escape(word)}" + r"(?!\w)" * word[-1].isalnum())
-    folders = (ROOT / name for name in ("service", "kmp", "sim", "docs", "examples"))
-    files = [path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".md", ".html")]
-    pages = [path for path in (*files, ROOT / "README.md") if path.name != "glossary.md"]
-    return [str(path.relative_to(ROOT)) for path in pages if pattern.search(path.read_text(encoding="utf-8"))]
-
-
-def test_a_word_that_the_glossary_retires_does_not_come_back() -> None:
-    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
-    retired = [word for row in cells_below(text, "retired") for word in re.findall(r"`([^`]+)`", row[0])]
-    assert len(retired) >= 20
-    assert {word: found for word in retired if (found := with_word(word))} == {}
-    assert not set(retired) & set(RETIRING)
-    assert [word for word in RETIRING if not with_word(word)] == [], "gone: move it to the table in docs/glossary.md"
-
-
 # All but the log of changes.
 PAGES = sorted(
     path

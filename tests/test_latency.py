@@ -130,7 +130,7 @@ def test_busy_processes_take_no_message_from_a_subscriber(tmp_path: Path) -> Non
     def note(sample: zenoh.Sample) -> None:
         numbers.setdefault(str(sample.key_expr), []).append(sample.source_info.source_sn)
 
-    with serving(tmp_path, "--arm", "assumed", "--rate", str(RATE_HZ)) as daemon, Tracker(daemon.session):
+    with serving(tmp_path, "--joints", "assumed", "--rate", str(RATE_HZ)) as daemon, Tracker(daemon.session):
         daemon.until(lambda status: status["mode"] == "follow")
         heard = [daemon.session.declare_subscriber(f"thirdhand/{key}/*", note) for key in ("joints", "tool")]
         busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]

@@ -26,7 +26,7 @@ def program() -> str:
 def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(tmp_path: Path) -> None:
     assert len([line for line in program().splitlines() if line]) <= 10
     site = unpacked(wheel_of(CLIENT, tmp_path), tmp_path / "site")
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = {"THIRDHAND_CONNECT": daemon.endpoint, "HOME": str(tmp_path)}
         for _ in range(3):  # a busy machine may leave the hands stale, or the skill worker without time
             done = isolated(site, program(), "zenoh", "msgspec", env=environment)
@@ -42,7 +42,7 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
     """Its program as it stands, but shorter: the left hand moves to the tool once."""
     page = (ROOT / "docs" / "first-tracker.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"<!-- tracker -->\n```python\n(.*?)```", page, re.DOTALL)
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = os.environ | {"THIRDHAND_CONNECT": daemon.endpoint, "PYTHONPATH": str(ROOT)}
         before = daemon.client.status().tool_m
         command = [sys.executable, "-c", code.replace("range(3000)", "range(315)")]

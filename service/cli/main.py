@@ -10,8 +10,6 @@ import argparse
 import contextlib
 import importlib
 import os
-import sys
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,6 @@ from service.contract.roles import DAEMON, ROLES
 from service.learning.residual_risk import OPTION
 from service.process import interrupt
 from service.process.progress import say
-from service.settings.config import RetiredSettingWarning
 from service.settings.file_content import SettingsError, UnreadableError
 
 RUN_BY = {  # the modules that are not named as their command
@@ -139,7 +136,6 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
     joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
-    c.add_argument("--arm", dest="joints", choices=("state", "assumed"), help=argparse.SUPPRESS)  # its earlier name
     option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
@@ -474,20 +470,9 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
     return sub
 
 
-def _show_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
-) -> None:
-    """Show a warning about a file in one line; others with their place in the program."""
-    if issubclass(category, RetiredSettingWarning):
-        say(f"thirdhand: {message}")
-    else:
-        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line and return its exit code."""
     args = parser().parse_args(arguments)
-    warnings.showwarning = _show_warning
     module, function = args.run.rsplit(".", 1)
     try:
         if "reaches" in args and not vars(args).get("config"):

@@ -217,8 +217,8 @@ def topic(cell: str, suffix: str) -> str:
 
 
 def keys_by_topic(cell: str, suffixes: Iterable[str]) -> dict[str, str]:
-    """The channels' keys by topic, with and without the slash that earlier recordings lack."""
-    return {name: suffix for suffix in suffixes for name in (topic(cell, suffix), key(cell, suffix))}
+    """The channels' keys by their topics in a recording."""
+    return {topic(cell, suffix): suffix for suffix in suffixes}
 
 
 STREAMS = tuple(channel for channel in CHANNELS if channel.direction == "out" and channel.every)

@@ -52,13 +52,12 @@ class SavedViaPoints:
 
     def __init__(self, settings: Settings, distances_m: Callable[[Settings, Vector], Vector] = beyond_m) -> None:
         self._folder, self._settings, self._distances_m = state_folder(settings), settings, distances_m
-        self._arm, self._shipped_arm = _identity(settings), _identity(Settings())
+        self._arm = _identity(settings)
         self.remark = ""  # message on via-points that were set aside by the last reading
 
     def path(self, skill: Skill) -> Path:
         """The file for this skill and arm, named by a hash of the skill's demonstrations."""
-        arm = "" if self._arm == self._shipped_arm else self._arm  # as files of earlier versions were named
-        digest = hashlib.blake2b((skill.learned_from + arm).encode(), digest_size=6).hexdigest()
+        digest = hashlib.blake2b((skill.learned_from + self._arm).encode(), digest_size=6).hexdigest()
         return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
@@ -111,7 +110,7 @@ class SavedViaPoints:
         if saved.pop("checksum", None) != _checksum(saved):
             raise UnusableError("the checksum is wrong, so the file was edited; teach the via-points again")
         request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
-        if (saved["learned_from"], saved.get("arm", self._shipped_arm)) != (skill.learned_from, self._arm):
+        if (saved["learned_from"], saved["arm"]) != (skill.learned_from, self._arm):
             return None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 

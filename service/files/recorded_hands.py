@@ -112,7 +112,7 @@ def _of_session(
     recording: Recording, settings: Settings | None, skill: StoredSkill | None, part: tuple[float, float] | None
 ) -> RecordedHands:
     path, state = recording.path, None
-    used = skill or decoded(recording.skill, origin=path.name, recorded=True)
+    used = skill or decoded(recording.skill, origin=path.name)
     with contextlib.suppress(RecordingError):  # states of another version are not needed
         state = next((step.state for step in recording.steps(whole=False) if step.state is not None), None)
     whole = list(ticks(recording))

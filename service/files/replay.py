@@ -124,7 +124,7 @@ class _Skills:
 
     def decoded(self, data: bytes) -> StoredSkill:
         """The skill in the bytes of its file, always the same object. Raises SkillError."""
-        skill = decoded(data, origin="the recording", recorded=True)
+        skill = decoded(data, origin="the recording")
         return self._found.setdefault(skill.digest, skill)
 
     def events(self, step: Step) -> tuple[Event, ...]:

@@ -155,12 +155,8 @@ def _digest(file: bytes) -> bytes:
     return hashlib.blake2b(file, digest_size=16).digest()
 
 
-def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
-    """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError.
-
-    Files of earlier versions have no checksum. They are accepted if `recorded`, as recordings have
-    checksums of their own.
-    """
+def decoded(data: bytes, *, origin: str) -> StoredSkill:
+    """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError."""
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
         made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
         raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
@@ -173,7 +169,7 @@ def decoded(data: bytes, *, origin: str, recorded: bool = False) -> StoredSkill:
         if (kind := arrays["format"].item()) not in FORMATS:
             accepted = ", ".join(map(str, sorted(FORMATS)))
             raise SkillError(f"{origin}: skill of format {kind}, of {accepted} needed: learn it anew with this version")
-        for fault in _spoilt(arrays, recorded=recorded):
+        for fault in _spoilt(arrays):
             raise SkillError(f"{origin}: {fault}")
         model, via_points = _model(arrays), validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
         turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
@@ -236,7 +232,7 @@ def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
     return next((model for model in MODELS if kind in model.formats), (*own, MODELS[0])[0])
 
 
-def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[str]:
+def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
@@ -265,11 +261,8 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]], *, recorded: bool) -> Iterator[s
         yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
     if len(arrays["base_inputs"]) > MOST_POINTS:
         yield f"{len(arrays['base_inputs'])} reference points, at most {MOST_POINTS} accepted"
-    if "checksum" in arrays:
-        if str(arrays["checksum"]) != checksum(arrays):
-            yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
-    elif not recorded:
-        yield "no checksum: written by an earlier version, or changed; learn it anew"
+    if str(arrays["checksum"]) != checksum(arrays):
+        yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
 
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:

@@ -78,7 +78,7 @@ def stored_demonstrations(skill: StoredSkill) -> list[NamedDemonstration]:
     if not skill.demonstrations:
         raise SkillError(
             f"skill {skill.name!r} cannot be refined: its file does not hold the demonstrations that it was learned "
-            f"from, as an earlier version wrote it; {REMEDY}"
+            f"from; {REMEDY}"
         )
     try:
         with np.load(io.BytesIO(skill.demonstrations), allow_pickle=False) as archive:

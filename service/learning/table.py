@@ -74,7 +74,7 @@ def table(found: Figures) -> str:
 
 
 def _told(found: Figures) -> list[str]:
-    """A line on the samples at which the skill is unsure; none in figures of earlier versions."""
+    """A line on the samples at which the skill is unsure; none if there are none."""
     if not (found.all.wrong or found.all.falsely_told):
         return []
     wrong = f"{found.all.wrong:.1f} % of the samples are missed by more than 10 cm"

@@ -206,7 +206,7 @@ def _take_events(found: Columns, step: Step) -> None:
 
 def _take_skill(found: Columns, file: bytes, tick: int) -> None:
     try:
-        skill = decoded(file, origin=found.recording.path.name, recorded=True)
+        skill = decoded(file, origin=found.recording.path.name)
     except SkillError as error:
         found.remarks.append(f"a skill cannot be read, so its via-points are not listed: {error}")
         return

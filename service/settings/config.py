@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -44,14 +43,6 @@ LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 
 
-# Retired settings by table and name, and what takes their place. In a cell's file they are accepted
-# with a warning and have no effect. Recordings replay with the values that they hold.
-RETIRED = {
-    ("tool", "jerk_weight"): "a lower max_jerk makes the tool follow more calmly",
-    ("tool", "stop_room"): "follow chooses between lag and overshoot",
-}
-
-
 class Following(NamedTuple):
     """Values that `[tool] follow` sets together."""
 
@@ -64,10 +55,6 @@ FOLLOWING = {
     "default": Following(stop_room=1.0, jerk_share=1.0),
     "calmly": Following(stop_room=0.5, jerk_share=0.5),
 }
-
-
-class RetiredSettingWarning(FutureWarning):
-    """A file has a setting that is retired."""
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -123,9 +110,7 @@ class ToolSettings(Section, frozen=True):
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
-    jerk_weight: Annotated[float, msgspec.Meta(ge=1e-11, le=1e-5)] = 2.8e-9  # [s⁶] retired: see RETIRED
     follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: see `tune`
-    stop_room: Annotated[float, msgspec.Meta(ge=0, le=3)] = 1.0  # retired: see RETIRED
     max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
     @property
@@ -156,7 +141,7 @@ class ToolSettings(Section, frozen=True):
     @property
     def room(self) -> float:
         """Share of the hand's braking distance that the setpoint uses for its own stop."""
-        return FOLLOWING[self.follow].stop_room * self.stop_room
+        return FOLLOWING[self.follow].stop_room
 
     @property
     def stop_acceleration(self) -> float:
@@ -614,10 +599,6 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
     except RecursionError:
         raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None
     given = _of_cell(given, cell, origin)
-    for (table, name), advice in RETIRED.items():
-        if isinstance(given.get(table), dict) and given[table].pop(name, None) is not None:
-            text = f"{origin}: [{table}] {name} is retired and has no effect; {advice}"
-            warnings.warn(text, RetiredSettingWarning, stacklevel=2)
     return converted(given, origin=origin, folder=folder)
 
 

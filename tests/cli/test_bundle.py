@@ -63,7 +63,7 @@ def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pyt
     keys = [path.read_text() for path in (tmp_path / "keys").rglob("*key*") if path.is_file()]
     assert len(keys) > 5
     network = f'[network]\nlisten = ["tcp/127.0.0.1:0#iface=lo;connect_private_key_base64={SECRET}"]\n'
-    arguments = ("--arm", "assumed", "--record", str(tmp_path / "recordings"))
+    arguments = ("--joints", "assumed", "--record", str(tmp_path / "recordings"))
     with serving(tmp_path, *arguments, network=network) as daemon, Tracker(daemon.session):
         daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
         daemon.until(lambda now: os.stat(now["scribe"]["recording"]).st_size > 50_000)

@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 
 def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(tmp_path: Path) -> None:
-    with serving(tmp_path, "--arm", "assumed", "--log", "json") as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--log", "json") as daemon:
         daemon.client.ask("hold")
         daemon.client.ask("resume")
         assert daemon.end() == 0

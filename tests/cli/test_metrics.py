@@ -67,7 +67,7 @@ def page(endpoint: str) -> Iterator[str]:
 
 def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(tmp_path: Path) -> None:
     network = f"[network]\nlisten = ['tcp/127.0.0.1:{free_port()}']\n"
-    arguments = ("--arm", "assumed", "--record", str(tmp_path / "records"))
+    arguments = ("--joints", "assumed", "--record", str(tmp_path / "records"))
 
     def scrape() -> Samples:
         with urllib.request.urlopen(address, timeout=20) as reply:
@@ -195,7 +195,7 @@ def test_what_prevents_the_page_is_a_sentence_and_an_exit_code(tmp_path: Path) -
     assert (done.returncode, "is a daemon or a router running there?" in done.stderr) == (1, True)
     done = told("metrics", "--listen", "no-port")
     assert (done.returncode, "PORT or HOST:PORT needed" in done.stderr) == (2, True)
-    with serving(tmp_path, "--arm", "assumed") as daemon, socket.create_server(("127.0.0.1", 0)) as taken:
+    with serving(tmp_path, "--joints", "assumed") as daemon, socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         done = thirdhand("metrics", "--listen", address, "--connect", daemon.endpoint)
         assert (done.returncode, f"--listen {address}: Address already in use" in done.stderr) == (1, True)

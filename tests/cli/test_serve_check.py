@@ -164,7 +164,7 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
 def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(tmp_path: Path) -> None:
     listen, mark = f"tcp/127.0.0.1:{free_port()}", tmp_path / "mark"
     network, sabotage = f"[network]\nlisten = ['{listen}']\n", FAILS_ONCE.format(mark=str(mark))
-    with serving(tmp_path, "--arm", "assumed", network=network, before=sabotage) as daemon:
+    with serving(tmp_path, "--joints", "assumed", network=network, before=sabotage) as daemon:
         found = lines(tmp_path, code=0, listen=listen)
         assert found["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
         found = lines(tmp_path, "--cell", "another", code=1, listen=listen)

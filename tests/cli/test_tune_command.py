@@ -10,7 +10,7 @@ import pytest
 
 from service.cli import tune
 from service.report.variants import CHANGES
-from support.cell import thirdhand, told
+from support.cell import told
 from support.paths import RECORDINGS
 
 GOLDEN = str(RECORDINGS / "golden.mcap")
@@ -90,17 +90,3 @@ def test_a_mistake_is_explained(
     assert done.returncode == code, done.stderr
     assert words in done.stderr
     assert done.stdout == ""
-
-
-def test_a_retired_setting_is_accepted_with_a_warning_of_one_line(tmp_path: Path) -> None:
-    cell = tmp_path / "cell.toml"
-    cell.write_text("[tool]\njerk_weight = 1e-8\nmax_jerk = 0\n", encoding="utf-8")
-    done = thirdhand("replay", GOLDEN, "--config", str(cell), timeout=110)
-    warned, *errors = done.stderr.splitlines()
-    assert warned == (
-        f"thirdhand: {cell}: [tool] jerk_weight is retired and has no effect; "
-        "a lower max_jerk makes the tool follow more calmly"
-    )
-    assert "max_jerk" in errors[0]
-    assert "jerk_weight" not in "".join(errors)
-    assert done.returncode == 2

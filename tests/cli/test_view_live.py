@@ -61,7 +61,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """A page beside a daemon that has a live view and sees two hands; slow, for both are drawn
     tick by tick.
     """
-    arguments = ("--arm", "assumed", "--live", "0", "--rate", "100")
+    arguments = ("--joints", "assumed", "--live", "0", "--rate", "100")
     with serving(tmp_path_factory.mktemp("cell"), *arguments) as daemon, Tracker(daemon.session):
         daemon.until(lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S)
         with served(daemon) as url:

@@ -107,7 +107,7 @@ def test_help_says_where_it_is_taken_from(command: str, capsys: pytest.CaptureFi
 
 
 def test_endpoint_and_cell_are_given_once(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving(tmp_path, "--cell", "lab/bench2", "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--cell", "lab/bench2", "--joints", "assumed") as daemon:
         file.write_text(f'connect = "{daemon.endpoint}"\ncell = "lab/bench2"\n')
         for command in (["status"], ["hold"], ["resume"], ["via-points", "list"], ["cells"]):
             assert main(command) == 0, capsys.readouterr().err

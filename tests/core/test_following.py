@@ -12,7 +12,7 @@ from service.core.intake.stage import Intake
 from service.core.setpoint.stage import SetpointGenerator
 from service.core.setpoint.tracker import tracker_gains
 from service.core.skill.model import Target
-from service.settings.config import Settings, ToolSettings
+from service.settings.config import Settings
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE
 
@@ -58,21 +58,18 @@ def test_after_a_hard_stop_it_does_not_swing_back(speed: float, acceleration: fl
 # --- quiet motion ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("weight", [1e-7, 1e-6, 1e-5])
+@pytest.mark.parametrize("max_jerk", [1.0, 5.0, 20.0])
 @pytest.mark.parametrize("distance_m", [0.05, 0.25])
-def test_a_slow_tracker_comes_to_rest_too(weight: float, distance_m: float) -> None:
-    tool, there = msgspec.structs.replace(TOOL, jerk_weight=weight), MIDDLE + np.array([distance_m, 0.0, 0.0])
+def test_a_slow_tracker_comes_to_rest_too(max_jerk: float, distance_m: float) -> None:
+    tool, there = msgspec.structs.replace(TOOL, max_jerk=max_jerk), MIDDLE + np.array([distance_m, 0.0, 0.0])
     states, _ = driven([at_rest(there)] * 3000, start=at_rest(MIDDLE), tool=tool)
     assert np.abs(states[-200:, 2]).max() < 1e-3
     assert states[:, 0, 0].max() < there[0] + 0.005
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "max_jerk", "weight"),
-    [(500, 5.0, 2.8e-9), (500, 2.0, 1e-11), (250, 1.0, 1e-7), (100, 50.0, 1e-7), (50, 20.0, 1e-5)],
-)
-def test_whatever_its_jerk_and_the_loops_rate_it_comes_to_rest(rate_hz: int, max_jerk: float, weight: float) -> None:
-    tool = msgspec.structs.replace(TOOL, jerk_weight=weight, max_jerk=max_jerk)
+@pytest.mark.parametrize(("rate_hz", "max_jerk"), [(500, 5.0), (500, 2.0), (250, 1.0), (100, 50.0), (50, 20.0)])
+def test_whatever_its_jerk_and_the_loops_rate_it_comes_to_rest(rate_hz: int, max_jerk: float) -> None:
+    tool = msgspec.structs.replace(TOOL, max_jerk=max_jerk)
     for way in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
         u = np.minimum(1.0, np.arange(12 * rate_hz) / (0.4 * rate_hz))[:, None]
         reach = np.stack(
@@ -145,8 +142,6 @@ def test_a_reach_that_a_noisy_tracker_sees_is_followed_smoothly(seed: int) -> No
 def test_more_weight_on_jerk_makes_gains_smaller() -> None:
     soft, hard = tracker_gains(1e-8), tracker_gains(1e-9)
     assert (np.abs(soft[[0, 3, 4]]) < np.abs(hard[[0, 3, 4]])).all()
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"jerk_weight": 0.0}, ToolSettings)
 
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 100, 500])

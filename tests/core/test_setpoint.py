@@ -17,10 +17,10 @@ from service.core.setpoint.bounds import speed_to_come, stop_distance
 from service.core.setpoint.stage import SetpointGenerator, SetpointStage
 from service.core.setpoint.step import slow_down
 from service.core.setpoint.tracker import waiting
-from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
+from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, JERK_WEIGHT_S6, RETURN_SHARE
 from service.core.skill.model import Target, Wanted
 from service.core.stops import fastest_stop
-from service.settings.config import Settings, ToolSettings
+from service.settings.config import FOLLOWING, Settings, ToolSettings
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE, URDF
@@ -124,8 +124,7 @@ def test_a_target_on_a_side_of_the_workspace_is_reached_and_the_setpoint_rests_t
         max_speed=speed,
         max_acceleration=10 ** random.uniform(-0.3, 1.3),
         max_jerk=10 ** random.uniform(0.7, 3),
-        jerk_weight=10 ** random.uniform(-11, -5),
-        stop_room=random.uniform(0, 3),
+        follow=str(random.choice(list(FOLLOWING))),
     )
     rate_hz = int(random.choice([50, 70, 100, 125, 250, 333, 500, 700, 1000]))
     settings = Settings(rate_hz=rate_hz, tool=tool if seed % 3 else TOOL)
@@ -138,7 +137,7 @@ def test_a_target_on_a_side_of_the_workspace_is_reached_and_the_setpoint_rests_t
     start = target + random.uniform(0, 0.2) * (BOX.mean(axis=0) - target)
     generator, state = SetpointGenerator(settings), blank(STATE)
     generator.begin(state, at_rest(start))
-    slowest_s = max(tool.jerk_weight ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
+    slowest_s = max(JERK_WEIGHT_S6 ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
     accelerations = []
     for _ in range(round((3.0 + 2.0 * np.linalg.norm(target - start) / speed + 30 * slowest_s) * rate_hz)):
         generator.step(state, Target(*at_rest(target), clamped=True), BOX, FREE, 1.0)

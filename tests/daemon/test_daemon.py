@@ -52,7 +52,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     what was recorded replays identically.
     """
     records = tmp_path / "records"
-    with serving(tmp_path, "--arm", "assumed", "--record", str(records), drawn=True) as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--record", str(records), drawn=True) as daemon:
         daemon.until(lambda s: (s["mode"], s["reason"]) == ("hold", "no_hands"))
         commands = daemon.session.declare_subscriber("thirdhand/joints/command", FifoChannel(100))
         with Tracker(daemon.session) as tracker:
@@ -106,7 +106,7 @@ def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Pa
     """They are recorded in their order, and replayed identically."""
     records, period_ns, bursts = tmp_path / "records", 20_000_000, (3, 1, 3, 2, 3, 30, 3)
     sent: list[list[int]] = []
-    with serving(tmp_path, "--arm", "assumed", "--rate", "50", "--record", str(records)) as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--rate", "50", "--record", str(records)) as daemon:
         with Tracker(daemon.session):
             daemon.until(following)
         daemon.until(lambda s: s["mode"] == "hold")
@@ -136,12 +136,12 @@ def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Pa
 
 def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
     """After the daemon has ended, and after it was killed: its lock keeps nobody out either."""
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
         assert daemon.end() == 0
         assert "earlier run" not in daemon.log.read_text()
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         (said,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
         (file,) = (tmp_path / "state").rglob("places-*.json")
         assert f"via-points of an earlier run are in force (1): handover. They are saved in {file}; " in said
@@ -151,7 +151,7 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]
         daemon.client.ask("via_points", {"op": "clear"})
         daemon.process.kill()
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         assert daemon.client.status().places == ()
 
 
@@ -184,7 +184,7 @@ def test_what_is_not_understood_is_refused_in_words(
 
 @pytest.fixture(scope="module")
 def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with serving(tmp_path_factory.mktemp("shared"), "--arm", "assumed") as daemon:
+    with serving(tmp_path_factory.mktemp("shared"), "--joints", "assumed") as daemon:
         yield daemon
         assert daemon.end() == 0
 
@@ -286,7 +286,7 @@ def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
     (tmp_path / "one.npz").write_bytes(
         learn([one._replace(left=one.right, conducts="right") for one in takes], points=60).file
     )
-    with serving(tmp_path, "--arm", "assumed", "--skill", str(tmp_path / "one.npz")) as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--skill", str(tmp_path / "one.npz")) as daemon:
         add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
         daemon.until(lambda s: s["tick"] > 0)
         with pytest.MonkeyPatch.context() as patch:
@@ -336,7 +336,7 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         at = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = thirdhand("serve", "--listen", at, "--arm", "assumed", env=os.environ | {"HOME": str(tmp_path)})
+        done = thirdhand("serve", "--listen", at, "--joints", "assumed", env=os.environ | {"HOME": str(tmp_path)})
     assert done.returncode == 1
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
 

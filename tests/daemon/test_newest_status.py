@@ -49,7 +49,7 @@ def test_a_status_is_begun_after_it_was_requested_and_a_flood_shares_one() -> No
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder: Path = tmp_path_factory.mktemp("newest")
-    with serving(folder, "--arm", "assumed") as running, Tracker(running.session):
+    with serving(folder, "--joints", "assumed") as running, Tracker(running.session):
         running.until(lambda status: status["mode"] == "follow")
         yield running
 

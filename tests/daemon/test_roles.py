@@ -368,7 +368,7 @@ def test_a_certificate_that_ends_soon_is_reported_by_daemon_doctor_and_cells(tmp
     own = tmp_path / "own"
     assert told("certificates", str(own), "--days", "20").returncode == 0
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{own}/daemon"\n'
-    with launched(tmp_path, "--arm", "assumed", network=config) as service:
+    with launched(tmp_path, "--joints", "assumed", network=config) as service:
         at = ("--connect", service.endpoint, "--certificate", str(own / "operator"))
         assert "certificate ends in 20 days" in told("cells", *at).stdout
         assert re.search(r"note +certificate +ends in 20 days\n.*\n.*--renew", told("doctor", *at).stdout)
@@ -490,7 +490,7 @@ def test_what_the_command_makes_is_private_and_not_written_over(secrets: Path) -
 
 def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path) -> None:
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\n'
-    with launched(tmp_path, "--arm", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
+    with launched(tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
         at = ("--connect", service.endpoint, "--certificate")
         assert service.endpoint.startswith("tls/127.0.0.1:")
         held = thirdhand("hold", *at, str(secrets / "operator"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import re
@@ -178,26 +177,6 @@ def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: 
     assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)
 
 
-def test_a_file_of_before_arms_were_told_apart_is_the_shipped_arms(
-    saved: SavedViaPoints, skill: Skill, tmp_path: Path
-) -> None:
-    """As earlier versions named and wrote it."""
-    points = [{"name": "there", "left": [0.6, -0.2, 0.1], "right": [0.9, 0.3, 0.1], "tool": [0.5, 0.0, 0.3]}]
-    request = {"points": points, "tolerance": 0.04}
-    content = {"skill": skill.name, "learned_from": skill.learned_from, "request": request}
-    checksum = hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
-    name = hashlib.blake2b(skill.learned_from.encode(), digest_size=6).hexdigest()
-    path = tmp_path / "lab" / "bench2" / f"places-{name}.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(content | {"checksum": checksum}))
-    read = saved.read(skill)
-    assert read is not None
-    assert ([point.name for point in read[0]], read[1]) == (["there"], 0.04)
-    other = SavedViaPoints(another_arm(tmp_path, ("0.55", "0.65")))
-    path.rename(other.path(skill))
-    assert other.read(skill) is None
-
-
 def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_taught_again(
     saved: SavedViaPoints, skill: Skill, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -324,14 +303,14 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
     folder, points = state_folder(settings), SavedViaPoints(settings).path(skill)
     for path in (folder / "stage.json", points, folder / "daemon.lock"):
         damage(path, "deep brackets")
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         log = daemon.log.read_text()
         assert "Traceback" not in log
         assert f"{folder / 'stage.json'} cannot be used" in log
         assert f"{points} cannot be used" in log
         daemon.client.set_stage("glass")
         daemon.until(lambda now: (folder / "stage.json").exists())
-    with serving(tmp_path, "--arm", "assumed") as daemon:
+    with serving(tmp_path, "--joints", "assumed") as daemon:
         assert "cannot be used" not in daemon.log.read_text()
         assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
         said = daemon.log.read_text()

@@ -238,7 +238,7 @@ def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> 
 
 
 def test_a_daemon_that_can_cache_nothing_compiles_itself_and_starts(tmp_path: Path) -> None:
-    with serving(tmp_path, "--arm", "assumed", before=NEVER_CACHED) as daemon:
+    with serving(tmp_path, "--joints", "assumed", before=NEVER_CACHED) as daemon:
         log = Path(daemon.log).read_text()
         assert len(re.findall(r"started in [\d.]+ s: .*, compilation [\d.]+ s, skill", log)) == 1
         children = psutil.Process(daemon.process.pid).children(recursive=True)

@@ -79,7 +79,7 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 
     with (
         serving(
-            tmp_path, "--arm", "assumed", "--record", str(records), before=SABOTAGE.format(folder=str(tmp_path))
+            tmp_path, "--joints", "assumed", "--record", str(records), before=SABOTAGE.format(folder=str(tmp_path))
         ) as daemon,
         Tracker(daemon.session),
     ):
@@ -112,7 +112,7 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
     """One that has no folder for its lock, and is served all the same."""
     (tmp_path / "state").write_text("a file where a folder is needed")
-    with serving(tmp_path, "--arm", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
+    with serving(tmp_path, "--joints", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
         started = children(daemon.process.pid)
         daemon.until(lambda status: status["tick"] > 0)
         assert "a second daemon of this cell is only detected through Zenoh" in daemon.log.read_text()
@@ -156,7 +156,7 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
     """`resume` is asked all the while: nobody cancels the stop of a daemon that ends."""
     records = tmp_path / "records"
     with (
-        serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon,
+        serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon,
         Tracker(daemon.session) as tracker,
     ):
         daemon.until(lambda status: status["mode"] == "follow")
@@ -189,7 +189,7 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
 
 
 def test_a_daemon_that_was_paused_counts_what_it_missed_and_goes_on(tmp_path: Path) -> None:
-    with serving(tmp_path, "--arm", "assumed") as daemon, Tracker(daemon.session):
+    with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session):
         before = daemon.until(lambda now: now["mode"] == "follow")
         daemon.process.send_signal(signal.SIGSTOP)
         time.sleep(1.0)
@@ -203,14 +203,14 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     """Nor where Zenoh does not show it the first; a daemon of another cell does. That a cell is
     free once its daemon has ended or was killed: test_taught_places_survive_a_restart.
     """
-    with serving(tmp_path, "--arm", "assumed") as daemon:
-        at = ("serve", "--arm", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
+    with serving(tmp_path, "--joints", "assumed") as daemon:
+        at = ("serve", "--joints", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
         refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
         assert refused.returncode == 1
         assert "cell thirdhand is already served" in refused.stderr
         assert f"listening on {daemon.endpoint}" in refused.stderr
         assert "Traceback" not in refused.stderr
-        unseen = thirdhand("serve", "--arm", "assumed", "--config", str(tmp_path / "cell.toml"))
+        unseen = thirdhand("serve", "--joints", "assumed", "--config", str(tmp_path / "cell.toml"))
         assert unseen.returncode == 1
         assert "cell thirdhand is already served on this machine" in unseen.stderr
         assert f"process {daemon.process.pid}, listening on {daemon.endpoint}" in unseen.stderr
@@ -220,7 +220,7 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
         other = tmp_path / "other"
         other.mkdir()
-        with serving(other, "--arm", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
+        with serving(other, "--joints", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
             assert daemon.client.status().cell == "thirdhand"
         assert daemon.end() == 0
 
@@ -238,7 +238,7 @@ def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(t
     )
     said: list[str] = []
     threading.Timer(10.0, go.touch).start()
-    with serving(tmp_path, "--arm", "assumed", "--record", str(records), before=before, say=said.append) as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--record", str(records), before=before, say=said.append) as daemon:
         assert go.exists()  # else it would not have been announced
         assert daemon.client.wait_until_ready().tick >= 0
         for request in ("hold", "resume", "reset", "hold"):
@@ -248,7 +248,7 @@ def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(t
 
 def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
     records = tmp_path / "records"
-    with serving(tmp_path, "--arm", "assumed", "--record", str(records)) as daemon:
+    with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
 
         def skill_worker() -> int:
             names = {pid: Path(f"/proc/{pid}/comm").read_text().strip() for pid in children(daemon.process.pid)}
@@ -323,7 +323,9 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
 def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path: Path, streams: str) -> None:
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    command = f"exec {sys.executable} -m service serve --arm assumed --config {tmp_path}/cell.toml --listen {endpoint}"
+    command = (
+        f"exec {sys.executable} -m service serve --joints assumed --config {tmp_path}/cell.toml --listen {endpoint}"
+    )
     running = subprocess.Popen(
         ["bash", "-c", f"{command} {streams}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

@@ -71,7 +71,7 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
     mark = tmp_path / "mark"
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
-    arguments = ("--arm", "assumed", "--hold")
+    arguments = ("--joints", "assumed", "--hold")
     with serving(tmp_path, *arguments, before=STANDS_STILL.format(mark=str(mark))) as daemon, Tracker(daemon.session):
         started = manager.heard(30, "READY=1")
         assert started[-1] == "READY=1"
@@ -187,7 +187,7 @@ def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
                 pass
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
-        with serving(tmp_path, "--arm", "assumed", "--record", str(disk / "records")) as daemon:
+        with serving(tmp_path, "--joints", "assumed", "--record", str(disk / "records")) as daemon:
             checked = told(
                 "serve", "--check", "--config", str(tmp_path / "cell.toml"), "--record", str(disk / "records")
             )

@@ -178,7 +178,7 @@ def is_welcome(daemon: Daemon, within_s: float = 30.0) -> bool:
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with serving(tmp_path_factory.mktemp("attacked"), "--arm", "assumed", before=FEW_DESCRIPTORS) as daemon:
+    with serving(tmp_path_factory.mktemp("attacked"), "--joints", "assumed", before=FEW_DESCRIPTORS) as daemon:
         yield daemon
         log = daemon.log.read_text()
         assert daemon.client.status().mode != "fault", log

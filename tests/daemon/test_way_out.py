@@ -19,7 +19,7 @@ def test_an_arm_that_is_stuck_says_so_and_comes_out(tmp_path: Path) -> None:
     network = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
     config.write_text(f"{network}{files}[arm]\nposture = {STUCK}\n")
     with (
-        serving(tmp_path, "--config", str(config), "--arm", "assumed") as daemon,
+        serving(tmp_path, "--config", str(config), "--joints", "assumed") as daemon,
         Tracker(daemon.session) as hands,
     ):
         hands.left, hands.right = (0.986, -0.354, 0.075), (0.78, 0.06, 0.11)

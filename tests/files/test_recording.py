@@ -14,7 +14,6 @@ import pytest
 import rerun as rr
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
@@ -235,28 +234,6 @@ def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
     assert with_markers("no robot") == "no robot"
     for arm, root in (("wam", "base"), ("ur5", "base_link")):
         assert Urdf(with_markers(robot_description(cell_of(arm)))).chain("left_hand")[0].parent == root
-
-
-def test_recordings_with_topics_as_earlier_versions_wrote_them_are_read(tmp_path: Path) -> None:
-    told = write(tmp_path / "a.mcap", 40)
-    with (tmp_path / "a.mcap").open("rb") as source, (tmp_path / "b.mcap").open("wb") as stream:
-        reader, writer = make_reader(source), Writer(stream)
-        writer.start(profile="ros2", library="thirdhand")
-        for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
-        for found in reader.iter_attachments():
-            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
-        known: dict[str, int] = {}
-        for about, channel, message in reader.iter_messages(log_time_order=False):
-            name = channel.topic if channel.topic in ("/tf", "/robot_description") else channel.topic[1:]
-            if name not in known:
-                number = writer.register_schema(about.name, about.encoding, about.data) if about else 0
-                known[name] = writer.register_channel(name, channel.message_encoding, number)
-            writer.add_message(known[name], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    steps = [step for step in Recording.open(tmp_path / "b.mcap").steps() if step.frame is not None]
-    assert [step.tick for step in steps] == [tick.index for tick, *_ in told]
-    assert "hall/bench-1/frame" in known
 
 
 def test_the_summary_of_every_file_tells_only_of_groups_that_are_there(tmp_path: Path) -> None:

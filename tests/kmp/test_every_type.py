@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import pickle
-import re
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from kmp import (
     named_arrays,
 )
 from kmp.arrays.immutable import Immutable
-from kmp.compiled import AVAILABLE
 
 S = np.random.default_rng(0).normal(size=(20, 2))
 R = Gaussians(S, np.tile(0.01 * np.eye(2), (20, 1, 1)))
@@ -200,31 +198,3 @@ def test_gaussians_are_chosen_by_index_as_numpy_would():
     assert [len(one) for one in R] == [1] * 20
     with pytest.raises(IndexError):
         R[20]
-
-
-EARLIER = {  # the module of each class in pickles of earlier versions, where it has moved since
-    "Inner": "inner",
-    "Database": "database",
-    "Changes": "database",
-    "Hyperparameters": "hyperparameters",
-    "AffineMean": "affine_mean",
-    "CompiledQuery": "compiled_query",
-    "InverseCholeskyFactor": "inverse_cholesky",
-    "GaussianMixture": "gmm",
-    "Correlation": "correlation",
-    "LocalKMP": "references",
-}
-
-
-def test_a_pickle_of_an_earlier_version_loads():
-    one = ONE.adapt(S[:1] + 0.3, R[:1], tolerance=0.1)
-    one.predict(S), one.predict(S[:1])  # both cache what a pickle then holds
-    text = pickle.dumps((one, AffineMean([[1.0]], [0.0]), GaussianMixture, Correlation, LocalKMP), protocol=0)
-    found = set()
-    for name, module in EARLIER.items():
-        text, count = re.subn(rf"ckmp\.[\w.]+\n{name}\n".encode(), f"ckmp.{module}\n{name}\n".encode(), text)
-        found |= {name} if count else set()
-    assert found == EARLIER.keys() - (set() if AVAILABLE else {"CompiledQuery"})
-    again, *others = pickle.loads(text)
-    assert np.array_equal(again.predict(S).covariance, one.predict(S).covariance)
-    assert others[1:] == [GaussianMixture, Correlation, LocalKMP]

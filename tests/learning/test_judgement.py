@@ -139,12 +139,3 @@ def test_each_column_of_the_table_is_explained_below_it_and_on_the_page(good: li
         assert column in head.splitlines()[0]
         assert column in below.partition("docs/learning.md")[0]
         assert column in page.partition("## Judged")[2]
-
-
-def test_figures_of_earlier_skills_are_read_and_tell_of_no_delay(good: list[Demonstration]) -> None:
-    found = judged(good)
-    assert found.delay_s is None
-    assert "the teacher was" not in table(found)
-    earlier = msgspec.to_builtins(found)
-    del earlier["delay_s"], earlier["delay_std_s"]
-    assert msgspec.convert(earlier, Figures) == found

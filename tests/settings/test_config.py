@@ -8,14 +8,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.contract.explain import validated
 from service.daemon.launch import described
 from service.files.shipped import cell_of
 from service.settings.config import (
     FOLLOWING,
     WAM,
     Files,
-    RetiredSettingWarning,
     Settings,
     load,
     parse,
@@ -344,14 +342,6 @@ def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, l
     with pytest.raises(SettingsError) as caught:
         load(tmp_path / "cell.toml")
     assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(("name", "value"), [("jerk_weight", 1e-8), ("stop_room", 2.0)])
-def test_a_retired_setting_has_no_effect_in_a_file_and_is_kept_by_recordings(name: str, value: float) -> None:
-    with pytest.warns(RetiredSettingWarning, match=rf"cell.toml: \[tool\] {name} is retired and has no effect; "):
-        assert parse(f"[tool]\n{name} = 'x'", origin="cell.toml") == Settings()
-    recorded = msgspec.json.encode({"tool": {name: value}})  # a recording replays with what was in effect
-    assert getattr(validated(msgspec.json.decode(recorded), Settings).tool, name) == value
 
 
 def test_follow_chooses_between_lag_and_calm_motion() -> None:

@@ -19,7 +19,7 @@ from support.cell import told
 
 LARGEST = 1000
 COMMANDS = {
-    "configuration": ("serve", "--arm", "assumed", "--config"),
+    "configuration": ("serve", "--joints", "assumed", "--config"),
     "via-points": ("via-points", "add", "--file"),
     "Zenoh configuration": ("status", "--zenoh-config"),
     "recording": ("view",),
@@ -119,6 +119,6 @@ def test_a_folder_of_recordings_that_is_none_is_refused(tmp_path: Path, kind: st
     path = odd(tmp_path, kind)
     if kind == "a file":
         path.write_bytes(b"")
-    done = told("serve", "--arm", "assumed", "--record", str(path))
+    done = told("serve", "--joints", "assumed", "--record", str(path))
     assert done.returncode == 1
     assert done.stderr.endswith(f"cannot record in {path}: it is not a folder\n")

@@ -70,7 +70,7 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
     assert result.exact, result.text()
     recording = Recording.open(path)
     settings, urdf = recording.settings, robot_description(recording.settings)
-    skill = decoded(recording.skill, origin=str(path), recorded=True)
+    skill = decoded(recording.skill, origin=str(path))
     controller = explained_controller(settings, skill, urdf=urdf)
     frames: list[Frame] = []
     measured: list[Vector] = []

@@ -279,7 +279,7 @@ def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up
     one_raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]", 1)
     with (
-        serving(tmp_path, "--arm", "assumed", "--rate", "100", network=LISTENING + CELL) as daemon,
+        serving(tmp_path, "--joints", "assumed", "--rate", "100", network=LISTENING + CELL) as daemon,
         headset.serving_hands(daemon.endpoint, tmp_path) as served,
         headset.worn(served.url, tmp_path, without=("anchors",)) as tab,
     ):

@@ -56,7 +56,7 @@ class Received:
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with serving(tmp_path_factory.mktemp("cell"), "--arm", "assumed", "--rate", "100") as running:
+    with serving(tmp_path_factory.mktemp("cell"), "--joints", "assumed", "--rate", "100") as running:
         yield running
 
 

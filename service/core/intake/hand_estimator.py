@@ -160,8 +160,6 @@ def _advance_both(states: Records, ticks: int, stale_ticks: int, one: Records, m
     state.tick += ticks
     for side in range(2):
         hand = state.hands[side]
-        if state.tremors[side, 0] == 0.0:  # a state that an earlier version recorded
-            no_tremor(states, side)
         if is_fresh(states, side, stale_ticks):
             advance_hand(states, side, one)
             look_ahead(states, models, side)
