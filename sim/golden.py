@@ -149,7 +149,10 @@ def record(
     run(controller, source, [keep, follow])
     table = np.zeros(max(checksums, default=-1) + 1, "<u4")
     table[[*checksums]] = [*checksums.values()]
-    with Recorder(path, settings=settings, skill=skill.file, state=start, checksums=table.tobytes()) as recorder:
+    constants = controller.constants
+    with Recorder(
+        path, settings=settings, skill=skill.file, state=start, constants=constants, checksums=table.tobytes()
+    ) as recorder:
         for tick, frame in steps:
             kept = frame if tick.index % WHOLE_EVERY == 0 else None
             recorder.write(tick, kept, time_ns=_time_ns(tick, settings))

@@ -5,12 +5,11 @@ k(x, x_r) = exp(-scale |x - x_r|^2) in the coordinates x = stretch * s. The pape
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kmp.arrays.checks import Array
 from kmp.compiled import compiled
+from kmp.elementary import exp
 
 
 @compiled
@@ -23,7 +22,7 @@ def kernel_value(query: Array, centre: Array, scale: float, offset: Array) -> fl
     for i in range(len(query)):
         offset[i] = query[i] - centre[i]
         square += offset[i] * offset[i]
-    return math.exp(-scale * square)
+    return exp(-scale * square)
 
 
 @compiled

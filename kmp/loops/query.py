@@ -25,6 +25,7 @@ from kmp.loops.kernel_row import kernel_value
 from kmp.loops.mean import means, slopes, table_of
 from kmp.query import MotionPrediction, Query
 
+_MOST_EXACT = 1500  # rows and columns of a factor that is computed in a fixed order, in less than 2 s
 MEANS = 4  # rows of a motion's output before the Jacobian: mean, velocity, acceleration, curvature
 
 
@@ -62,7 +63,7 @@ class CompiledQuery(Immutable):
         L (R A, R A) with L L^T = K + lambda_c Sigma. None if the solution is not dense.
         """
         solution = self.query.solution
-        return _packed(solution) if isinstance(solution, Dense) else None
+        return _packed(self.query, solution) if isinstance(solution, Dense) else None
 
     @cached_property
     def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
@@ -115,10 +116,57 @@ class CompiledQuery(Immutable):
         return found if distinct > 1 else found[0, 0] * np.eye(len(q.prior_mean))
 
 
-def _packed(solution: Dense) -> Array:
-    inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
-    a = solution.distinct
+def _packed(query: Query, solution: Dense) -> Array:
+    a, size = solution.distinct, len(query.centres) * solution.distinct
+    inverse = np.empty((size, size))
+    noise = solution.hyperparameters.lambda_covariance * solution.database.reference.covariance[:, :a, :a]
+    is_exact = size <= _MOST_EXACT and not query.derivatives
+    if not (is_exact and _inverse_factor(np.ascontiguousarray(query.centres), query.scale, noise, inverse)):
+        inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
     return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
+
+
+@compiled
+def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> bool:
+    """Write L^-1 to `out` (N A, N A), of the Cholesky factor L L^T = K (x) I + noise; true if the
+    matrix is positive definite.
+
+    `centres` (N, I) are in the kernel's coordinates, `noise` is (N, A, A). LAPACK is several times
+    faster, but rounds differently on each kind of processor; here all sums have a fixed order.
+    """
+    count, outputs = noise.shape[:2]
+    size = count * outputs
+    factor, offset, column = np.zeros((size, size)), np.empty(centres.shape[1]), np.empty(size)
+    for n in range(count):
+        for m in range(n + 1):
+            value = kernel_value(centres[n], centres[m], scale, offset)
+            for a in range(outputs):
+                factor[n * outputs + a, m * outputs + a] = value
+        for a in range(outputs):
+            for b in range(outputs):
+                factor[n * outputs + a, n * outputs + b] += noise[n, a, b]
+    for k in range(size):
+        if not factor[k, k] > 0.0:
+            return False
+        root = math.sqrt(factor[k, k])
+        for i in range(k, size):
+            column[i] = factor[i, k] / root
+        factor[k:, k] = column[k:]
+        for i in range(k + 1, size):
+            row, share = factor[i], column[i]
+            for j in range(k + 1, i + 1):
+                row[j] -= share * column[j]
+    out[:] = 0.0
+    for i in range(size):
+        row = out[i]
+        row[i] = 1.0
+        for k in range(i):
+            share, other = factor[i, k], out[k]
+            for j in range(k + 1):
+                row[j] -= share * other[j]
+        for j in range(i + 1):
+            row[j] /= factor[i, i]
+    return True
 
 
 @compiled

@@ -7,6 +7,7 @@ flat state and the skill in force. Messages are encoded once; they are recorded 
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
@@ -33,6 +34,7 @@ from service.core.codes import (
 from service.core.decision.stage import Decision
 from service.core.frame import (
     RECORDS,
+    STAGES,
     Event,
     Frame,
     Lap,
@@ -101,6 +103,9 @@ class Controller:
         self._setpoint = SetpointStage(settings, self._arm)
         self._limiter = LimiterStage(settings, self._arm)
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
+        stages = (self.intake, self._skill, self.decision, self._separation, self._setpoint, self._arm, self._limiter)
+        self.constants = dict(zip(STAGES, map(_digest, stages), strict=True))
+        """Digests of the constants that each stage derived from settings, skill and description."""
         self._here: Kinematics | None = None  # kinematics at the state's joints; None: not yet computed
 
     @property
@@ -252,6 +257,17 @@ class Controller:
         if self._here is None:
             self._here = self._arm.at(self._state["joints"][0])
         return self._here
+
+
+def _digest(stage: object) -> str:
+    """A digest of the parameter records of a stage, and of its parts in the same package."""
+    sums, package = hashlib.blake2b(digest_size=8), type(stage).__module__.rpartition(".")[0]
+    for _, value in sorted(vars(stage).items()):
+        if isinstance(value, np.ndarray) and value.dtype.names:
+            sums.update(value.tobytes())
+        elif type(value).__module__.startswith(package) and hasattr(value, "__dict__") and not isinstance(value, Skill):
+            sums.update(_digest(value).encode())
+    return sums.hexdigest()
 
 
 def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import atan2, sin_cos
 from service.core.frame import Records, Vector
 
 ROUND_TO = 1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
@@ -116,7 +117,7 @@ def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
     sine = math.sqrt(x * x + y * y + z * z)
     out[:] = 0.0
     if sine > 1e-9:
-        size = math.atan2(sine, start[0] * end[0] + start[1] * end[1] + start[2] * end[2]) / sine
+        size = atan2(sine, start[0] * end[0] + start[1] * end[1] + start[2] * end[2]) / sine
         out[0], out[1], out[2] = size * x, size * y, size * z
 
 
@@ -133,7 +134,7 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
     z = bw * -az + aw * bz - (bx * ay - by * ax)
     w = bw * aw + bx * ax + by * ay + bz * az
     sine = math.sqrt(x * x + y * y + z * z)
-    size = 2.0 * math.atan2(sine, abs(w)) / max(sine, _TINY)
+    size = 2.0 * atan2(sine, abs(w)) / max(sine, _TINY)
     if w < 0.0:
         size = -size
     out[0], out[1], out[2] = size * x, size * y, size * z
@@ -143,8 +144,9 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
 def turn_on(quaternion: Vector, turn: Vector) -> None:
     """Rotate a quaternion (4,) by a rotation vector (3,) [rad] of the base frame, in place."""
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
-    size = 0.5 if angle < 1e-6 else math.sin(0.5 * angle) / angle
-    ax, ay, az, aw = size * turn[0], size * turn[1], size * turn[2], math.cos(0.5 * angle)
+    sine, cosine = sin_cos(0.5 * angle)
+    size = 0.5 if angle < 1e-6 else sine / angle
+    ax, ay, az, aw = size * turn[0], size * turn[1], size * turn[2], cosine
     bx, by, bz, bw = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     quaternion[0] = aw * bx + bw * ax + ay * bz - az * by
     quaternion[1] = aw * by + bw * ay + az * bx - ax * bz
@@ -206,7 +208,7 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
 def _about(axis: Vector, angle: float, out: Vector) -> None:
     """Write into out (3, 3) the rotation about a unit axis by an angle [rad]."""
     x, y, z = axis[0], axis[1], axis[2]
-    s, c = math.sin(angle), math.cos(angle)
+    s, c = sin_cos(angle)
     v = 1.0 - c
     out[0, 0], out[0, 1], out[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
     out[1, 0], out[1, 1], out[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x

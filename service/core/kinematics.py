@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import sin_cos
 from service.core.arm.least_squares import factorise, substitute
 from service.core.frame import Records, Vector
 
@@ -114,7 +115,7 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
         linear[2] += dq[j] * (moment[2] + shift[0] * axis[1] - shift[1] * axis[0])
         for i in range(3):
             angular[i] += dq[j] * axis[i]
-        c, s = math.cos(way[j]), math.sin(way[j])
+        s, c = sin_cos(way[j])
         turns = wx * wx + wy * wy + wz * wz > 0.5
         if not turns:
             c, s = 1.0, 0.0

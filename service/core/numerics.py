@@ -10,8 +10,11 @@ TOLERANCE = 1e-9  # a bound that is exceeded by less than this is kept
 INSIDE_LIMIT_SHARE = 1.0 - TOLERANCE  # limits are planned with this share, so that rounding does not break them
 LEAST_SLOPE = 1e-10  # a constraint with a smaller slope in the free directions cannot be approached
 TICK_ROUNDING = 1e-6  # [ticks] rounding of a duration, as sums of periods are not exact
-PROBABILITY_ROUND_TO = 1e12  # probabilities are rounded, so that a replay on another kind of CPU agrees
-GAIN_DECIMALS = 6  # gains are rounded, so that a replay on another kind of CPU agrees
+PROBABILITY_ROUND_TO = 1e9  # probabilities of errors are rounded: covariances may differ between processors
+# Constants that the C library or LAPACK computes are rounded, so that all kinds of CPU agree.
+GAIN_DECIMALS = 6
+ROTATION_DECIMALS = 12  # rotations in an arm's description, from its angles
+PULL_DECIMALS = 6  # weights of pulls [m], solved with an error of 1e-9
 SLOWEST_PER_S = 0.2  # [1/s] lowest rate of the setpoint's tracker
 
 LEAST_PULL_VARIANCE_SHARE = 1e-6  # added variance, so that exact via-points remain solvable

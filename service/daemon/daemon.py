@@ -181,7 +181,7 @@ class Daemon:
         """
         reporter: threading.Thread | None = None
         try:
-            self._scribe.start(skill=self._file, state=self._controller.state)
+            self._scribe.start(skill=self._file, state=self._controller.state, constants=self._controller.constants)
             reporter = supervised_thread.start("status thread", lambda: self._report(announce), self._fail)
             self._granted = ask_for_real_time()
             self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)

@@ -97,7 +97,9 @@ class CellStatus(NamedTuple):
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
             stage=skill.model.names[frame["stage"] : frame["stage"] + 2] if frame["stage_belief"] else (),
             stage_belief=round(float(frame["stage_belief"]), 3),
-            task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2) if skill.model.clock else None,
+            task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
+            if skill.model.clock and skill.model.clock.weight
+            else None,
             error_probability=round(float(frame["error_probability"]), 4) if aimed else None,
             deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),

@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from threadpoolctl import threadpool_info
 
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
@@ -46,6 +47,10 @@ def machine() -> dict[str, str]:
     build: Any = np.show_config(mode="dicts")
     blas = build["Build Dependencies"]["blas"]
     found["blas"] = f"{blas['name']} {blas['version']}"
+    found["features"] = " ".join(build["SIMD Extensions"].get("found", []))
+    found["libc"] = " ".join(platform.libc_ver())
+    kernels = {library.get("architecture") for library in threadpool_info() if library["user_api"] == "blas"}
+    found["kernel"] = " ".join(sorted(filter(None, kernels)))
     for name in ("thirdhand", "numpy", "scipy", "pin", "ruckig", "msgspec", "mcap", "eclipse-zenoh"):
         with contextlib.suppress(packages.PackageNotFoundError):
             found[name] = packages.version(name)

@@ -68,6 +68,7 @@ class Recorder(McapFile):
         state: Record | None = None,
         urdf: str | None = None,
         metadata: Mapping[str, str] | None = None,
+        constants: Mapping[str, str] | None = None,
         time_ns: int = 0,
         checksums: bytes = b"",
         thin: bool = False,
@@ -90,6 +91,7 @@ class Recorder(McapFile):
         }
         super().__init__(Path(path), joints=len(settings.joints.names), compressed=not checksums)
         about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
+        about |= {f"constants of {stage}": digest for stage, digest in (constants or {}).items()}
         self.kept = self.pending = 0  # number of ticks in the file, and in the unfinished chunk
         try:
             self.writer.add_metadata("thirdhand", about)

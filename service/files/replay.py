@@ -22,6 +22,7 @@ from service.files.steps import Gap, Step, checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.settings.whole_file import whole
 
+MACHINE = ("cpu", "features", "libc", "kernel", "numpy", "blas")  # what the last bits of a result depend on
 REPLAY_TOLERANCE = 1e-5  # [m, rad] other machines may differ by this, because their last bits differ
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
 
@@ -52,6 +53,7 @@ class Replay:
     joined: int = 0
     first_difference: str = ""
     largest: dict[str, float] = field(default_factory=dict)
+    differing: set[str] = field(default_factory=set)  # stages whose constants are not those of the recording
     recorded_on: str = ""
     here: str = ""
 
@@ -82,6 +84,8 @@ class Replay:
             lines.append(self.first_difference)
             largest = ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
             lines.append(f"largest differences: {largest or 'none in the frames that are recorded completely'}")
+            if self.differing:
+                lines.append(f"the constants of {', '.join(sorted(self.differing))} are not those of the recording")
             if self.recorded_on != self.here:
                 lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
         return "\n".join(lines)
@@ -184,6 +188,9 @@ class _Comparison:
             assert skill is not None
             self._controller = Controller(self.recording.settings, skill, start.state, urdf=self.recording.urdf)
             self.last, self.gap_at = start, None
+            for stage, digest in self._controller.constants.items():
+                if self.recording.metadata.get(f"constants of {stage}", digest) != digest:
+                    self.result.differing.add(stage)
             with self._anew(skill, start) as self.recorder:
                 run(self._controller, self._ticks(), [self.compare])
             start = None if self.gap_at is None else self._next_start(self.gap_at)
@@ -282,7 +289,4 @@ def ticks(recording: Recording) -> Iterator[Tick]:
 
 
 def _named(metadata: dict[str, str]) -> str:
-    return (
-        ", ".join(f"{name} {metadata[name]}" for name in ("cpu", "numpy", "blas") if name in metadata)
-        or "an unnamed machine"
-    )
+    return ", ".join(f"{name} {metadata[name]}" for name in MACHINE if name in metadata) or "an unnamed machine"

@@ -267,12 +267,13 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
     """Faults of arrays with numbers out of their ranges. The last input may be a clock's."""
+    is_timed = bool((arrays.get("task_clock", np.zeros(2))[1:2] > 0.0).any())  # the clock has a weight
     for name in names:
         array, (low, high, unit) = arrays[name], ALL_RANGES[name]
         if array.dtype.kind not in "iuf":
             yield f"{prefix}{name} has numbers of type {array.dtype}, real ones needed"
             continue
-        if "task_clock" in arrays and name in INPUT_ARRAYS and array.ndim == 2:
+        if is_timed and name in INPUT_ARRAYS and array.ndim == 2:
             array, times = array[:, :-1], array[:, -1]
             if not (np.abs(times) <= LONGEST_CLOCK_S * MOST_CLOCK_WEIGHT).all():
                 yield f"{prefix}{name} has a clock that is no number, or too late"

@@ -151,7 +151,12 @@ class ScribeProcess:
             self._drawing = DrawingThread(lambda: _viewer(setup, skill))
         paths = RecordingPaths(setup.settings, setup.folder, setup.recording, setup.rrd, attempt=setup.attempt)
         self._segments = Segments(
-            setup.settings, paths, say=self._errors.append, draw=self._draw_into, unmarked=setup.unmarked
+            setup.settings,
+            paths,
+            say=self._errors.append,
+            draw=self._draw_into,
+            unmarked=setup.unmarked,
+            constants=setup.constants,
         )
         state = None if setup.state is None else np.frombuffer(setup.state, state_layout(self._joints))[0]
         self._segments.begin(skill, state)

@@ -111,6 +111,7 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     Without state the scribe begins with the first message that has one. `recording` and `rrd` are
     explicit paths instead of names in `folder`. `attempt` counts the scribes of a daemon.
     `unmarked` ticks were lost with earlier scribes and are not marked in a recording yet.
+    `constants` are `Controller.constants`.
     """
 
     settings: Settings
@@ -121,6 +122,7 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     live_port: int | None
     attempt: int
     unmarked: int = 0
+    constants: dict[str, str] = {}
 
 
 class ScribeReport(msgspec.Struct, frozen=True):

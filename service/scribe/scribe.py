@@ -16,7 +16,7 @@ import signal
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +79,17 @@ class Scribe:
         self._lost_before = self._unmarked = 0  # ticks lost with dead scribes, and those that no recording marks
         self._sent_before = 0  # ticks sent to dead scribes
         self._started = 0.0
+        self._constants: dict[str, str] = {}
         self._memory: dict[int, tuple[bytes, int]] = {}
         self._report = ScribeReport()
         self.newest_recording: str | None = None  # the path, also while no recording can be written
         self._errors: deque[str] = deque(maxlen=5)
 
-    def start(self, *, skill: bytes, state: Record | None) -> None:
-        """Start the process; ticks may be sent at once. Never waits."""
+    def start(self, *, skill: bytes, state: Record | None, constants: Mapping[str, str] | None = None) -> None:
+        """Start the process; ticks may be sent at once. Never waits. Recordings tell these digests
+        of the core's `constants`.
+        """
+        self._constants = dict(constants or {})
         if self._wanted:
             self._send_all = state is None
             self._spawn(skill, state)
@@ -292,7 +296,7 @@ class Scribe:
         )
         begin = None if state is None else state.tobytes()
         places = folder, recording, rrd, self._live_port
-        setup = ScribeSetup(self._settings, begin, *places, self._restarts + 1, self._unmarked)
+        setup = ScribeSetup(self._settings, begin, *places, self._restarts + 1, self._unmarked, self._constants)
         self._child = child.start("scribe", "service.scribe.process", socket.SOCK_SEQPACKET)
         self._progress, self._started = child.Progress(self._child), time.monotonic()
         ours = self._child.socket

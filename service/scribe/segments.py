@@ -12,7 +12,7 @@ import errno
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -46,7 +46,9 @@ class Segments:
         say: Callable[[str], None],
         draw: Callable[[Path], None],
         unmarked: int = 0,
+        constants: Mapping[str, str] | None = None,
     ) -> None:
+        self._constants = constants
         self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
         self._recorder: Recorder | None = None
         self._wanted = True
@@ -115,7 +117,10 @@ class Segments:
             if self._full and shutil.disk_usage(existing_folder(path.parent)).free < MIN_FREE_BYTES:
                 return None
             settings, skill, now_ns = self._settings, self._skill, time.time_ns()
-            return Recorder(path, settings=settings, skill=skill, state=state, time_ns=now_ns, thin=True)
+            constants = self._constants
+            return Recorder(
+                path, settings=settings, skill=skill, state=state, constants=constants, time_ns=now_ns, thin=True
+            )
         except OSError as error:
             self._failed(path, error)
             _discard(path)

@@ -127,7 +127,7 @@ def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]])
     """A URDF with only the links, joints and origins of a robot, without shapes and masses.
 
     `moving` has the axes of the joints that move, by name; all others are fixed. Moving joints get
-    the limits ANY_LIMIT, and continuous joints become revolute.
+    the limits ANY_LIMIT. All that turn become continuous: Pinocchio takes their cosine and sine.
     """
     out = Element("robot", name="arm")
     for link in robot.findall("link"):
@@ -135,7 +135,7 @@ def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]])
     for joint in robot.findall("joint"):
         name, kind = joint.get("name", ""), "fixed"
         if name in moving:
-            kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
+            kind = "prismatic" if joint.get("type") == "prismatic" else "continuous"
         kept = ElementTree.SubElement(out, "joint", name=name, type=kind)
         for tag in ("parent", "child", "origin"):
             if (given := joint.find(tag)) is not None:

@@ -28,7 +28,16 @@ from service.learning.skill_file import SkillError, StoredSkill
 from service.settings.config import Settings
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.people.into_reach import RigidMap
-from sim.experiments.people.left_out import JUDGED_HZ, Judged, LeftOut, judged, left_out, predicted, read
+from sim.experiments.people.left_out import (
+    JUDGED_HZ,
+    RESTS_S,
+    Judged,
+    LeftOut,
+    judged,
+    left_out,
+    predicted_rounds,
+    read,
+)
 from sim.experiments.reached import taught
 from sim.experiments.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
 from sim.experiments.rivals.partners import RIVALS, left_out_by
@@ -82,6 +91,7 @@ class Fold(NamedTuple):
     figures: Figures | None  # none where nothing could be learned
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
+    again: list[list[Judged]]  # the further rounds of each accepted take, by their rests
     in_spite: list[Judged]  # each take of a refused fold, with the skill used in spite of the refusal
     take_refusals: list[str]  # via-points that the skill cannot be adapted to
 
@@ -190,19 +200,23 @@ def served(
     """
     skill, refusals = as_command(shown, told=told, refined=refined)
     if skill is None:
-        return Fold(refusals, (), None, "", [None] * len(asked), [], [])
+        return Fold(refusals, (), None, "", [None] * len(asked), [], [], [])
     figures = figures_of(skill)
-    fold = Fold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [])
+    fold = Fold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [], [])
     for take in asked:
-        one = None
+        rounds: list[Judged] = []
         try:
             there = taught(skill, take.demonstration.places) if told else skill
-            one = judged(take, predicted(there, take, reach=None if refusals else Settings().reach))
+            said = predicted_rounds(there, take, reach=None if refusals else Settings().reach)
+            rounds = [judged(take, one) for one in said]
         except SkillError as error:
             fold.take_refusals.append(str(error))
-        if refusals and one:
-            fold.in_spite.append(one)
-        fold.accepted.append(None if refusals else one)
+        if refusals:
+            fold.in_spite.extend(rounds[:1])
+            fold.accepted.append(None)
+        else:
+            fold.accepted.append(rounds[0] if rounds else None)
+            fold.again.extend([rounds[1:]] if rounds else [])
     return fold
 
 
@@ -257,6 +271,10 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
             "risks": list(dict.fromkeys(text for fold in folds for text in fold.residual))[:2],
             "refuses": accepted.count(False),
             "reasons": list(dict.fromkeys(reasons))[:2],
+            "again": {
+                f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
+                for i, rest_s in enumerate(RESTS_S)
+            },
             "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
             "beside_mm": {rival: rows.get("rms_mm") for rival, rows in there.items()},
             "model": next((fold.model for fold in folds if fold.model), None),

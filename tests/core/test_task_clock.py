@@ -1,5 +1,6 @@
 """The clock of a task: when it starts, waits, ends and starts anew; that it is learned as it counts
-live; and that `learn` takes it for a timetable and for nothing else.
+live; that `learn` takes it for a timetable and for nothing else; and that no memory of a skill
+outlasts a round of a session.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.staged import StagedKMP
 from service.core.skill.task_clock import (
@@ -20,13 +20,14 @@ from service.core.skill.task_clock import (
     count,
     counted,
 )
-from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.methods.clock import Tempo, clock_of
 from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+from sim.experiments.people.left_out import judged, left_out, predicted_rounds
+from support.kinds import KINDS, learned, named, takes
 
-RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
+RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)
 HOME, AWAY = np.array(RUNS.begin), np.array(RUNS.begin) + 0.5
 PERIOD_S = 0.01
@@ -55,6 +56,10 @@ def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: flo
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
         (WAITS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 1.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, HOME), ("move", 1.0, HOME)], 0.9),  # begun again
+        (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # it returns by itself
+        (RUNS, [("move", 20.0, AWAY), ("rest", 0.5, HOME), ("move", 1.0, AWAY)], 0.9),
+        (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),  # a hesitation
+        (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),  # not where demonstrations begin
         (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),  # the task was over
         (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),  # too short a rest
     ],
@@ -82,36 +87,28 @@ def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
     assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - shown).max() < 0.05
 
 
+def test_the_task_begins_again_once_in_each_rest_where_it_begins() -> None:
+    rows = RUNS.rows(np.stack([HOME, AWAY]))
+    state, begun = np.zeros(5), []
+    for speed, hands, stage in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
+        begun.append(count(hands, speed, 0.0, PERIOD_S, stage, rows, state))
+    assert np.flatnonzero(begun) == pytest.approx(50 + RUNS.home_s / PERIOD_S, abs=1)
+    for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a stage begins anew, but not the task
+        assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
+    assert state[CLOCK_S] == 0.0
+
+
 def test_numbers_of_a_file_that_are_no_clock_are_refused() -> None:
     assert TaskClock.of(RUNS.numbers) == RUNS
-    for bad in (RUNS.numbers[:-1], -RUNS.numbers, np.full(12, np.nan), np.full(12, 1e9)):
+    for bad in (RUNS.numbers[:-1], -RUNS.numbers, np.full(13, np.nan), np.full(13, 1e9)):
         with pytest.raises(ValueError, match="task_clock"):
             TaskClock.of(bad)
 
 
-def takes(count: int, *, timetable: bool) -> list[Demonstration]:
-    """Hands that come at different speeds and then rest; the tool moves on while they rest, or goes
-    with the left hand.
-    """
-    out, times = [], np.arange(0.0, 7.0, 0.02)
-    for i in range(count):
-        rng = np.random.default_rng(i)
-        share = np.clip((times - 0.4 - 0.3 * rng.random()) / rng.uniform(0.7, 1.6), 0.0, 1.0)
-        began = times - times[np.argmax(share > 0)]
-        way = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
-        left = np.array((0.6, -0.2, 0.2)) + (1.0 - way) * (0.0, 0.25, 0.0) + rng.normal(0.0, 0.01, 3)
-        right = np.array((0.7, 0.3, 0.2)) + 0.0 * left + rng.normal(0.0, 0.01, 3)
-        late = np.clip((began - 4.0) / 1.5, 0.0, 1.0)[:, None] if timetable else way
-        tool = np.array((0.5, 0.1, 0.4)) + late * np.array((0.0, 0.3, 0.1)) + 0.0 * left
-        turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
-        poses = [np.hstack([at + rng.normal(0.0, 0.0005, at.shape), turn]) for at in (left, right, tool)]
-        out.append(Demonstration((times * 1e9).astype(np.int64), poses[0], poses[1], poses[2]))
-    return out
-
-
 def clock(skill: StoredSkill) -> TaskClock | None:
-    assert isinstance(skill.model, HandsKMP)
-    return skill.model.clock
+    """The clock that is an input of a skill's model, if there is one."""
+    assert isinstance(skill.model, HandsKMP | StagedKMP)
+    return skill.model.clock if skill.model.is_timed else None
 
 
 def test_the_intake_finds_when_hands_begin_to_move() -> None:
@@ -145,19 +142,6 @@ def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
     np.testing.assert_allclose(moved.velocity, (ahead.position - behind.position) / 0.02, atol=2e-3)
 
 
-def named(count: int, *, timetable: bool) -> list[Demonstration]:
-    """These takes, with the via-points at which they begin and end."""
-    out = []
-    for one in takes(count, timetable=timetable):
-        rows = [
-            {"name": name, "left": one.left[at, :3].tolist(), "right": one.right[at, :3].tolist()}
-            | {"tool": one.tool[at, :3].tolist()}
-            for name, at in (("start", 0), ("end", -1))
-        ]
-        out.append(one._replace(places=msgspec.convert(rows, tuple[ViaPoint, ...])))
-    return out
-
-
 @pytest.mark.thorough
 def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     shown = named(6, timetable=True)
@@ -168,9 +152,7 @@ def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     assert not skill.model.clock.waits
     assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
     assert any("anew in each stage" in text for text in figures.warnings)
-    plain = learn(named(6, timetable=False)).model
-    assert isinstance(plain, StagedKMP)
-    assert plain.clock is None
+    assert clock(learn(named(6, timetable=False))) is None
     back = decoded(skill.file, origin="again")
     assert isinstance(back.model, StagedKMP)
     assert back.model.clock == skill.model.clock
@@ -180,6 +162,20 @@ def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     assert np.linalg.norm(late.position - early.position) > 0.2
     behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.02, 0.02))
     np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.thorough
+def test_each_round_of_a_session_is_predicted_as_the_first_one(kind: str) -> None:
+    """With rests of 0.5 to 6 s where the take begins, also after half a round was broken off."""
+    skill, asked = learned(kind)
+    take = left_out("asked", "", asked)
+    rounds = [*predicted_rounds(skill, take), *predicted_rounds(skill, take, broken_share=0.5)]
+    first, *others = [judged(take, said) for said in rounds]
+    first_mm = 1e3 * np.sqrt(first.squares / first.samples)
+    for again in others:
+        assert 1e3 * np.sqrt(again.squares / again.samples) < max(1.1 * first_mm, first_mm + 2.0)
+        assert (again.held or 0) - (first.held or 0) <= 0.03 * first.samples
 
 
 def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
@@ -194,6 +190,6 @@ def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
 
 def test_a_file_with_a_broken_clock_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     skill = learn(takes(6, timetable=True))
-    monkeypatch.setattr(TaskClock, "numbers", np.full(12, np.inf))
+    monkeypatch.setattr(TaskClock, "numbers", np.full(13, np.inf))
     with pytest.raises(SkillError, match="task_clock"):
         decoded(with_file(skill).file, origin="broken")

@@ -142,8 +142,8 @@ def test_an_event_of_a_kind_that_nobody_knows_is_refused_with_its_tick(tmp_path:
     with Recorder(tmp_path / "b.mcap", settings=CELL, skill=SKILL) as recorder:
         recorder.close()
     recording = Recording.open(tmp_path / "b.mcap")
-    file.put("hall/bench-1/tick", channels.TICK.type, cdr.encode_tick(3, b"\xff", 0), 0, 0)
-    file.put("hall/bench-1/frame", channels.FRAME.type, encode(blank(FRAME)), 0, 0)
+    file.put("/hall/bench-1/tick", channels.TICK.type, cdr.encode_tick(3, b"\xff", 0), 0, 0)
+    file.put("/hall/bench-1/frame", channels.FRAME.type, encode(blank(FRAME)), 0, 0)
     file.close()
     recording.path = tmp_path / "a.mcap"
     with pytest.raises(RecordingError, match="after tick 3: a Tick with an event of kind 255"):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from kmp.elementary import exp, log
 from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step, stand
 from service.core.arm.tuning import (
     CLOSING_BRAKE_SHARE,
@@ -29,6 +30,7 @@ from service.core.frame import RECORDS, Record, Vector, as_array, parameters
 from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
+from service.core.numerics import ROTATION_DECIMALS
 from service.core.separation.stage import Separation
 from service.settings.config import Reach, Settings
 from service.settings.urdf import Urdf
@@ -73,10 +75,13 @@ class Arm:
         self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
         plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
-        unit = np.array(quaternion) / math.hypot(*quaternion)
+        unit = np.array(quaternion) / math.sqrt(sum(v * v for v in quaternion))
         plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
         tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
         self._tool = self._model.addFrame(tool)
+        for placement in (*self._model.jointPlacements, *(frame.placement for frame in self._model.frames)):
+            placement.rotation = np.round(placement.rotation, ROTATION_DECIMALS)
+        self._turns = np.array([joint.nq == 2 for joint in self._model.joints])[1:]
         self._data = self._model.createData()
         top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / Reach().outer
         closing = closing or Closing(
@@ -84,7 +89,7 @@ class Arm:
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
         scale = acceleration**SPARING_POWER
-        scale /= np.exp(np.log(scale).mean())
+        scale /= exp(sum(log(float(one)) for one in scale) / len(scale))
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
         spared /= spared.mean(axis=1, keepdims=True)
@@ -126,6 +131,7 @@ class Arm:
         self._kinematics = np.dtype(
             [
                 ("joints", np.float64, (joints,)),
+                ("configuration", np.float64, (self._model.nq,)),
                 ("position", np.float64, (3,)),
                 ("rotation", np.float64, (3, 3)),
                 ("tasks", np.float64, (tasks, joints)),
@@ -147,8 +153,8 @@ class Arm:
     def at(self, q: Vector) -> Kinematics:
         """Kinematics of the arm at joints q (J,) [rad, m]."""
         here = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
-        stand(here, q)
-        jacobian = pin.computeFrameJacobian(self._model, self._data, here["joints"][0], self._tool, AXES)
+        stand(here, self._turns, q)
+        jacobian = pin.computeFrameJacobian(self._model, self._data, here["configuration"][0], self._tool, AXES)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
         describe(self.parameters, here, jacobian, placement.homogeneous)
         return Kinematics(here)

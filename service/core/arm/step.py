@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.compiled import compiled
+from kmp.elementary import sin_cos
 from service.core.arm.least_squares import solve
 from service.core.arm.tuning import (
     IDLE_BRAKE_SHARE,
@@ -29,11 +31,19 @@ SEPARATED = 4  # flag of a step: separation changed the velocities
 
 
 @compiled
-def stand(heres: Records, q: Vector) -> None:
-    """Write joints q (J,) [rad, m], limited to ± MAX_JOINT_RAD."""
-    here = heres[0]
+def stand(heres: Records, turns: NDArray[np.bool_], q: Vector) -> None:
+    """Write joints q (J,) [rad, m], limited to ± MAX_JOINT_RAD, and their configuration: cosine and
+    sine of each joint that `turns` (J,), the position of each other one.
+    """
+    here, entry = heres[0], 0
     for joint in range(len(q)):
-        here.joints[joint] = min(max(q[joint], -MAX_JOINT_RAD), MAX_JOINT_RAD)
+        position = min(max(q[joint], -MAX_JOINT_RAD), MAX_JOINT_RAD)
+        here.joints[joint] = here.configuration[entry] = position
+        if turns[joint]:
+            sine, cosine = sin_cos(position)
+            here.configuration[entry], here.configuration[entry + 1] = cosine, sine
+            entry += 1
+        entry += 1
 
 
 @compiled
@@ -179,7 +189,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
         off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED_RADPS * arm.per_rad[j]
         if arm.is_continuous[j]:  # any number of turns away; 0 at half a turn, where no direction is shorter
-            off = math.sin(off)
+            off, _ = sin_cos(off)
         home[j] = min(max(POSTURE_GAIN_PER_S * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]

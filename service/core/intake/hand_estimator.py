@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.core.codes import DOUBTED, LEARNING, TRUSTED
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
@@ -49,7 +50,7 @@ def smoothing(period_s: float, still_s: float) -> Vector:
     """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
     stillness: 1 - exp(-period / time constant).
     """
-    return 1.0 - np.exp(-period_s / np.array([STILLNESS_LOWPASS_S, still_s, STILLNESS_FALL_S]))
+    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, still_s, STILLNESS_FALL_S)])
 
 
 @compiled
@@ -67,7 +68,7 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
         lowpass[axis] = np.rint((lowpass[axis] + changes[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO) / ROUND_TO
         square += lowpass[axis] * lowpass[axis]
     share = square / still_speed**2
-    now = math.exp(-share * share)
+    now = exp(-share * share)
     after = stillness + (changes[1] if now > stillness else changes[2]) * (now - stillness)
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 

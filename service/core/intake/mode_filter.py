@@ -21,11 +21,10 @@ are the probabilities of the modes. All functions change them in place.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp, log
 from service.core.frame import Records, Vector
 from service.core.intake import MODES, STATES
 from service.core.intake.motion_model import CHANGE, REACH, REST, STEADY
@@ -36,12 +35,12 @@ from service.core.intake.tuning import (
     MODE_INTENSITIES_M2PS5,
     MODE_PRIOR,
     MODE_SWITCH_RATES_PER_S,
+    OUTLIER_STDS,
     REST_ACCELERATION_STD_MPS2,
     REST_MAX_SPEED_MPS,
     REST_SPEED_STD_MPS,
     START_SPEED_STD_MPS,
 )
-from service.core.numerics import PROBABILITY_ROUND_TO
 from service.core.vectors import square
 
 
@@ -196,7 +195,7 @@ def bounded(innovation: float) -> float:
     LEAST_MODE_PROBABILITY³, a factor for each axis: a less probable sample does not distinguish
     modes.
     """
-    return min(innovation, -6.0 * math.log(LEAST_MODE_PROBABILITY))
+    return min(innovation, 6.0 * OUTLIER_STDS**2)
 
 
 @compiled
@@ -212,12 +211,12 @@ def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: flo
         slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + REST_SPEED_STD_MPS²)))
     """
     for i in range(MODES):
-        stay = math.exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
+        stay = exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
         for j in range(MODES):
             shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
         if i != REST:
             speed = square(means[i, 1])
-            slow = math.exp(-0.5 * bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
+            slow = exp(-0.5 * bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
 
@@ -301,7 +300,7 @@ def update(
         log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
     The innovation in log L is that before the update. For REST, log L is reduced by half of
-    `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY and are rounded.
+    `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY.
     """
     shares, expected, likelihood = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES)
     if tremor[1 + CHANGE] == 0.0:
@@ -315,18 +314,16 @@ def update(
             for column in range(row):
                 p[row, column] = p[column, row]
         variance, error = measure(mean, p, noise, position)
-        likelihood[i] = -1.5 * math.log(variance) - 0.5 * bounded(error)
+        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(error)
         if i == REST:
             likelihood[i] -= 0.5 * _beyond_rest(mean, tremor)
         best = max(best, likelihood[i])
     for i in range(MODES):
-        modes[i] = expected[i] * math.exp(likelihood[i] - best)
+        modes[i] = expected[i] * exp(likelihood[i] - best)
     _normalise(modes)
     for i in range(MODES):
         modes[i] = max(modes[i], LEAST_MODE_PROBABILITY)
     _normalise(modes)
-    for i in range(MODES):
-        modes[i] = np.rint(modes[i] * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO
 
 
 @compiled

@@ -91,7 +91,7 @@ def model(interval_s: float | Vector) -> dict[str, Vector]:
     for k, rate in enumerate(TREMOR_RATES_PER_S):
         oscillator = np.array([[0.0, 1.0], [-(rate**2), -2.0 * TREMOR_DAMPING * rate]])
         tremor[..., k, :, :], driven = _over(oscillator, interval_s)
-        tremor_noise[..., k, :, :] = 4.0 * TREMOR_DAMPING * rate**3 * driven
+        tremor_noise[..., k, :, :] = 4.0 * TREMOR_DAMPING * rate * rate * rate * driven
     return {"transition": transition, "noise": noise, "tremor": tremor, "tremor_noise": tremor_noise}
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.contract.records import SOURCES, Cause
 from service.core.codes import (
     ARM_GUIDED,
@@ -102,7 +103,7 @@ def note(states: Records, source: int, jumped: bool, most_s: float, period_s: fl
         passed *= 0.5  # half the time since the sample before the last one
         ticks[0], ticks[1] = ticks[1], state.tick
     passed_s = min(passed * period_s, most_s)
-    share += (1.0 - math.exp(-passed_s / TRACKER_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
+    share += (1.0 - exp(-passed_s / TRACKER_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
     state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
 

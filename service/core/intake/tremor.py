@@ -11,11 +11,10 @@ put in order then, and wrong ones have been dropped.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp, log
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO
 from service.core.intake import BANK, MODES, NO_TREMOR, USUAL_RATE
@@ -23,15 +22,14 @@ from service.core.intake.mode_filter import measure, move_on
 from service.core.intake.motion_model import CHANGE, REST, STEADY
 from service.core.intake.tuning import (
     END_SHARE,
-    LEAST_MODE_PROBABILITY,
     MAX_TREMOR_M,
     NOISE_OUTLIER_SHARE,
+    OUTLIER_STDS,
     START_SPEED_STD_MPS,
     TRACKER_MEMORY_S,
     TREMOR_RATES_PER_S,
     TREMOR_STDS_M,
 )
-from service.core.numerics import PROBABILITY_ROUND_TO
 
 
 @compiled
@@ -69,14 +67,14 @@ def note_tremor(states: Records, models: Records, side: int, at: int, period_s: 
     if not 0 <= ticks < len(models) or state.kept_restarts[side, at] > 0:
         _start(means, covariances, noise, position)
         return
-    fade, overs, null = math.exp(-ticks * period_s / TRACKER_MEMORY_S), models[ticks : ticks + 1], 0.0
+    fade, overs, null = exp(-ticks * period_s / TRACKER_MEMORY_S), models[ticks : ticks + 1], 0.0
     for k in range(BANK):
         mean, covariance, rate = means[k], covariances[k], max(k - NO_TREMOR, 0)
         if ticks > 0:
             driven = TREMOR_STDS_M[REST] ** 2 if k >= NO_TREMOR else 0.0
             move_on(mean, covariance, overs, CHANGE if k == 1 else STEADY, rate, driven)
         variance, error = measure(mean, covariance, noise, position)
-        likelihood = -1.5 * math.log(variance) - 0.5 * min(error, NOISE_OUTLIER_SHARE)
+        likelihood = -1.5 * log(variance) - 0.5 * min(error, NOISE_OUTLIER_SHARE)
         if k == 0:
             null = likelihood
         evidence[k] = np.rint((evidence[k] * fade + likelihood - null) * ROUND_TO) / ROUND_TO
@@ -86,7 +84,7 @@ def note_tremor(states: Records, models: Records, side: int, at: int, period_s: 
                 amplitude += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATES_PER_S[rate]) ** 2
             strength = state.bank_variances[side, rate]
             strength += (1.0 - fade) * (min(amplitude, MAX_TREMOR_M**2) - strength)
-            state.bank_variances[side, rate] = np.rint(strength * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO
+            state.bank_variances[side, rate] = strength
     _choose(states, side)
 
 
@@ -101,7 +99,7 @@ def _choose(states: Records, side: int) -> None:
     for k in range(NO_TREMOR, BANK):
         if state.bank_evidence[side, k] > state.bank_evidence[side, best]:
             best = k
-    least = -math.log(LEAST_MODE_PROBABILITY) * (END_SHARE if state.trembles[side] else 1.0)
+    least = OUTLIER_STDS**2 * (END_SHARE if state.trembles[side] else 1.0)
     no_tremor(states, side)
     if state.bank_evidence[side, best] - max(state.bank_evidence[side, 0], state.bank_evidence[side, 1]) > least:
         state.trembles[side], state.tremor_rate[side] = 1, best - NO_TREMOR

@@ -37,7 +37,7 @@ TREMOR_RATE_PER_S = 2.0 * math.pi * 10.0  # [1/s] usual angular frequency; physi
 # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
 TREMOR_DAMPING = 0.1  # damping ratio of the tremor's oscillator
 # [1/s] possible rates, 2.3 to 12 Hz; neighbours differ by the width of the resonance
-TREMOR_RATES_PER_S = TREMOR_RATE_PER_S * (1.0 + 2.0 * TREMOR_DAMPING) ** np.arange(-8.0, 2.0)
+TREMOR_RATES_PER_S = np.round(TREMOR_RATE_PER_S * (1.0 + 2.0 * TREMOR_DAMPING) ** np.arange(-8.0, 2.0), 9)
 # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
 MAX_TREMOR_M = 6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
 # [m/s] after a hand's first sample: OUTLIER_STDS times the stationary one of the mode CHANGE
@@ -49,7 +49,7 @@ REST_SPEED_STD_MPS = 0.01  # standard deviation of a resting hand, each axis: ha
 REST_ACCELERATION_STD_MPS2 = REST_SPEED_STD_MPS  # [m/s²] it changes its drift by as much in a second
 REST_MAX_SPEED_MPS = OUTLIER_STDS * REST_SPEED_STD_MPS  # a faster hand does not rest: reaches are seen at once
 # no mode becomes less probable than an outlier on two axes, so that each can return
-LEAST_MODE_PROBABILITY = math.exp(-(OUTLIER_STDS**2))
+LEAST_MODE_PROBABILITY = round(math.exp(-(OUTLIER_STDS**2)), 9)
 REAPPEARED_VARIANCE_SHARE = OUTLIER_STDS**2  # squared distance / variance of a hand that continues its filter
 
 # Measurement noise, estimated from third differences of the samples.

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
 from service.core.separation import FARTHEST_REPORTED_M
@@ -119,7 +120,7 @@ def step(
                 for j in range(joints):
                     later[j] = here.joints[j] + ahead * state.joints[1, j]
                 place(later, config.frames, config.axes, capsules, then)
-            faster = HAND_ACCELERATION_FADE_S * (1.0 - math.exp(-ahead / HAND_ACCELERATION_FADE_S))
+            faster = HAND_ACCELERATION_FADE_S * (1.0 - exp(-ahead / HAND_ACCELERATION_FADE_S))
             for i in range(3):
                 v, a = state.hands[side, 1, i], state.hands[side, 2, i]
                 velocity[i] = v + faster * a

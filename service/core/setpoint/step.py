@@ -186,19 +186,19 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
 
     With h the distance to the side, (d/dt + p)³ h >= 0, that is
 
-        jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = gains[0]^(1/3).
+        jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = -gains[4] / 2.
 
     A setpoint whose target lies on a side then comes to rest there. Without this limit, the tracker
     would pass its target a little, begin the fastest stop each time, and oscillate. Beyond a side,
     h is 0: the setpoint moves no farther out, and its targets bring it back.
     """
     config = parameters[0]
-    p = config.gains[0] ** (1.0 / 3.0)
+    p = -0.5 * config.gains[4]
     for i in range(3):
         x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
         damping = -3.0 * p * (p * v + a)
-        highest = max(p**3 * max(box[1, i] - x, 0.0) + damping, -config.stop_jerk)
-        lowest = min(p**3 * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk)
+        highest = max(p * p * p * max(box[1, i] - x, 0.0) + damping, -config.stop_jerk)
+        lowest = min(p * p * p * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk)
         jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
 
 

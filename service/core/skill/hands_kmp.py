@@ -47,7 +47,7 @@ class HandsKMP:
     * both hands' positions (6);
     * for each of `order` rows of their memory, its offset from these positions (6 each);
     * if `turned`, both hands' rotation matrices times TURN_WEIGHT_M (18);
-    * if there is a `clock` of the task, its time times its weight (1).
+    * if the `clock` of the task has a weight, its time times its weight (1).
 
     A hand of unknown orientation is assumed to have the mean orientation of the demonstrations.
     Where no clock is known, as at a via-point, it is that of the nearest reference point.
@@ -76,12 +76,17 @@ class HandsKMP:
     @property
     def order(self) -> int:
         """Number of rows of the hands' memory that are inputs."""
-        beside = TURN_INPUTS * self.turned + (self.clock is not None)
+        beside = TURN_INPUTS * self.turned + self.is_timed
         return min(max((int(self.primitive.inputs.shape[1]) - beside) // 6 - 1, 0), ORDER)
 
     @property
     def shape(self) -> tuple[int, int]:
-        return 6 * (1 + self.order) + TURN_INPUTS * self.turned + (self.clock is not None), 3
+        return 6 * (1 + self.order) + TURN_INPUTS * self.turned + self.is_timed, 3
+
+    @property
+    def is_timed(self) -> bool:
+        """True if the clock is an input."""
+        return self.clock is not None and self.clock.weight > 0.0
 
     @cached_property
     def _usual_turns(self) -> Vector:
@@ -145,7 +150,7 @@ class HandsKMP:
             return hands
         usual = self._usual_turns
         out = [hands, np.zeros((len(hands), 6 * self.order)), np.tile(usual, (len(hands), 1))]
-        if self.clock is not None:
+        if self.is_timed:
             known = self.primitive.base.inputs
             nearest = ((hands[:, None] - known[:, :6]) ** 2).sum(axis=2).argmin(axis=1)
             out.append(known[nearest, -1:])
@@ -154,7 +159,7 @@ class HandsKMP:
     @property
     def _is_rich(self) -> bool:
         """True if there are other inputs than positions."""
-        return bool(self.order or self.turned or self.clock is not None)
+        return bool(self.order or self.turned or self.is_timed)
 
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
         moving = self._moving(seen)
@@ -168,7 +173,7 @@ class HandsKMP:
         if self.turned and not len(turns):
             turns = np.tile(self._usual_turns / TURN_WEIGHT_M, (TURNS, 1))
         moving_features(seen.moving, seen.past[: self.order], turns, out)
-        if self.clock is not None:
+        if self.clock is not None and self.clock.weight > 0.0:
             out[:, -1] = self.clock.weight * seen.clock[:3]
         return out
 

@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.core.frame import Records, Vector
 from service.core.numerics import MEMORY_STEP_S
 from service.core.skill import TURNS
@@ -48,8 +49,8 @@ def remember(states: Records, period_s: float, lag_s: float, turn_lag_s: float) 
         share = turn_share = 1.0
         if state.memory_ticks[side] >= 0:
             passed_s = (state.tick - state.memory_ticks[side]) * period_s
-            share = 1.0 - math.exp(-min(passed_s, MEMORY_LONGEST_STEP_S) / lag_s) if lag_s > 0.0 else 1.0
-            turn_share = 1.0 - math.exp(-passed_s / turn_lag_s)
+            share = 1.0 - exp(-min(passed_s, MEMORY_LONGEST_STEP_S) / lag_s) if lag_s > 0.0 else 1.0
+            turn_share = 1.0 - exp(-passed_s / turn_lag_s)
         state.memory_ticks[side] = state.tick
         for i in range(3):
             _follow(state.hands[side, 0, i], share, state.memory[:, side, i])
@@ -176,7 +177,7 @@ def along(values: Vector, period_s: float, lag_s: float, rows: int) -> Vector:
     (T, D).
     """
     out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / MEMORY_STEP_S))
-    _filtered(np.ascontiguousarray(values), 1.0 - math.exp(-period_s / steps / lag_s), steps, out)
+    _filtered(np.ascontiguousarray(values), 1.0 - exp(-period_s / steps / lag_s), steps, out)
     return out
 
 

@@ -153,7 +153,7 @@ class Model(Protocol):
 
     @property
     def clock_rows(self) -> Vector | None:
-        """Parameters (K, 12) of the clock in each stage, see `task_clock.count`."""
+        """Parameters (K, 13) of the clock in each stage, see `task_clock.count`."""
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""

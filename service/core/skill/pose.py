@@ -12,6 +12,7 @@ import numpy as np
 
 from kmp import KMP
 from kmp.compiled import compiled
+from kmp.elementary import sin_cos
 from service.core.frame import Vector
 from service.core.geometry import turn_on
 from service.core.skill.tuning import GRIPPER_CLOSE_ABOVE, GRIPPER_MOVES_S, GRIPPER_OPEN_BELOW, GRIPPER_THERE_M
@@ -113,7 +114,8 @@ def _turned(
     angle = math.sqrt(square)
     first, second = 0.5, 1.0 / 6.0
     if angle > 1e-3:
-        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
+        sine, cosine = sin_cos(angle)
+        first, second = (1.0 - cosine) / square, (angle - sine) / (square * angle)
     for i in range(3):
         for j in range(3):
             per_zeta[i, j] = 2.0 * second * vector[i] * vector[j]

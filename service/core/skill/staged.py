@@ -110,7 +110,7 @@ class Placed(Immutable):
         sizes["scale"], _ = primitive.kernel.coordinates(1)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
         inputs, count = primitive.centres, len(off)
-        if clock is None:
+        if clock is None or not clock.weight:
             inputs = np.column_stack([inputs, np.zeros(len(inputs))])
         else:
             sizes["clock_weight"] = clock.weight
@@ -183,13 +183,6 @@ class Placed(Immutable):
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
-def rows_of(clock: TaskClock, stages: Records) -> Vector:
-    """Parameters (K, 12) of a clock in these stages, each with the hands at its begin."""
-    out = np.tile(clock.numbers, (len(stages), 1))
-    out[:, 6:] = stages["begins"].reshape(-1, 6)
-    return out
-
-
 @dataclass(frozen=True, eq=False)
 class StagedKMP:
     """Model with the inputs share of a stage that the left and the right hand have covered, the
@@ -225,11 +218,16 @@ class StagedKMP:
 
     @property
     def shape(self) -> tuple[int, int]:
-        return 2 + len(self.off) + (self.clock is not None), OUTPUTS
+        return 2 + len(self.off) + self.is_timed, OUTPUTS
+
+    @property
+    def is_timed(self) -> bool:
+        """True if the clock is an input."""
+        return self.clock is not None and self.clock.weight > 0.0
 
     @cached_property
     def clock_rows(self) -> Vector | None:
-        return None if self.clock is None else rows_of(self.clock, self._unpulled.stages)
+        return None if self.clock is None else self.clock.rows(self._unpulled.stages["begins"].reshape(-1, 6))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -335,7 +333,7 @@ class StagedKMP:
         most = int(belief.argmax())
         stage, hands = self.placed.stages[most], np.ascontiguousarray(hands)
         along = along_both(hands, still, stage)
-        time = [] if self.clock is None else [self.clock.weight * clock_s]
+        time = [self.clock.weight * clock_s] if self.clock is not None and self.clock.weight else []
         return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)]), *time])
 
     def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> StagedKMP:

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp, tanh
 from kmp.loops.kernel_row import add_weighted
 from kmp.loops.mean import add_table
 from service.core.frame import Record, Records, Vector
@@ -149,7 +150,7 @@ def _near(hands: Vector, stage: Record) -> float:
     for side in range(2):
         for i in range(3):
             square += (hands[3 * side + i] - stage["begins"][side, i]) ** 2
-    return math.exp(-0.5 * square / STAGE_END_M**2)
+    return exp(-0.5 * square / STAGE_END_M**2)
 
 
 @compiled
@@ -169,7 +170,7 @@ def _likely(moving: Vector, stage: Record) -> float:
         out -= 0.5 * min((off / stage["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
         length, velocity = stage["square"][side], moving[1, here]
         goes = dot(velocity, stage["way"][side]) / math.sqrt(length) if length > STAYS else -norm(velocity)
-        out += math.tanh(goes / DIRECTION_SPEED_MPS)
+        out += tanh(goes / DIRECTION_SPEED_MPS)
     return out
 
 
@@ -219,7 +220,7 @@ def recognise(belief: Vector, moving: Vector, period_s: float, stages: Records, 
     most = likelihood.max()
     total = 0.0
     for k in range(count):
-        belief[k] *= math.exp((likelihood[k] - most) * share)
+        belief[k] *= exp((likelihood[k] - most) * share)
         total += belief[k]
     for k in range(count):
         belief[k] = round(belief[k] / total * ROUND_TO) / ROUND_TO
@@ -377,7 +378,7 @@ def _around(moving: Vector, out: Vector) -> None:
         square = 0.0
         for i in range(3 * side, 3 * side + 3):
             square += moving[1, i] * moving[1, i]
-        goes = 1.0 - math.exp(-((math.sqrt(square) / CALM_MPS) ** 4))
+        goes = 1.0 - exp(-((math.sqrt(square) / CALM_MPS) ** 4))
         for i in range(3 * side, 3 * side + 3):
             step, curved = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
             out[0, i], out[1, i], out[2, i] = moving[0, i] - step + curved, moving[0, i], moving[0, i] + step + curved

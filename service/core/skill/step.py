@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import acos, exp, sin_cos
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Records, Vector
 from service.core.intake.tuning import END_SHARE
@@ -28,7 +29,7 @@ def recent(position: Vector, passed_s: float, trail: Vector) -> Vector:
 
         m = m + (1 - exp(-elapsed / T)) (p - m),   v = (p - m) / T
     """
-    out, share = np.empty(3), 1.0 - math.exp(-passed_s / TRAIL_S)
+    out, share = np.empty(3), 1.0 - exp(-passed_s / TRAIL_S)
     for i in range(3):
         trail[i] += share * (position[i] - trail[i])
         out[i] = (position[i] - trail[i]) / TRAIL_S
@@ -55,7 +56,7 @@ def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, 
     spread = math.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
     if spread > 0.0:
         half = 0.5 * (a * b * c + 2.0 * d * e * f - a * f * f - b * e * e - c * d * d) / spread**3
-        mean += 2.0 * spread * math.cos(math.acos(min(max(half, -1.0), 1.0)) / 3.0)
+        mean += 2.0 * spread * sin_cos(acos(min(max(half, -1.0), 1.0)) / 3.0)[1]
     return math.sqrt(REGION_95 * max(mean, 0.0))
 
 
@@ -98,7 +99,7 @@ def conclude(
     if rule.alarm > 0.0:
         state.unsure = frame.error_probability > ease * rule.alarm
     else:
-        state.unsure = math.hypot(reach_m, off) > ease * UNSURE_M
+        state.unsure = math.sqrt(reach_m * reach_m + off * off) > ease * UNSURE_M
     tell_stage(states, frames)
     if ambiguity <= AMBIGUOUS_PROBABILITY * (END_SHARE if state.reason == AMBIGUOUS else 1.0):
         state.sure_tick = state.tick

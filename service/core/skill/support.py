@@ -14,13 +14,14 @@ import numpy as np
 from kmp import KMP
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
+from kmp.elementary import exp, log
 from kmp.loops.mean import add_table, table_of
 from service.core.frame import Vector
 from service.core.numerics import PROBABILITY_ROUND_TO
 from service.core.skill.model import LEVELS
 from service.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
 
-SURVIVAL = -np.log1p(-np.array(LEVELS))  # -log of the share of errors beyond each level
+SURVIVAL = np.round(-np.log1p(-np.array(LEVELS)), 12)  # -log of the share of errors beyond each level
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,9 +110,9 @@ def error_probability(covariance: Vector, added: float, ratios: Vector) -> float
         k = 1
         while k < len(ratios) - 1 and ratio > ratios[k]:
             k += 1
-        width = max(math.log(ratios[k] / ratios[k - 1]), 1e-3)
-        along = math.log(ratio / ratios[k - 1]) / width
-        found = math.exp(-(SURVIVAL[k - 1] + along * (SURVIVAL[k] - SURVIVAL[k - 1])))
+        width = max(log(ratios[k] / ratios[k - 1]), 1e-3)
+        along = log(ratio / ratios[k - 1]) / width
+        found = exp(-(SURVIVAL[k - 1] + along * (SURVIVAL[k] - SURVIVAL[k - 1])))
     return float(np.rint(found * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO)
 
 

@@ -8,11 +8,15 @@ t' [s] it advances at a rate r, which follows its goal g with the time constant 
 * g = 1 for a clock that runs. g = 1 - s for a clock that waits, with the stillness s of the hand
   that is less still.
 * g = 0 once t has reached `longest_s`, the end of the longest demonstration.
-* g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. The next motion
-  starts the clock anew if the hands are where demonstrations begin, or if the task may be over (t
-  at least `over_s`). Elsewhere the user has paused, and the clock continues.
-* If the task has stages, the clock starts anew in each. When the most probable stage changes, the
-  clock is set to 0, and starts with the next motion.
+* g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. If the task may
+  be over then (t at least `over_s`), the next motion starts the clock anew. Otherwise the user has
+  paused, and the clock continues.
+* t = r = 0 once the hands have rested for `home_s` where demonstrations begin, longer than in any
+  demonstration there. The task begins again: the memory of the hands is that of hands that have
+  always been there, no stage is known, and the next motion starts the clock.
+* If the task has stages, the clock starts anew in each. When the most probable stage changes, or
+  after a rest of `rest_s` where the stage begins, the clock is set to 0, and starts with the next
+  motion.
 
 So the clock is continuous within a stage, and constant where nothing was demonstrated.
 """
@@ -27,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.core.frame import Records, Vector
 from service.core.numerics import MEMORY_STEP_S
 from service.core.skill import MAX_SKILL_DISTANCE_M
@@ -34,76 +39,102 @@ from service.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS
 from service.core.vectors import norm, squared_distance
 
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE = range(5)  # entries of `task_clock` in the state
-WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, NEAR_AT = 0, 2, 3, 4, 5  # entries of `TaskClock.numbers`
+WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
 LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
 
 
 class TaskClock(NamedTuple):
-    """Parameters of the clock that is an input of a skill."""
+    """Parameters of the clock of a skill."""
 
     waits: bool  # true if the clock waits while both hands rest
-    weight: float  # as an input, a second counts as this length [m], with stages as this share of a segment
+    # As an input, a second counts as this length [m], with stages as this share of a segment. With
+    # 0, the clock is no input, and only tells when a task begins again.
+    weight: float
     longest_s: float  # the clock stops at this time
     over_s: float  # from this time on the task may be over
     rest_s: float  # a longer rest ends the task, or is a pause
+    home_s: float  # at most `rest_s`: after a longer rest near `begin` the task begins again
     near_m: float  # hands within this distance of `begin` are where demonstrations begin
     begin: tuple[float, ...]  # (6,) [m] mean hands at the begin of the demonstrations
 
     @property
     def numbers(self) -> Vector:
-        """The parameters (12,) as one array, as compiled functions and a skill's file have them."""
+        """The parameters (13,) as one array, as compiled functions and a skill's file have them."""
         return np.array([*self[:-1], *self.begin], np.float64)
+
+    def rows(self, begins: Vector) -> Vector:
+        """The parameters (K, 13) in each of K stages that begin with the hands `begins` (K, 6)
+        [m].
+        """
+        out = np.tile(self.numbers, (len(begins), 1))
+        out[:, BEGIN_AT:] = begins
+        return out
 
     @staticmethod
     def of(numbers: Iterable[float]) -> TaskClock:
         """The clock with these `numbers`. Raises ValueError if they are no clock's."""
         values = [float(number) for number in numbers]
-        if len(values) != 12:
-            raise ValueError(f"task_clock has {len(values)} numbers, 12 needed")
-        waits, weight, longest_s, over_s, rest_s, near_m, *begin = values
-        largest = (1.0, MOST_CLOCK_WEIGHT, *3 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
-        if not all(abs(value) <= most for value, most in zip(values, largest, strict=True)) or min(values[:6]) < 0.0:
-            raise ValueError(f"task_clock is {values}: numbers from 0 to {largest[:6]} and a begin [m] needed")
-        return TaskClock(waits > 0.0, weight, longest_s, over_s, rest_s, near_m, tuple(begin))
+        if len(values) != BEGIN_AT + 6:
+            raise ValueError(f"task_clock has {len(values)} numbers, {BEGIN_AT + 6} needed")
+        waits, weight, longest_s, over_s, rest_s, home_s, near_m = values[:BEGIN_AT]
+        largest = (1.0, MOST_CLOCK_WEIGHT, *4 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
+        is_in_range = all(abs(value) <= most for value, most in zip(values, largest, strict=True))
+        if not is_in_range or min(values[:BEGIN_AT]) < 0.0:
+            raise ValueError(f"task_clock is {values}: numbers from 0 to {largest[:BEGIN_AT]} and a begin [m] needed")
+        return TaskClock(waits > 0.0, weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:]))
 
 
 @compiled
-def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> None:
+def _is_near(hands: Vector, numbers: Vector) -> bool:
+    """True if both hands (6,) [m] are where the task or the stage with these `numbers` begins."""
+    for side in range(2):
+        begin = numbers[BEGIN_AT + 3 * side : BEGIN_AT + 3 * side + 3]
+        if squared_distance(hands[3 * side : 3 * side + 3], begin) > numbers[NEAR_AT] ** 2:
+            return False
+    return True
+
+
+@compiled
+def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> bool:
     """Advance a clock (5,) by one period `period_s` [s]; see the equations of this module. The
     faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
-    `still`.
+    `still`. Returns true if the task begins again.
 
     `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, and
-    the stage. `rows` (K, 12) are `TaskClock.numbers` of each stage; a task without stages has one
+    the stage. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages has one
     row.
     """
-    numbers = rows[stage]
+    numbers, begins_again = rows[stage], False
     if clock[CLOCK_STAGE] != stage:
         clock[:] = 0.0
         clock[CLOCK_STAGE] = stage
+
     if speed > CLOCK_START_MPS:
-        if clock[REST_LEFT_S] <= 0.0:
-            near, square = True, numbers[NEAR_AT] ** 2
-            for side in range(2):
-                here = slice(3 * side, 3 * side + 3)
-                near = near and squared_distance(hands[here], numbers[6:][here]) <= square
-            if near or clock[CLOCK_S] >= numbers[OVER_AT]:
-                clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
+        if clock[REST_LEFT_S] <= 0.0 and clock[CLOCK_S] >= numbers[OVER_AT]:
+            clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
         clock[REST_LEFT_S] = numbers[REST_AT]
     else:
-        clock[REST_LEFT_S] = max(clock[REST_LEFT_S] - period_s, 0.0)
+        before_s = clock[REST_LEFT_S]
+        clock[REST_LEFT_S] = max(before_s - period_s, 0.0)
+        has_returned = clock[REST_LEFT_S] <= numbers[REST_AT] - numbers[HOME_AT] and _is_near(hands, rows[0])
+        if before_s > 0.0 and (has_returned or (clock[REST_LEFT_S] == 0.0 and _is_near(hands, numbers))):
+            clock[CLOCK_S] = clock[CLOCK_RATE] = clock[REST_LEFT_S] = 0.0
+            begins_again = has_returned
+
     goal = 0.0
     if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
         goal = 1.0 - still if numbers[WAITS_AT] > 0.0 else 1.0
-    clock[CLOCK_RATE] += (1.0 - math.exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
+    clock[CLOCK_RATE] += (1.0 - exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
     clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
     clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
+    return begins_again
 
 
 @compiled
 def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
-    """Advance the clock in the state by `count`, in the most probable stage. The speeds are those
-    of the hands `sides` (2,) without their tremor.
+    """Advance the clock in the state by `count`, in the most probable stage; memory and belief end
+    where the task begins again. The speeds are those of the hands `sides` (2,) without their
+    tremor.
     """
     state, hands, speed, still, stage = states[0], np.empty(6), 0.0, 1.0, 0
     for i in range(2):
@@ -113,7 +144,10 @@ def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vecto
     for k in range(len(rows)):
         if state.stage_belief[k] > state.stage_belief[stage]:
             stage = k
-    count(hands, speed, still, passed_s, stage, rows, state.task_clock)
+    if count(hands, speed, still, passed_s, stage, rows, state.task_clock):
+        state.memory_ticks[:] = -1
+        state.stage_belief[:] = 0.0
+        state.unprimed_belief[:] = 0.0
 
 
 @compiled

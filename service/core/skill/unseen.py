@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kmp.compiled import compiled
+from kmp.elementary import exp
 from service.core.frame import Records, Vector
 from service.core.intake.tuning import MODE_PRIOR, MODE_SWITCH_RATES_PER_S
 from service.core.skill.memory import turn_lag_s
@@ -26,7 +27,7 @@ def deviation_m(states: Records, side: int, period_s: float) -> float:
     hand may have begun to move, or to rest.
     """
     state, variance = states[0], 0.0
-    stay = math.exp(-MODE_SWITCH_RATES_PER_S.max() * (state.tick - state.hand_ticks[side]) * period_s)
+    stay = exp(-MODE_SWITCH_RATES_PER_S.max() * (state.tick - state.hand_ticks[side]) * period_s)
     for mode in range(len(MODE_PRIOR)):
         share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * MODE_PRIOR[mode]
         variance += share * state.mode_covariances[side, mode, 0, 0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
-from service.core.numerics import LEAST_PULL_VARIANCE_SHARE
+from service.core.numerics import LEAST_PULL_VARIANCE_SHARE, PULL_DECIMALS
 from service.core.skill.tuning import LEAST_SEGMENT_M, PULL_SHARPNESS_PER_M2
 
 NEIGHBOURS = 12  # of a via-point with a radius: two along each coordinate of both hands
@@ -80,4 +80,5 @@ def pulls_through(
     off = np.concatenate([outputs - mean(inputs), np.zeros((len(unchanged), 3))])
     square = ((centres[:, None] - centres) ** 2).sum(axis=2)
     noise = np.concatenate([deviations**2, np.zeros(len(unchanged))]) + LEAST_PULL_VARIANCE_SHARE
-    return centres, np.linalg.solve(np.exp(-sharpness * square) + np.diag(noise), off)
+    weights = np.linalg.solve(np.exp(-sharpness * square) + np.diag(noise), off)
+    return centres, np.asarray(np.round(weights, PULL_DECIMALS), np.float64)

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from service.contract.messages import BASE, PoseStamped
 from service.core.frame import Records, Vector, blank, state_layout
 from service.core.intake.stage import Intake
-from service.core.skill.staged import rows_of
 from service.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
-from service.core.skill.tuning import CLOCK_START_MPS
+from service.core.skill.tuning import CLOCK_START_MPS, LEAST_SEGMENT_M
 from service.learning.demonstration import Demonstration
 from service.learning.regions import blocks_of
 from service.settings.config import Settings
 
 LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
+LEAST_REST_S = 1.0  # a shorter rest is no pause
+LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
+HALF_WAY = 0.5  # of the way to the nearest begin of another stage, the hands are not at the first one
 LEAST_NEAR_M = 0.1  # hands within this distance of where demonstrations begin have returned there
 NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of a demonstration's hands
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
@@ -72,16 +74,21 @@ class Tempo(NamedTuple):
         )
 
     def in_stages(self, rows: Vector, stages: NDArray[np.int64]) -> Vector:
-        """The clock (T,) [s] in these stages (T,), with the parameters `rows` of `rows_of`."""
+        """The clock (T,) [s] in these stages (T,), with the parameters `rows` of the clock."""
         return counted(self.hands, self.speeds.max(axis=1), self.stillness.min(axis=1), self.period_s, rows, stages)
 
-    def longest_rest_s(self, alone: int | None) -> float:
-        """The longest time [s] without motion after the first motion, also at the end."""
+    def rested_s(self, alone: int | None) -> Vector:
+        """Times (T,) [s] since the hands moved; 0 before their first motion."""
         sides = slice(None) if alone is None else [alone]
-        moving = np.flatnonzero(self.speeds[:, sides].max(axis=1) > CLOCK_START_MPS)
-        if not len(moving):
-            return 0.0
-        return float(np.diff([*moving, len(self.speeds)]).max()) * self.period_s
+        is_moving = self.speeds[:, sides].max(axis=1) > CLOCK_START_MPS
+        samples = np.arange(len(is_moving))
+        latest_motion = np.maximum.accumulate(np.where(is_moving, samples, -1))
+        return np.where(latest_motion < 0, 0, samples - latest_motion) * self.period_s
+
+    def is_near(self, begin: Vector, near_m: float, alone: int | None) -> NDArray[np.bool_]:
+        """True (T,) where the hands that matter are within `near_m` of `begin` (6,) [m]."""
+        distances_m = np.linalg.norm((self.hands - begin).reshape(-1, 2, 3), axis=2)
+        return np.asarray((distances_m[:, slice(None) if alone is None else [alone]] <= near_m).all(axis=1))
 
 
 def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
@@ -90,10 +97,23 @@ def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> Task
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
     near_m = max(LEAST_NEAR_M, NEAR_TIMES * off_m)
-    rest_s = LONGER * max(one.longest_rest_s(alone) for one in tempos)
-    free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, near_m, tuple(begin.tolist()))
+    free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(begin=tuple(begin.tolist()))
     ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
-    return free._replace(longest_s=max(ends_s), over_s=min(ends_s), rest_s=max(rest_s, 1.0))
+    return free._replace(longest_s=max(ends_s), over_s=min(ends_s))
+
+
+def _endless(
+    tempos: Sequence[Tempo], begins: Sequence[Vector], near_m: float, alone: int | None, *, waits: bool
+) -> TaskClock:
+    """A clock that does not stop by itself, whose rests are longer than those of demonstrations
+    that begin with these hands (6,) [m].
+    """
+    rested_s = [one.rested_s(alone) for one in tempos]
+    is_home = [tempo.is_near(begin, near_m, alone) for tempo, begin in zip(tempos, begins, strict=True)]
+    rest_s = LONGER * max(float(one.max()) for one in rested_s)
+    home_s = LONGER * max(float(one[inside].max(initial=0.0)) for one, inside in zip(rested_s, is_home, strict=True))
+    rest_s, home_s = max(rest_s, LEAST_REST_S), max(home_s, LEAST_HOME_S)
+    return TaskClock(waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6)
 
 
 def stage_clock_of(
@@ -102,13 +122,27 @@ def stage_clock_of(
     """The clock of the stages (K,) of demonstrations with these tempos and labels (T,), with a
     weight of 1. Only where a stage begins does a rest start it anew.
     """
-    rest_s = LONGER * max(one.longest_rest_s(None) for one in tempos)
-    free = TaskClock(waits, 1.0, math.inf, math.inf, math.inf, LEAST_NEAR_M, (0.0,) * 6)
+    begins = [begins_of(stages) for stages in placed]
+    near_m = min(LEAST_NEAR_M, *(HALF_WAY * _nearest_m(hands) for hands in begins))
+    free = _endless(tempos, [hands[0] for hands in begins], near_m, None, waits=waits)
     ends_s = [
-        float(tempo.in_stages(rows_of(free, stages), label).max())
-        for tempo, stages, label in zip(tempos, placed, labels, strict=True)
+        float(tempo.in_stages(free.rows(hands), label).max())
+        for tempo, hands, label in zip(tempos, begins, labels, strict=True)
     ]
-    return free._replace(longest_s=max(ends_s), over_s=LONGEST_CLOCK_S, rest_s=max(rest_s, 1.0))
+    return free._replace(longest_s=max(ends_s))
+
+
+def begins_of(stages: Records) -> Vector:
+    """The hands (K, 6) [m] with which each of K stages begins."""
+    return np.asarray(stages["begins"].reshape(-1, 6))
+
+
+def _nearest_m(begins: Vector) -> float:
+    """The distance [m] of the hand that moves farther, from where the task begins (K, 6) to the
+    nearest begin of another stage at which the hands are elsewhere.
+    """
+    distances_m = np.linalg.norm((begins[1:] - begins[0]).reshape(-1, 2, 3), axis=2).max(axis=1)
+    return float(distances_m[distances_m > LEAST_SEGMENT_M].min(initial=math.inf))
 
 
 def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -53,7 +53,12 @@ class Inputs(NamedTuple):
     @property
     def is_rich(self) -> bool:
         """True if there are other inputs than positions."""
-        return bool(self.order or self.turned or self.clock is not None)
+        return bool(self.order or self.turned or self.is_timed)
+
+    @property
+    def is_timed(self) -> bool:
+        """True if the clock is an input."""
+        return self.clock is not None and self.clock.weight > 0.0
 
     def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
         """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
@@ -62,7 +67,7 @@ class Inputs(NamedTuple):
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
             turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
         found = features(hands, demonstration.period_s, self.order, turns)
-        if self.clock is None:
+        if self.clock is None or not self.is_timed:
             return found
         assert tempo is not None
         return np.column_stack([found, self.clock.weight * tempo.seconds(self.clock, self.alone)])
@@ -103,10 +108,12 @@ class HandInputs:
         tempos = [Tempo.of(take.demonstration) for take in taught.all]
         found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
         kind = found.kind
-        if kind.clock is not None:
+        if kind.order and kind.clock is None:
+            kind = kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
+        elif kind.clock is not None:
             remarks.append(
-                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.rest_s:.1f} s, where demonstrations begin "
-                "or after the task, starts it anew"
+                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where demonstrations begin "
+                f"starts it anew, and one of more than {kind.clock.rest_s:.1f} s after the task"
             )
         if kind.alone is not None:
             remarks.append(

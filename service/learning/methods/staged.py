@@ -27,7 +27,7 @@ from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.core.skill import ORDER
 from service.core.skill.memory import along
-from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, Unknown, rows_of
+from service.core.skill.staged import NO_ERRORS, Placed, StagedKMP, Unknown
 from service.core.skill.stages import LEFT, MOST_STAGES, NONE, OUTPUTS, RIGHT, STAYS
 from service.core.skill.task import Indices, NamedViaPoints, Task
 from service.core.skill.task_clock import TaskClock
@@ -46,7 +46,7 @@ from service.learning.division import (
     via_points_never_reached,
 )
 from service.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
-from service.learning.methods.clock import Tempo, paired, remark_on, stage_clock_of
+from service.learning.methods.clock import Tempo, begins_of, paired, remark_on, stage_clock_of
 from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, CLOCKS, LEAST_TURN_RAD, POSITIONS, clock_limit_m, refit
 from service.learning.methods.weights import WEIGHTS, chosen
@@ -113,7 +113,7 @@ class Samples(NamedTuple):
     def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The samples with a clock as the last input."""
         times = [
-            tempo.in_stages(rows_of(clock, one.stages), one.labels)[rows]
+            tempo.in_stages(clock.rows(begins_of(one.stages)), one.labels)[rows]
             for tempo, one, rows in zip(tempos, self.encoded, self.rows, strict=True)
         ]
         inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
@@ -283,7 +283,7 @@ class _Prediction(NamedTuple):
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
         times = np.zeros(len(hands))
         if clock is not None and tempo is not None:
-            times = tempo.in_stages(rows_of(clock, placed.stages), belief.argmax(axis=1))
+            times = tempo.in_stages(clock.rows(begins_of(placed.stages)), belief.argmax(axis=1))
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
         belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
         errors = one.tool[::step] - placed.mean(hands, belief, tempos)
@@ -412,6 +412,10 @@ class Staged:
         task, encoded, off = best.task, best.encoded, best.off
         if best.samples.clock is not None:
             remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each stage")
+        tempos, shown = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
+        untimed = stage_clock_of(
+            tempos, [one.stages for one in shown], [one.labels for one in shown], waits=False
+        )._replace(weight=0.0)
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
             progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
@@ -428,7 +432,7 @@ class Staged:
             off,
             np.concatenate(errors),
             delay.mean_s,
-            clock=best.samples.clock,
+            clock=best.samples.clock or untimed,
             unknown=unknown,
         )
         held_out: dict[int, HeldOut] = {}
@@ -436,7 +440,7 @@ class Staged:
         for block in blocks:
             others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, model.clock, known)
+                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, best.samples.clock, known)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]

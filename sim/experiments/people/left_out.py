@@ -2,11 +2,14 @@
 judgement.
 
 Hands pass sample by sample through the core's stages `intake` and `skill`, each take from a fresh
-state. Targets are clamped only where a reach is given: most recordings lie outside the arm's.
+state, alone or in a session: the same take again and again, with the way back of the hands and a
+rest before each further round. Targets are clamped only where a reach is given: most recordings lie
+outside the arm's.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -35,6 +38,8 @@ from sim.experiments.rivals.method import Observed, Predicted
 
 RATE_HZ, JUDGED_HZ = 125, 25
 LONGEST_SHIFT_S = 1.0
+RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
+BACK_S = 2.0  # the hands' way back to where the take begins
 FAR_M = 1e3  # the corner of a workspace that clamps nothing
 ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
 PLACE_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
@@ -95,6 +100,66 @@ def predicted(skill: Skill, take: LeftOut, *, reach: Reach | None = None) -> Pre
     return _through_core(take.demonstration, skill, reach)[2]
 
 
+def predicted_rounds(
+    skill: Skill, take: LeftOut, *, reach: Reach | None = None, broken_share: float = 0.0
+) -> list[Predicted]:
+    """The core's predictions in each round of a session; the first one is that of `predicted`. See
+    `session_of`.
+    """
+    hands, begins = session_of(take.demonstration, broken_share)
+    said, count = _through_core(hands, skill, reach)[2], len(take.times)
+    assert said.covariance is not None
+    assert said.held is not None
+    assert said.uncertain is not None
+    parts = [slice(begin, begin + count) for begin in begins]
+    return [
+        Predicted(said.mean[part], said.covariance[part], said.held[part], said.uncertain[part], said.radii)
+        for part in parts
+    ]
+
+
+def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstration, list[int]]:
+    """The hands of a session, and the sample at JUDGED_HZ with which each round begins. Before each
+    further round, `broken_share` of the take is done and broken off, if it is not 0.
+
+    On the way back, position is a polynomial of minimum jerk over BACK_S, and orientation is the
+    normalized mean of the ends. The tool is where the take has it, and is not used.
+    """
+    seconds, poses, begins = [take.seconds], [np.hstack([take.left, take.right])], [0]
+    whole_s, whole = seconds[0], poses[0]
+    for rest_s in RESTS_S:
+        for share in (broken_share, 1.0):
+            if share == 0.0:
+                continue
+            over_s, begin = seconds[-1][-1], math.ceil((seconds[-1][-1] + BACK_S + rest_s) * JUDGED_HZ)
+            way_s = np.arange(take.period_s, BACK_S, take.period_s)
+            rest_at_s = np.arange(over_s + BACK_S, begin / JUDGED_HZ - 0.5 * take.period_s, take.period_s)
+            done = max(2, round(share * len(whole)))
+            seconds += [over_s + way_s, rest_at_s, begin / JUDGED_HZ + whole_s[:done]]
+            poses += [
+                _way(poses[-1][-1], whole[0], way_s / BACK_S),
+                np.tile(whole[0], (len(rest_at_s), 1)),
+                whole[:done],
+            ]
+            if share == 1.0:
+                begins.append(begin)
+    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)  # so that rounding does not lose the last sample
+    poses.append(poses[-1][-1:])
+    hands, stamps = np.concatenate(poses), np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)
+    return take._replace(stamps_ns=stamps, left=hands[:, :7], right=hands[:, 7:], tool=hands[:, :7]), begins
+
+
+def _way(first: Array, last: Array, shares: Array) -> Array:
+    """Poses (T, 14) of both hands at these shares (T,) of the time from `first` to `last` (14,)."""
+    moved = (shares**3 * (10.0 - 15.0 * shares + 6.0 * shares**2))[:, None]
+    out = first + moved * (last - first)
+    for part in (slice(3, 7), slice(10, 14)):
+        nearer = math.copysign(1.0, float(first[part] @ last[part])) * last[part]
+        turned = first[part] + moved * (nearer - first[part])
+        out[:, part] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    return out
+
+
 def _through_core(
     demonstration: Demonstration, skill: Skill | None = None, reach: Reach | None = None
 ) -> tuple[Array, Array, Predicted]:
@@ -108,10 +173,10 @@ def _through_core(
     intake, stage, state = Intake(settings), SkillStage(settings, used), start_state(settings, used)
     frame = blank(frame_layout(len(settings.joints.names)))
     alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
-    inboxes = _inboxes(demonstration, range(2) if alone is None else [alone])
+    received = hand_events(demonstration, range(2) if alone is None else [alone])
     every = RATE_HZ // JUDGED_HZ
     moving, means, covariances, held, unsure = [], [], [], [], []
-    for tick, inbox in enumerate(inboxes):
+    for tick, inbox in enumerate(received):
         known = intake.step(state, frame, 1, inbox)
         hands = state["hands"]
         if alone is not None:
@@ -131,8 +196,8 @@ def _through_core(
     return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *told, used.regions.radii)
 
 
-def _inboxes(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
-    """The samples of a take's hands at each tick."""
+def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
+    """The samples of a take's hands at each tick, RATE_HZ."""
     since = demonstration.stamps_ns - demonstration.stamps_ns[0]
     inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * RATE_HZ) + 1)]
     for side in sides:

@@ -1,0 +1,57 @@
+"""The shipped skill through a day: in every round of a session, its targets are as in the first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.contract.records import Mode
+from service.core.frame import Event, Vector, order
+from service.core.skill.skill import Skill
+from sim.scene import Scene
+from sim.script import HandScript
+from support.in_process import ASSUMED, Loop
+
+BACK_S, REST_S = 2.0, (1.5, 0.5, 1.0, 3.0, 0.5, 0.5)
+HALF = 3  # the round that is broken off half-way
+EVENTS = {  # what happens in a round, and when
+    1: ((3.0, "hold"), (4.0, "resume")),
+    4: ((3.0, "fault"), (4.0, "reset")),
+}
+
+
+def way(first: Vector, last: Vector, period_s: float) -> Vector:
+    """Hands (T, 2, 3) [m] on their way back."""
+    share = np.arange(period_s, BACK_S, period_s)[:, None, None] / BACK_S
+    return first + share**3 * (10 - 15 * share + 6 * share**2) * (last - first)
+
+
+@pytest.mark.thorough
+def test_the_shipped_skill_does_the_same_in_every_round(taught: Skill) -> None:
+    """After a hold, a fault, a round that was broken off, and with rests of 0.5 to 3 s."""
+    script = HandScript(Scene(), seed=1)
+    period_s = ASSUMED.period_s
+    whole = np.array([np.array(script.sample(t))[:, :3] for t in np.arange(0.0, script.duration_s, period_s)])
+    hands: list[Vector] = []
+    begins: list[int] = []
+    events: dict[int, Event] = {}
+    for number, rest_s in enumerate(REST_S):
+        if number:
+            hands.append(way(hands[-1][-1], whole[0], period_s))
+        rests = round(rest_s / period_s)
+        rests += -(sum(map(len, hands)) + rests) % 5  # so that each round is sampled alike
+        hands.append(np.repeat(whole[:1], rests, axis=0))
+        begins.append(sum(map(len, hands)))
+        hands.append(whole[: len(whole) // 2] if number == HALF else whole)
+        events |= {begins[-1] + round(at_s / period_s): order(kind) for at_s, kind in EVENTS.get(number, ())}
+    positions = np.concatenate(hands)
+
+    loop = Loop(ASSUMED, taught)
+    loop.hands = lambda k: positions[k]
+    frames = loop.run(len(positions), events)
+    first, *others = (frames[begin : begin + len(whole)] for begin in begins)
+    for number, again in enumerate(others, 1):
+        if number != HALF:
+            assert np.abs(again["target"] - first["target"]).max() < 0.001
+            is_led = np.arange(len(whole)) * period_s < (5.0 if number in EVENTS else 0.5)
+            assert (again["mode"][~is_led] == Mode.FOLLOW).all()
