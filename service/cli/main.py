@@ -283,6 +283,8 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--components", "K", components, type=count)
     option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)
     option(c, "--seed", None, "the seed of the mixture's start and of the sampled inputs", 0, type=int)
+    delay = "the teacher's delay [s], for demonstrations with via-points (default: chosen by held-out errors)"
+    option(c, "--delay", "S", delay, type=within(float, 0.0, 1.0, " s"))
 
     c = command("via-points", "Adds, lists and removes via-points of a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")

@@ -176,6 +176,7 @@ def learn(args: argparse.Namespace) -> int:
             ell=args.ell,
             penalty=args.penalty,
             seed=args.seed,
+            delay_s=args.delay,
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
             refined=refined,

@@ -23,7 +23,7 @@ from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.settings.whole_file import whole
 
 MACHINE = ("cpu", "features", "libc", "kernel", "numpy", "blas")  # what the last bits of a result depend on
-REPLAY_TOLERANCE = 1e-5  # [m, rad] other machines may differ by this, because their last bits differ
+REPLAY_TOLERANCE = 1e-5  # [m, rad] other versions of a library may differ by this
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
 
 

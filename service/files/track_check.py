@@ -6,7 +6,9 @@ the duration.
 
 1. The samples of a track are divided into runs, at steps that no hand can make and at which the
    intake begins or ends to reject samples or restarts its filter.
-2. Run B can follow run A if a hand can move from A's last to B's first sample in the time between.
+2. Run B can follow run A if a hand can move from A's last to B's first sample in the time between;
+   or if A continues with B once a glitch, up to three samples at the end of A and at the begin of
+   B, is left out.
 3. The sequence of runs that can follow each other and has the most samples is retained.
 4. `track_offsets` finds the parts of it that are displaced by a few centimetres.
 
@@ -15,6 +17,7 @@ A pose that is repeated bit by bit before a leap shows that the tracker had lost
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum
@@ -41,6 +44,11 @@ MAX_HAND_MPS2 = 100.0  # missed 0.5, 0.3, 1.2 %; removed 0.03, 0.31, 0.03 %
 UNSAMPLED_MPS = 2.0  # a hand moves at most this fast between two pieces of its track
 # [s] A shorter piece between two bad stretches is left out with them. Range 0.1 to 0.5.
 LEAST_PIECE_S = 0.3  # good time left out beside bad stretches 1.4, 1.4, 1.9 %
+
+# Numbers of samples at the end of a run and at the begin of the next one that may be a glitch, from
+# few to many; and the least number of others of each run.
+TRIMMED = sorted(itertools.product(range(4), repeat=2), key=sum)[1:]
+LEAST_CONTINUED = 4
 
 Mask = NDArray[np.bool_]
 
@@ -80,7 +88,7 @@ class Checked(NamedTuple):
     """A track without its rejected samples, and the stretches that are too long to be interpolated.
 
     `start_ns` and `end_ns` [ns] are the first and last stamp, and `poses` the number of poses,
-    before samples were rejected.
+    before samples were rejected; `rejected` counts those that the daemon's rules reject.
     """
 
     track: Track
@@ -88,6 +96,7 @@ class Checked(NamedTuple):
     start_ns: int
     end_ns: int
     poses: int
+    rejected: int
 
     @property
     def seen_share(self) -> float:
@@ -97,9 +106,12 @@ class Checked(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """A remark on the number of rejected samples; empty if none was rejected."""
-        rejected = self.poses - len(self.track.poses)
-        return f"{self.track.name}: the rules of the daemon reject {rejected} of {self.poses} poses" * (rejected > 0)
+        """A remark on the numbers of samples that are left out; empty if there are none."""
+        left_out, rejected = self.poses - len(self.track.poses), self.rejected
+        if not left_out:
+            return ""
+        by_rules = f"; the rules of the daemon reject {rejected}" if rejected else ""
+        return f"{self.track.name}: {left_out} of {self.poses} poses are left out{by_rules}"
 
 
 def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) -> list[Checked]:
@@ -115,7 +127,8 @@ def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) ->
         first, last = int(track.stamps_ns[0]), int(track.stamps_ns[-1])
         stretches = _stretches(track, kept, why, longest_s)
         some = int(np.isfinite(track.poses[:, 0]).sum())
-        out.append(Checked(track.at(kept), stretches, first, last, some))
+        rejected = sum(bool(reason) for reason in verdict.why)
+        out.append(Checked(track.at(kept), stretches, first, last, some, rejected))
     return out
 
 
@@ -241,23 +254,39 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     is_pause = (pauses > hands.stale_ms / 1000) | (np.diff(usable) > 1)
     bounds = np.concatenate([[0], np.flatnonzero(is_leap | is_pause) + 1, [len(usable)]])
     begins, ends = bounds[:-1], bounds[1:] - 1
-    total = (ends - begins + 1).astype(np.float64)
-    before = [-1] * len(begins)
+    own = (ends - begins + 1).astype(np.float64)
+    total, before = own.copy(), [(-1, 0, 0)] * len(begins)
     for run in range(1, len(begins)):
         off = np.linalg.norm(at[begins[run]] - at[ends[:run]], axis=1)
         possible = off <= hands.jump + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
         possible[-1] &= not is_leap[ends[run - 1]]
-        if possible.any():
-            before[run] = int(np.argmax(np.where(possible, total[:run], -1.0)))
-            total[run] += total[before[run]]
-    last = int(np.argmax(total))
-    while last >= 0:
-        mask[usable[begins[last] : ends[last] + 1]] = True
-        last = before[last]
+        links = {(int(i), 0, 0): total[i] for i in np.flatnonzero(possible)}
+        if not possible[-1]:
+            links |= {
+                (run - 1, last, first): total[run - 1] - last - first
+                for last, first in TRIMMED
+                if _continues(at, seconds, int(ends[run - 1]) - last, int(begins[run]) + first, hands)
+                and min(own[run - 1] - last, own[run] - first) >= LEAST_CONTINUED
+            }
+        if links:
+            before[run] = max(links, key=links.__getitem__)
+            total[run] += links[before[run]]
+    run, dropped = int(np.argmax(total)), 0
+    while run >= 0:
+        previous, last, first = before[run]
+        mask[usable[begins[run] + first : ends[run] + 1 - dropped]] = True
+        run, dropped = previous, last
     rows = np.flatnonzero(mask)
     shown = (track.stamps_ns[rows] - track.stamps_ns[0]) / 1e9
     mask[rows[displaced(shown, track.poses[rows, :3])]] = False
     return mask
+
+
+def _continues(at: Vector, seconds: Vector, last: int, first: int, hands: HandSettings) -> bool:
+    """True if the track comes within a jump of `first`, as it moves at index `last`."""
+    velocity = (at[last] - at[last - 1]) / (seconds[last] - seconds[last - 1])
+    expected = at[last] + velocity * (seconds[first] - seconds[last])
+    return bool(np.linalg.norm(at[first] - expected) <= hands.jump)
 
 
 def _leaps(at: Vector, pauses: Vector, hands: HandSettings) -> Mask:

@@ -5,7 +5,8 @@ squares, together with the line of the motion: x = a + b t + d h(t), with h = -1
 after the middle. With h' the part of h that is orthogonal to all lines a + b t,
 d = (h' . x) / (h' . h).
 
-A stretch is displaced if it begins with a step and ends with the opposite step. Both must be larger
+A stretch is displaced if it begins with a step and ends with the opposite step. One or two samples
+that leave the track and return are no step. Both must be larger
 than the usual steps of the track, which are caused by noise and by the curvature of its motion. A
 step without a return is accepted, because a track does not show which side of it is right.
 
@@ -22,7 +23,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, percentile_filter
+from scipy.ndimage import maximum_filter, median_filter, percentile_filter
 
 from service.core.frame import Vector
 
@@ -40,6 +41,9 @@ USUAL_S = 1.5  # missed 0.5, 0.5, 0.5 %; removed 0.03, 0.03, 0.10 %
 # small
 # jumps.
 UNUSUAL_RATIO = 2.5  # missed 0.5, 0.5, 0.8 %; removed 0.03, 3.73, 0.00 %
+GLITCH_WINDOW = 5  # samples in whose median up to two that are off do not count
+# A sample is off from this multiple of the usual distance from that median on. Range 2.5 to 5.
+GLITCH_RATIO = 3.0
 # |step + return| / |step - return| of a jump. Range 0.15 to 0.35.
 MAX_REMAINDER = 0.25  # missed 0.5, 0.7, 0.5 %; removed 0.03, 0.03, 0.14 %
 # Residual of the estimates beside a single step / step. Range 0.25 to 0.5: with larger values, fast
@@ -56,8 +60,9 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
     mask = np.zeros(len(seconds), bool)
     if len(seconds) < 2 * HALF_WINDOW:
         return mask
-    steps = _steps(seconds, positions)
-    rows = _unusual(steps, round(USUAL_S / float(np.median(np.diff(seconds)))))
+    around = round(USUAL_S / float(np.median(np.diff(seconds))))
+    steps = _steps(seconds, _without_glitches(positions, around))
+    rows = _unusual(steps, around)
     after = 0
     for i, begin in enumerate(rows.tolist()):
         if begin < after:
@@ -71,6 +76,20 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
                 after = end + 1
                 break
     return mask
+
+
+def _without_glitches(positions: Vector, around: int) -> Vector:
+    """The positions (N, 3) [m], with the median of their neighbourhood for one or two that are
+    farther from it than usual among so many neighbours.
+    """
+    medians = median_filter(positions, (GLITCH_WINDOW, 1), mode="nearest")
+    off = np.linalg.norm(positions - medians, axis=1)
+    return np.where((off > GLITCH_RATIO * _usual(off, around))[:, None], medians, positions)
+
+
+def _usual(sizes: Vector, around: int) -> Vector:
+    """The usual one of sizes (N,) among so many neighbours on both sides."""
+    return np.asarray(percentile_filter(sizes, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror"))
 
 
 def _steps(seconds: Vector, positions: Vector) -> Vector:
@@ -104,7 +123,7 @@ def _unusual(steps: Vector, around: int) -> NDArray[np.intp]:
     beside them equal those that a single step causes there.
     """
     size = np.linalg.norm(steps, axis=1)
-    usual = percentile_filter(size, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror")
+    usual = _usual(size, around)
     largest = maximum_filter(size, 2 * HALF_WINDOW - 1)
     (rest,) = _without_line(np.arange(0.5 - HALF_WINDOW, HALF_WINDOW)[None])
     share = (rest @ _side(1)) / (rest @ _side())

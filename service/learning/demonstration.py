@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -21,6 +23,8 @@ LONGEST_PERIOD_S = 1.0  # samples farther apart on average show no motion
 CLOSURE_MARGIN = 0.05  # closures from -0.05 to 1.05 are accepted
 NORM_TOLERANCE = 0.01  # accepted deviation of a quaternion's norm from 1
 LEAST_SAMPLES = 4  # samples of a demonstration
+SITTING_S = 600.0  # after a longer pause, another person may demonstrate
+LEAST_SITTINGS = 3  # with fewer, too few demonstrations remain if one sitting is held out
 
 
 class Demonstration(NamedTuple):
@@ -94,15 +98,34 @@ def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
 
 
+def exchanged(demonstration: Demonstration) -> list[Demonstration]:
+    """The demonstration with its hands exchanged, and also with those of its via-points, if any."""
+    one = demonstration._replace(left=demonstration.right, right=demonstration.left)
+    places = tuple(msgspec.structs.replace(place, left=place.right, right=place.left) for place in one.places)
+    return [one, one._replace(places=places)] if places else [one]
+
+
 def persons(demonstrations: Sequence[Demonstration]) -> list[int]:
-    """The number of each demonstration's person, from 0; if fewer than two persons are named, each
-    demonstration has its own.
+    """The number of each demonstration's person, from 0. If fewer than two persons are named, each
+    sitting counts as one: demonstrations without a pause of SITTING_S between them; with fewer than
+    LEAST_SITTINGS of these, each demonstration has its own number.
     """
-    if len({one.person for one in demonstrations if one.person}) < 2:
-        return list(range(len(demonstrations)))
     people = [one.person or str(i) for i, one in enumerate(demonstrations)]
+    if len({one.person for one in demonstrations if one.person}) < 2:
+        people = _sittings(demonstrations)
     order = {person: number for number, person in enumerate(dict.fromkeys(people))}
     return [order[person] for person in people]
+
+
+def _sittings(demonstrations: Sequence[Demonstration]) -> list[str]:
+    """The sitting of each demonstration; its own number if there are too few sittings."""
+    in_time = sorted(range(len(demonstrations)), key=lambda i: int(demonstrations[i].stamps_ns[0]))
+    out, sitting = [""] * len(demonstrations), 0
+    for before, after in pairwise([*in_time[:1], *in_time]):
+        pause_ns = int(demonstrations[after].stamps_ns[0]) - int(demonstrations[before].stamps_ns[-1])
+        sitting += pause_ns > 1e9 * SITTING_S
+        out[after] = str(sitting)
+    return out if sitting + 1 >= LEAST_SITTINGS else [str(i) for i in range(len(demonstrations))]
 
 
 def check(demonstration: Demonstration) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from service.core.skill.skill import is_reachable
 from service.learning.ambiguity import COMPARED, contradictions, lengths
 from service.learning.baselines import baselines, constant_errors
 from service.learning.records import Figures, Fitted, HeldOut, Pose, Row, TimedErrors, persons_of
-from service.learning.regions import calibrated, calibrated_without, timed_errors
+from service.learning.regions import calibrated, calibrated_without, timed_errors, unknown_std
 from service.learning.takes import Division, conductor_of
 from service.learning.verdicts import Subject, verdicts
 from service.settings.config import Reach
@@ -100,6 +101,7 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
         f"{contradicting.pair} have the hands {1000 * contradicting.hands_m:.0f} mm from each other and the tools "
         f"{1000 * contradicting.tools:.0f} mm",
         float(np.median([row.error_mm for row in rows])),
+        1000 * math.sqrt(3.0) * unknown_std(takes),
     )
     found = [*verdicts(subject), *pose.verdicts]
     warnings, residual, unsafe = (

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from service.learning.demonstration import Demonstration
+from kmp.criteria.cross_validation import rms
+from service.learning.demonstration import Demonstration, exchanged
 from service.learning.judgement import judged
 from service.learning.pose import learned_pose
 from service.learning.records import Evidence, Fitted, Options, Pose, Progress, Taught
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.store import stored
 from service.learning.stored_demonstrations import stored_demonstrations
-from service.learning.takes import Division, divided
+from service.learning.takes import Division, divided, standing_out
 from service.settings.config import Reach
+
+EXCHANGED_SHARE = 0.5  # a take fits with its hands exchanged if that reduces its error to less than this share
 
 
 def learn(
@@ -30,6 +33,7 @@ def learn(
     penalty: float | None = None,
     spread_m: float = 0.01,
     seed: int = 0,
+    delay_s: float | None = None,
     reach: Reach | None = None,
     accepted_by: str = "",
     refined: StoredSkill | None = None,
@@ -45,6 +49,7 @@ def learn(
     * `penalty`: lambda of the paper, for a mixture only; None for its default.
     * `spread_m`: added to the standard deviation of a mixture's reference [m].
     * `seed`: seed of the mixture.
+    * `delay_s`: the teacher's delay [s] between via-points; None to choose it.
     * `reach`: reach of the arm, in which the tool's path should be.
     * `accepted_by`: person who accepts the residual risks of the skill; empty for nobody.
     * `refined`: skill that is refined by the demonstrations. Those in its file are learned from as
@@ -54,13 +59,34 @@ def learn(
 
     Raises SkillError if nothing can be learned.
     """
-    options = Options(points, ell, components, penalty, spread_m, seed)
-    division = divided(demonstrations, names, options, stored_demonstrations(refined) if refined else ())
+    options = Options(points, ell, components, penalty, spread_m, seed, delay_s)
+    before = stored_demonstrations(refined) if refined else ()
+    division = divided(demonstrations, names, options, before)
     fitted, pose = _fitted(division, progress)
+    if odd_m := standing_out(fitted.held_out):
+        named = {take.name: take.demonstration for take in division.takes}
+        remarks = [_remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()]
+        kept = {name: one for name, one in named.items() if name not in odd_m}
+        division = divided(list(kept.values()), list(kept), options, before)
+        division = division._replace(remarks=[*remarks, *division.remarks])
+        fitted, pose = _fitted(division, progress)
     judgement = judged(division, fitted, pose, reach or Reach(), accepted_by=accepted_by)
     skill = stored(name, division, fitted, pose, judgement)
     show(Evidence(skill, judgement.figures, fitted.held_out, judgement.inside))
     return skill
+
+
+def _remark(name: str, error_m: float, named: dict[str, Demonstration], options: Options, progress: Progress) -> str:
+    """The remark on a take that stands out, and whether it fits with its hands exchanged."""
+    progress(f"trying {name} with its hands exchanged")
+    errors_m = []
+    for other in exchanged(named[name]):
+        fitted, _ = _fitted(divided([*(named | {name: other}).values()], list(named), options), progress)
+        errors_m += [rms(one.errors) for one in fitted.held_out if one.take.name == name]
+    text = f"{name} stands out, and is left out: its tool is {1000 * error_m:.0f} mm from where the others have it"
+    if min(errors_m) < EXCHANGED_SHARE * error_m:
+        text += f", and {1000 * min(errors_m):.0f} mm with its hands exchanged: put each tracker on its own hand"
+    return f"{text}; record it again"
 
 
 def _fitted(division: Division, progress: Progress) -> tuple[Fitted, Pose]:

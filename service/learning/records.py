@@ -34,6 +34,7 @@ class Options(NamedTuple):
     penalty: float | None
     spread_m: float
     seed: int
+    delay_s: float | None = None  # of the teacher, between via-points; None: chosen
 
 
 class Take(NamedTuple):

@@ -11,13 +11,18 @@ from kmp.criteria.cross_validation import rms
 from service.contract.records import SIDES
 from service.contract.requests import Hands
 from service.core.frame import Vector
+from service.core.skill.tuning import UNSURE_M
 from service.learning.ambiguity import same_hands_m
 from service.learning.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, moved_m, persons
 from service.learning.methods import Method, method_of
-from service.learning.records import Fitted, Options, Take
+from service.learning.methods.staged import Staged
+from service.learning.records import Fitted, HeldOut, Options, Take
+from service.learning.regions import BLOCKS
 from service.learning.skill_file import SkillError
 from service.learning.via_points import of_one
 
+LEAST_COMPARED = 4  # of fewer takes, none can be told to stand out
+STANDS_OUT_TIMES = 4.0
 COMPARED_TIMES = 100  # shares of the duration at which demonstrations are compared
 REPEATED_M = 0.003  # demonstrations with a smaller root mean square distance are the same one
 
@@ -54,6 +59,9 @@ def divided(
     if options.components is None and options.penalty is not None:
         raise SkillError("a penalty goes with a number of components: without them it is chosen")
     names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
+    # In the order of recording, so that the order of the files makes no difference.
+    in_order = sorted(zip(names, demonstrations, strict=True), key=lambda one: (int(one[1].stamps_ns[0]), one[0]))
+    names, demonstrations = [name for name, _ in in_order], [one for _, one in in_order]
     for name, one in zip(names, demonstrations, strict=True):
         try:
             check(one)
@@ -82,6 +90,8 @@ def divided(
             for some in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
+    if options.delay_s is not None and not isinstance(method, Staged):
+        raise SkillError("a delay goes with via-points that all demonstrations name; without them it is learned too")
     if before:
         _check_alike(demonstrations, names, before)
     takes = takes_of(demonstrations, names)
@@ -140,11 +150,38 @@ def check_count(names: Sequence[str], components: int | None, remark: str = "") 
 
 
 def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[Take]:
-    """The takes of demonstrations."""
+    """The takes of demonstrations.
+
+    Persons are numbered so that consecutive numbers, which are held out at once, have tools all
+    along the path of the task: in the order of their mean tool along the axis on which these vary
+    most, dealt to BLOCKS blocks in turn.
+    """
+    person_of = persons(demonstrations)
+    count = max(person_of, default=-1) + 1
+    number_of = list(range(count))
+    if count > BLOCKS:
+        means_m = np.zeros((count, 3))
+        for person in range(count):
+            theirs = [one for one, number in zip(demonstrations, person_of, strict=True) if number == person]
+            means_m[person] = np.mean([one.tool[:, :3].mean(axis=0) for one in theirs], axis=0)
+        along = np.argsort(means_m[:, means_m.var(axis=0).argmax()], kind="stable").tolist()
+        dealt = sorted(range(count), key=lambda rank: (rank % BLOCKS, rank))
+        for number, rank in enumerate(dealt):
+            number_of[along[rank]] = number
     return [
-        Take(name, person, one, one.hands, one.tool, one.gripper)
-        for name, person, one in zip(names, persons(demonstrations), demonstrations, strict=True)
+        Take(name, number_of[person], one, one.hands, one.tool, one.gripper)
+        for name, person, one in zip(names, person_of, demonstrations, strict=True)
     ]
+
+
+def standing_out(held_out: Sequence[HeldOut]) -> dict[str, float]:
+    """The held-out errors [m] of the takes that stand out, by name: above STANDS_OUT_TIMES the
+    median, and above UNSURE_M; none of fewer than LEAST_COMPARED takes, or of more than a third.
+    """
+    errors_m = {one.take.name: rms(one.errors) for one in held_out}
+    limit_m = max(UNSURE_M, STANDS_OUT_TIMES * float(np.median(list(errors_m.values()))))
+    out = {name: error_m for name, error_m in errors_m.items() if error_m > limit_m}
+    return out if len(errors_m) >= LEAST_COMPARED and 3 * len(out) <= len(errors_m) else {}
 
 
 def _repeats(demonstrations: Sequence[Demonstration]) -> dict[int, int]:

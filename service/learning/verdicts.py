@@ -39,6 +39,7 @@ class Subject(NamedTuple):
     frames: Sequence[str]  # all frames of the demonstrations, sorted
     contradiction: str  # the worst pair of samples, in words
     median_mm: float  # of the demonstrations' errors
+    scatter_mm: float  # of the tool around its mean position, root mean square
     part: str = ""  # name of a demonstration, baseline, kind of wrong samples or region
     value: float = 0.0  # figure of the part
 
@@ -61,16 +62,18 @@ class Subject(NamedTuple):
         return {"hands swapped": found.swapped, "hands 30 cm beside": found.beside} if of else {"": 0.0}
 
 
+MORE = "; more demonstrations along the same paths, or named via-points (record --places), help"
+
+
 class Rule(NamedTuple):
     """A rule: the predicate of broken parts, the text with the fields of Subject as `s`, the
-    severity of a broken part, the remedy if it is more than a warning, and the kind of parts that
-    the rule looks at.
+    severity of a broken part, the remedy, and the kind of parts that the rule looks at.
     """
 
     is_broken: Callable[[Subject], bool]
     text: str
     severity: Callable[[Subject], Severity] = lambda s: "warning"
-    remedy: str = ""
+    remedy: str = MORE
     of: str = ""
 
 
@@ -111,6 +114,7 @@ RULES = (
     Rule(
         lambda s: len(s.frames) == 1 and s.frames[0] not in ("", BASE),
         f"the demonstrations are in frame {{frames}}: it is taken to be {BASE!r}, the arm's base plate",
+        remedy=". If it is not, name the cell that maps this frame (--config)",
     ),
     Rule(
         lambda s: len(s.figures.demonstrations) < 3,
@@ -122,6 +126,7 @@ RULES = (
         lambda s: s.gate.floored or s.all.error_mm < 1000 * NOISE_M,
         "the demonstrations have less noise than any tracker: were they computed? The gate allows for a tracker's "
         "noise, and is {s.figures.gate_mm:.1f} mm",
+        remedy=". If they were recorded, nothing is wrong; learn what is to be served from recordings of the tracker",
     ),
     Rule(
         _is_unexplained,
@@ -135,22 +140,25 @@ RULES = (
         lambda s: s.all.error_mm > NOTED_MM and not _is_unexplained(s),
         f"held-out demonstrations are missed by {{s.all.error_mm:.0f}} mm, up to {RESIDUAL_MM:.0f} mm accepted",
         severity=lambda s: "residual" if s.all.error_mm > RESIDUAL_MM else "warning",
-        remedy=": more demonstrations, or named via-points (record --places), help",
     ),
     Rule(
         lambda s: _is_better(s) and not _is_timetable(s),
         "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not {s.all.error_mm:.0f}",
+        remedy=". The hands say less about the tool than it seems, or the demonstrations are too few: name the "
+        "via-points of the task (record --places), or record more",
         of="baselines",
     ),
     Rule(
         _is_timetable,
         "the task is a timetable: the elapsed time predicts the tool with an error of {s.value:.0f} mm, the hands "
         "with {s.all.error_mm:.0f} mm",
+        remedy=". Keep to the pace of the demonstrations, or let the hands lead the tool in each of them",
         of="baselines",
     ),
     Rule(
         lambda s: len(s.figures.demonstrations) > 2 and s.value > max(OUTLIER_TIMES * s.median_mm, OUTLIER_MM),
         "{s.part} differs from the others: its error is {s.value:.0f} mm, the median {s.median_mm:.0f} mm",
+        remedy=": look at it (record NAME --show), and leave it out or record it again if it is wrong",
         of="demonstrations",
     ),
     Rule(
@@ -173,11 +181,23 @@ RULES = (
         "the gate holds {s.all.held:.0f} % of what was demonstrated, and cannot be higher: {cause}",
     ),
     Rule(
+        lambda s: s.gate.capped,
+        "hands are followed up to the largest deviation that is allowed, {s.figures.gate_mm:.0f} mm: the "
+        "demonstrations differ too much for a smaller one",
+        severity=lambda s: "residual",
+    ),
+    Rule(
+        lambda s: s.all.predicted_mm > s.scatter_mm > 0.0,
+        "the skill expects an error of {s.all.predicted_mm:.0f} mm, more than the tool moves about its mean position, "
+        "{s.scatter_mm:.0f} mm",
+        severity=lambda s: "residual",
+        remedy=": a demonstration may be wrong, look at those with the largest errors (record NAME --show)",
+    ),
+    Rule(
         lambda s: s.value < CAUGHT_RESIDUAL,
         f"the gate holds {{s.value:.1f}} % of {{s.part}}, {CAUGHT_RESIDUAL:.0f} % wanted: the arm follows hands "
         "there, as those of the demonstrations go as far",
         severity=lambda s: "residual",
-        remedy="; more demonstrations along the same paths, or named via-points, help",
         of="wrong samples",
     ),
     Rule(
@@ -210,5 +230,5 @@ def verdicts(subject: Subject) -> Iterator[Verdict]:
             s = subject._replace(part=part, value=value)
             if rule.is_broken(s):
                 severity = rule.severity(s)
-                text = (rule.text + rule.remedy * (severity != "warning")).format(s=s, **words)
+                text = (rule.text + rule.remedy).format(s=s, **words)
                 yield Verdict(severity, text)

@@ -77,8 +77,8 @@ def test_what_is_doubtful_is_warned_of(good: list[Demonstration], spoil: object,
 
 
 def test_a_demonstration_given_twice_is_one(good: list[Demonstration]) -> None:
-    with pytest.raises(SkillError, match=r"1 demonstration given.*; again repeats take-1, and is left out$"):
-        learn([good[0], good[0]], names=["take-1", "again"])
+    with pytest.raises(SkillError, match=r"1 demonstration given.*; take-2 repeats take-1, and is left out$"):
+        learn([good[0], good[0]], names=["take-1", "take-2"])
 
 
 def test_the_reach_is_that_of_the_arm_at_hand(good: list[Demonstration]) -> None:

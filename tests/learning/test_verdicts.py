@@ -31,8 +31,11 @@ GATE = Gate(0.05, Caught(1.0, 1.0, 1.0), capped=False, floored=False)
 def found(frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float = 20.0, **change: Any) -> dict[str, str]:
     """Texts and severities of figures that differ in these from good ones."""
     row = msgspec.structs.replace(GOOD, error_mm=error_mm, held=change.pop("held", 1.0))
+    row = msgspec.structs.replace(row, predicted_mm=change.pop("expected_mm", row.predicted_mm))
+    gate = GATE._replace(capped=change.pop("capped", False))
     figures = msgspec.structs.replace(FIGURES, demonstrations=(row,) * takes, all=row, **change)
-    return {one.text: one.severity for one in verdicts(Subject(figures, GATE, frames, "a and b", row.error_mm))}
+    subject = Subject(figures, gate, frames, "a and b", row.error_mm, scatter_mm=250.0)
+    return {one.text: one.severity for one in verdicts(subject)}
 
 
 def test_good_figures_are_remarked_on_by_nobody() -> None:
@@ -46,6 +49,8 @@ def test_good_figures_are_remarked_on_by_nobody() -> None:
         ({"error_mm": 126.0, "explained": 78.0}, "residual", "missed by 126 mm"),
         ({"error_mm": 150.0, "explained": 15.0}, "unsafe", "15 % of its variance in held-out"),
         ({"error_mm": 30.0, "explained": 15.0}, "", ""),
+        ({"capped": True}, "residual", "up to the largest deviation that is allowed, 50 mm"),
+        ({"expected_mm": 260.0}, "residual", "more than the tool moves about its mean position, 250 mm"),
         ({"takes": 2}, "warning", "2 demonstration(s) are too few"),
         ({"takes": 2, "error_mm": 93.0}, "unsafe", "as they miss each other by 93 mm: record more"),
         ({"ambiguous": 8.0}, "warning", "8 % of the samples contradict others"),

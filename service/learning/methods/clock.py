@@ -150,7 +150,9 @@ def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:
     persons (H,). Such takes are often of one person, whose pace others need not have. All are 0 if
     there would be fewer than LEAST_PAIRS blocks.
     """
-    out, blocks = np.zeros_like(persons), blocks_of(persons, len(persons) // 2)
+    in_time = {person: number for number, person in enumerate(dict.fromkeys(persons.tolist()))}
+    numbers = np.array([in_time[person] for person in persons.tolist()], np.intp)
+    out, blocks = np.zeros_like(persons), blocks_of(numbers, len(persons) // 2)
     for number, block in enumerate(blocks if len(blocks) >= LEAST_PAIRS else ()):
         out[block] = number
     return out

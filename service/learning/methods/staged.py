@@ -51,7 +51,7 @@ from service.learning.methods.held_out import held_out_takes
 from service.learning.methods.inputs import AS_GOOD, AS_GOOD_M, CLOCKS, LEAST_TURN_RAD, POSITIONS, clock_limit_m, refit
 from service.learning.methods.weights import WEIGHTS, chosen
 from service.learning.records import Delay, Fitted, HeldOut, Options, Progress, Take, Taught, Weights, persons_of
-from service.learning.regions import blocks_of, unknown_std
+from service.learning.regions import LEAST_BLOCKS, blocks_of, unknown_std
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
@@ -364,22 +364,36 @@ def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence
     return block if len(blocks) > 1 else ()
 
 
+def is_clear(gains: Vector) -> bool:
+    """True if the mean of gains (B,) in blocks is above one standard error of it."""
+    return len(gains) < LEAST_BLOCKS or bool(gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains)))
+
+
 def with_delay(
-    task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]], usual_s: float | None = None
+    task: Task,
+    shown: Sequence[Divided],
+    blocks: Sequence[Sequence[int]],
+    usual_s: float | None = None,
+    given_s: float | None = None,
 ) -> tuple[Candidate, Delay, float]:
     """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
     in all of them; that delay, with the standard deviation of the best delays of the single
-    demonstrations; and the error [m]. If `usual_s` is given, it is the delay unless another one
-    predicts much better: a teacher's delay varies between takes, and there may be only a few.
+    demonstrations; and the error [m]. There is none unless it reduces the mean squared error by
+    more than one standard error over the blocks. If `usual_s` is given, it is the delay unless
+    another one predicts much better: a teacher's delay varies between takes, and there may be only
+    a few. A delay that is `given_s` is taken as it is.
     """
-    candidates = [Candidate.of(task, shown, late_s) for late_s in DELAYS_S]
+    delays_s = DELAYS_S if given_s is None else (given_s,)
+    candidates = [Candidate.of(task, shown, late_s) for late_s in delays_s]
     squares = np.array([one.squares(blocks) for one in candidates])
-    best, each_s = int(squares.sum(axis=1).argmin()), np.array(DELAYS_S)[squares.argmin(axis=0)]
+    best, each_s = int(squares.sum(axis=1).argmin()), np.array(delays_s)[squares.argmin(axis=0)]
     if usual_s is not None:
-        usual = DELAYS_S.index(usual_s)
+        usual = delays_s.index(usual_s)
         if squares[best].sum() > OWN_DELAY_SHARE**2 * squares[usual].sum():
             best = usual
-    return candidates[best], Delay(DELAYS_S[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
+    elif not is_clear(np.array([(squares[0] - squares[best])[block].mean() for block in blocks])):
+        best = 0
+    return candidates[best], Delay(delays_s[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
 
 
 @dataclass(frozen=True)
@@ -469,11 +483,11 @@ class Staged:
         new, earlier = (
             [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
         )
-        demonstrations = [take.demonstration for take in taught.new]
+        demonstrations, given_s = [take.demonstration for take in taught.new], self.options.delay_s
         progress(f"choosing the delay over {len(new)} demonstrations")
         everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # to judge what all persons share
-        usual_s = with_delay(self.task, everybody, all_blocks)[1].mean_s if earlier else None
-        best, delay, error_m = with_delay(self.task, new, blocks, usual_s)
+        usual_s = with_delay(self.task, everybody, all_blocks, given_s=given_s)[1].mean_s if earlier else None
+        best, delay, error_m = with_delay(self.task, new, blocks, usual_s, given_s)
 
         def tried(task: Task) -> Candidate:
             return Candidate.of(task, everybody, delay.mean_s)
@@ -492,7 +506,7 @@ class Staged:
             limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
             taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
             if taken in tasks:
-                best, delay, least_m = with_delay(tasks[taken], new, blocks, usual_s)
+                best, delay, least_m = with_delay(tasks[taken], new, blocks, usual_s, given_s)
                 errors_m[taken] = errors_m[taken] if earlier else least_m
             tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
@@ -508,7 +522,7 @@ class Staged:
         if not earlier:
             return best, delay, tried_m, taken, None
         progress(f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones")
-        before_s = with_delay(best.task, earlier, blocks_of(persons_of(taught.earlier)))[1].mean_s
+        before_s = with_delay(best.task, earlier, blocks_of(persons_of(taught.earlier)), given_s=given_s)[1].mean_s
         weighted = {
             weight: Candidate.of(
                 best.task, new, delay.mean_s, earlier if math.isfinite(weight) else (), before_s, weight

@@ -1,0 +1,82 @@
+"""What `learn` states does not depend on the order of the files, on chance, or on one bad take."""
+
+from __future__ import annotations
+
+import functools
+from random import Random
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.learning.demonstration import Demonstration, persons
+from service.learning.learn import learn
+from service.learning.methods.staged import is_clear
+from service.learning.records import Figures
+from service.learning.skill_file import SkillError, StoredSkill
+from service.learning.takes import takes_of
+from sim.made_tasks import takes
+
+
+@functools.cache
+def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
+    return [take.demonstration for take in takes(kind, people=range(people), each=2)]
+
+
+def figures(skill: StoredSkill) -> Figures:
+    return msgspec.json.decode(skill.figures, type=Figures)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("named", [True, False])
+def test_the_order_of_the_files_makes_no_difference(named: bool) -> None:
+    demonstrations = [one if named else one._replace(places=()) for one in shown()]
+    names = [f"take {number}" for number in range(len(demonstrations))]
+    first = learn(demonstrations, names=names)
+    for seed in range(2):
+        order = Random(seed).sample(range(len(names)), len(names))
+        again = learn([demonstrations[i] for i in order], names=[names[i] for i in order])
+        assert again.file == first.file
+
+
+def test_blocks_that_are_held_out_have_tools_along_the_whole_path() -> None:
+    """Of three tasks, shown one after another, each block has takes of all."""
+    base = shown()[0]
+    tasks = [base._replace(tool=base.tool + np.eye(7)[0] * 0.3 * (n // 6)) for n in range(18)]
+    blocks = np.array_split(np.argsort([take.person for take in takes_of(tasks, ["take"] * 18)]), 6)
+    assert all({n // 6 for n in block.tolist()} == {0, 1, 2} for block in blocks)
+
+
+def test_takes_of_a_sitting_are_held_out_together() -> None:
+    base, hour_ns = shown()[0], 3600 * 10**9
+    later = [base._replace(stamps_ns=base.stamps_ns + (n // 2) * hour_ns + n % 2 * 60 * 10**9) for n in range(8)]
+    assert persons(later) == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert persons(later[:4]) == [0, 1, 2, 3]  # two sittings are too few
+
+
+@pytest.mark.thorough
+def test_a_take_with_exchanged_hands_is_left_out_and_named() -> None:
+    good = shown()
+    spoilt = good[2]._replace(left=good[2].right, right=good[2].left)
+    names = [f"take {number}" for number in range(len(good))]
+    skill = learn([*good[:2], spoilt, *good[3:]], names=names)
+    warnings = figures(skill).warnings
+    assert warnings[0].startswith("take 2 stands out, and is left out: its tool is ")
+    assert "with its hands exchanged: put each tracker on its own hand" in warnings[0]
+    assert {row.name for row in figures(skill).demonstrations} == {*names} - {"take 2"}
+    assert figures(skill).gate_mm < 150.0
+    others = learn([*good[:2], *good[3:]], names=[name for name in names if name != "take 2"])
+    assert figures(skill).all == figures(others).all
+
+
+def test_a_delay_is_stated_only_if_the_gain_is_clear() -> None:
+    assert not is_clear(np.array([0.1, -0.09, 0.02]))
+    assert not is_clear(np.array([0.16, -0.14, 0.15, -0.15]))
+    assert is_clear(np.array([0.02, 0.03, 0.02]))
+
+
+@pytest.mark.thorough
+def test_a_delay_that_is_given_is_taken() -> None:
+    assert figures(learn(shown(), delay_s=0.35)).delay_s == 0.35
+    with pytest.raises(SkillError, match=r"a delay goes with via-points"):
+        learn([one._replace(places=()) for one in shown()], delay_s=0.1)
