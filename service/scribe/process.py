@@ -1,5 +1,5 @@
-"""The scribe's process: it writes the messages from a socket into recordings, and feeds the
-live view.
+"""The scribe's process: it writes the messages from a socket into recordings, and feeds
+the live view.
 
 It ends when the other side of the socket closes or dies, after writing everything received. It
 cannot outlive its daemon for long: the daemon's death continues a stopped scribe, and an alarm ends
@@ -42,7 +42,7 @@ CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that 
 MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
 LIVE_END_S = 8.0  # a live view that does not end within this time is abandoned
-MAX_WAITING_FRAMES = 1000  # with more frames and images waiting for the live view, new ones are left out
+MAX_WAITING_FRAMES = 2500  # with more frames and images waiting for the live view, new ones are left out
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, for which frames are
@@ -95,7 +95,7 @@ class LiveView:
                     self.put(lambda viewer, skill=payload: viewer.learn(skill))  # type: ignore[misc]
             return
         if self._gap:
-            text = f"{self._gap} frames and images before tick {received.tick.index} are left out: viewers are slow"
+            text = f"{self._gap} frames and images before tick {received.tick.index} are left out: too slow to draw"
             self._gap = 0
             self.put(lambda viewer: viewer.gap(text, time_ns))
         self.put(lambda viewer: viewer.add(frame, time_ns, received.timing, events))
@@ -197,7 +197,8 @@ class ScribeProcess:
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
         """Write one message, and pass it to the live view."""
-        received, live = unpack(message, skills, joints=self._joints), self._live
+        received = unpack(message, skills, joints=self._joints)
+        live = self._live
         if isinstance(received, Note):
             key, text, noted_ns = received.key, received.text, received.time_ns
             self._segments.note(key, text, noted_ns)
@@ -209,10 +210,11 @@ class ScribeProcess:
             if live is not None:
                 live.image(received)
             return
-        missing, time_ns = self._segments.write(received), int(received.timing["time_ns"])
+        missing = self._segments.write(received)
         if live is None:
             return
         if missing:
+            time_ns = int(received.timing["time_ns"])
             gap = f"{missing} ticks before tick {received.tick.index} are not recorded"
             live.put(lambda viewer: viewer.gap(gap, time_ns))
         if (skill := received.skill) is not None:

@@ -24,7 +24,7 @@ HELD_AT = MAX_WAITING_FRAMES + 300  # for one tick, within the gap
 END = MAX_WAITING_FRAMES + 600
 
 
-def told(*, first: int, end: int, skill_at: int = -1, skill: bytes = b"") -> list[TickMessage]:
+def received(*, first: int, end: int, skill_at: int = -1, skill: bytes = b"") -> list[TickMessage]:
     """Ticks as the scribe receives them."""
     messages = []
     for tick, frame, timing in ticks(end - first, first=first):
@@ -47,7 +47,7 @@ def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[s
 
 def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_is(tmp_path: Path, skill: Skill) -> None:
     def feed(view: LiveView) -> None:
-        for message in told(first=0, end=END, skill_at=HELD_AT + 100, skill=skill.file):
+        for message in received(first=0, end=END, skill_at=HELD_AT + 100, skill=skill.file):
             view.add(message)
             if message.tick.index == HELD_AT + 50:
                 view.put(lambda viewer: viewer.note("requests", 'via_points {"op": "clear"}', at_ns(HELD_AT + 50)))
@@ -64,7 +64,7 @@ def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_i
     assert left_out > 100
     assert breaks == [drawn_ticks[-3] + 1]
     log = [text for (text,) in values(rows["/log"], TEXT)]
-    assert f"{left_out} frames and images before tick {HELD_AT} are left out: viewers are slow" in log
+    assert f"{left_out} frames and images before tick {HELD_AT} are left out: too slow to draw" in log
     assert "All via-points were removed." in log
     modes = [mode for (mode,) in values(rows["/mode"], "StateChange:state")]
     assert modes == ["hold", "follow", "hold", "follow"]
@@ -74,13 +74,13 @@ def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_i
 
 def test_once_all_that_waited_is_drawn_new_frames_are_drawn_again(tmp_path: Path) -> None:
     def feed(view: LiveView) -> None:
-        for message in told(first=0, end=HELD_AT):
+        for message in received(first=0, end=HELD_AT):
             view.add(message)
         is_drained = threading.Event()
         view.put(lambda viewer: is_drained.set())
         view.is_paused = False
         assert is_drained.wait(60)
-        for message in told(first=HELD_AT + 1, end=END):
+        for message in received(first=HELD_AT + 1, end=END):
             view.add(message)
 
     drawn_ticks = values(shown(tmp_path / "a.rrd", feed)["/joints/velocity"], "tick")
