@@ -113,7 +113,6 @@ def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
     assert {"daemon", "fork server", "scribe", "skill worker"} == set(whole["processes"])
     assert (kept / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert replay(next(kept.glob("*.mcap"))).exact
-    assert next(kept.glob("*.rrd")).stat().st_size > 10_000
 
 
 @pytest.mark.usefixtures("probed_once")

@@ -51,7 +51,7 @@ def bundle(args: argparse.Namespace) -> int:
     texts |= {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()} if settings else {}
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
         folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
-    found = named_after(args.cell, Path(folder), ".mcap") if folder else []
+    found = named_after(args.cell, Path(folder)) if folder else []
     recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
     about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
     about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)

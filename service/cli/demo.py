@@ -22,13 +22,13 @@ from service.cli.hands import invite
 from service.cli.usage import UsageError
 from service.cli.web_address import page_served, web_address
 from service.client import Client, Tracker, no_room_to_brake, open_session
-from service.contract.explain import ExplainedError
+from service.contract.explain import ExplainedError, in_words
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
 from service.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
 from service.files.shipped import ARMS, cell_of
 from service.process.child import python
-from service.process.progress import say
+from service.process.progress import progress, say
 from service.trackers.cell_view import Latest
 from service.trackers.mouse_page import MousePage, PlayedTask
 from service.trackers.web_server import Address
@@ -70,10 +70,24 @@ def demo(args: argparse.Namespace) -> int:
         say(f"the task failed on a machine that was too busy, {report['busy']}: it is tried again")
         aside = args.output / TOO_BUSY
         aside.mkdir(exist_ok=True)
-        for made in filter(None, (report["recording"], report["rrd"])):
-            shutil.move(made, aside)
+        shutil.move(report["recording"], aside)
+    report["rrd"] = _drawn(Path(report["recording"]))
     print(json.dumps(report, indent=2) if args.json else text(report))
     return exit_code(report)
+
+
+def _drawn(recording: Path) -> str | None:
+    """The path of the drawing of a recording, beside it; None if it cannot be drawn."""
+    from service.cli.view import convert  # its import is slow
+
+    rrd = recording.with_suffix(".rrd")
+    try:
+        with progress(f"drawing {recording.name}") as done:
+            convert(recording, rrd, say=say, progress=done)
+    except (ExplainedError, OSError) as error:
+        say(f"there is no drawing: {in_words(error)}")
+        return None
+    return str(rrd)
 
 
 def exit_code(report: dict[str, Any]) -> int:
@@ -168,7 +182,7 @@ def _played_on_page(
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     from service.report.report import reported  # its import is slow: the first messages must come before
 
-    recording, rrd = status.scribe["recording"], status.scribe["rrd"]
+    recording = status.scribe["recording"]
     if recording is None:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
     found = reported(recording)
@@ -192,7 +206,6 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
         "realtime": status.realtime,
         "busy": ", ".join(filter(None, (bench, status.busy))),
         "recording": recording,
-        "rrd": rrd,
     }
 
 
@@ -250,7 +263,7 @@ def text(report: dict[str, Any]) -> str:
         *([f"  machine  too busy: {busy}"] if busy else []),
         "",
         f"  thirdhand replay {_shown(report['recording'])}",
-        f"  thirdhand view {_shown(report['rrd'])}",
+        f"  thirdhand view {_shown(report['rrd'] or report['recording'])}",
         f"  thirdhand report {_shown(report['recording'])}",
         *([f"  The recording is not complete: {report['missing']}."] if report["missing"] else []),
         "",

@@ -136,7 +136,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
     joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
-    option(c, "--record", "DIR", "record to .mcap and .rrd files in this folder")
+    option(c, "--record", "DIR", "record to .mcap files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
     hold = "begin in hold, until `thirdhand resume`: for a service manager, which starts the daemon unattended"

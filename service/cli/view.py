@@ -8,11 +8,11 @@ import argparse
 import io
 import math
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
 import time as clock
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.daemon.launch import free_port
+from service.files.mcap_file import RecordingError
 from service.files.recording import OBJECTS_NOTE, Recording
 from service.files.steps import Gap
 from service.process.progress import progress, say
 from service.settings import palette
 from service.settings.network import is_local
+from service.settings.whole_file import whole
 from service.trackers.cell_view import Latest
 from service.trackers.web_server import Address
 from service.viewer import vulkan
@@ -83,7 +85,9 @@ def _kind(path: Path) -> bytes:
     try:
         path.stat()  # reports a link that leads to itself
     except (FileNotFoundError, NotADirectoryError):
-        raise ExplainedError(f"no such file: {path}") from None
+        recording = path.with_suffix(".mcap")
+        hint = f"; `thirdhand view {shlex.quote(str(recording))}` draws the recording" if recording.is_file() else ""
+        raise ExplainedError(f"no such file: {path}{hint}") from None
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     if not path.is_file():  # reading a pipe could wait forever
@@ -157,7 +161,8 @@ def convert(
     say: Callable[[str], None] = lambda line: None,
     progress: Callable[[int], None] = lambda ticks: None,
 ) -> int:
-    """Draw a recording into a Rerun file and return the number of its ticks.
+    """Draw a recording into a Rerun file and return the number of its ticks. The file is complete
+    or absent, and its time 0 is the recording's first tick.
 
     `say` is called with messages on missing parts, which the drawing's log shows too. Raises
     RecordingError, ViewerError.
@@ -166,46 +171,63 @@ def convert(
     with tempfile.TemporaryDirectory() as folder:
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")
-        viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=Path(rrd_path))
-        if viewer.arm_remark:
-            say(viewer.arm_remark)
-        notes, images = recording.notes("requests", "log", OBJECTS_NOTE), recording.images()
-        note, image = next(notes, None), next(images, None)
-        count, time_ns, last = 0, 0, None
-        gaps: list[Gap] = []
-        shown = 0
-        for step in recording.steps():
-            if step.lost or step.damage:
-                gaps.append(Gap(last, step.tick, step.lost, step.damage))
-            last = step.tick
-            if step.frame is None:
-                continue
-            time_ns = step.time_ns
-            for gap in gaps[shown:]:
-                viewer.log(str(gap), "WARN", time_ns)
-            shown = len(gaps)
-            while note is not None and note[2] <= time_ns:
-                viewer.note(*note)
-                note = next(notes, None)
-            while image is not None and image[2] <= time_ns:
-                viewer.image(*image)
-                image = next(images, None)
-            if step.skill is not None:
-                viewer.learn(step.skill)
-            viewer.add(step.frame, time_ns, step.timing, step.events)
-            count += 1
-            progress(count)
-        missing = [*map(str, gaps), *recording.unreported(gaps, last=last)]
-        for text in missing[shown:]:
-            viewer.log(text, "WARN", time_ns)
-        viewer.close()
+        try:
+            with whole(Path(rrd_path)) as part:
+                viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=part)
+                if viewer.models.remark:
+                    say(viewer.models.remark)
+                count, missing = _draw(recording, viewer, progress)
+        except RecordingError:
+            raise
+        except Exception as error:
+            raise ViewerError(f"the drawing in {rrd_path} failed: {in_words(error)}") from error
     for text in missing:
         say(text)
     if missing:
         say(f"the other {count} ticks are shown")
-    if viewer.problems:
-        raise ViewerError("; ".join(viewer.problems))
     return count
+
+
+def _draw(recording: Recording, viewer: Viewer, progress: Callable[[int], None]) -> tuple[int, list[str]]:
+    """Draw a whole recording. Returns the number of its ticks, and messages on missing parts."""
+    notes = recording.notes("requests", "log", OBJECTS_NOTE)
+    note = next(notes, None)
+    images = recording.images()
+    image = next(images, None)
+    count = 0
+    time_ns = 0
+    previous_tick = None
+    gaps: list[Gap] = []
+    logged = 0  # number of gaps in the drawing's log
+    for step in recording.steps():
+        if step.lost or step.damage:
+            gaps.append(Gap(previous_tick, step.tick, step.lost, step.damage))
+        previous_tick = step.tick
+        if step.frame is None and step.checksum is None:  # a state alone, which has no time
+            continue
+        time_ns = step.time_ns
+        for gap in gaps[logged:]:
+            viewer.gap(str(gap), time_ns)
+        logged = len(gaps)
+        if step.skill is not None:
+            viewer.learn(step.skill)
+        viewer.add(step.frame, time_ns, step.timing, step.events)
+        count += 1
+        progress(count)
+        while note is not None and note[2] <= time_ns:
+            viewer.note(*note)
+            note = next(notes, None)
+        while image is not None and image[2] <= time_ns:
+            viewer.image(*image)
+            image = next(images, None)
+    while note is not None:
+        viewer.note(*note)
+        note = next(notes, None)
+    missing = [*map(str, gaps), *recording.unreported(gaps, last=previous_tick)]
+    for text in missing[logged:]:
+        viewer.log(text, "WARN", time_ns)
+    viewer.close()
+    return count, missing
 
 
 def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
@@ -262,10 +284,7 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
 def last_followed(rrd: Path, end: int) -> int:
     """The last time [ns] in mode `follow` in a drawing that ends at `end` [ns], or `end`."""
     times, modes = [], []
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "RRD file has no footer")  # the service writes none
-        reader = rr.chunk.RrdReader(rrd)
-    for chunk in reader.stream():
+    for chunk in rr.chunk.RrdReader(rrd).stream():
         if chunk.entity_path == "/mode" and not chunk.is_static:
             rows = chunk.to_record_batch()
             times += rows[TIMELINE].cast("int64").to_pylist()

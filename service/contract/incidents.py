@@ -281,7 +281,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "check that the folder exists and its disk has room; `thirdhand replay` lists what is missing"),
         Incident(Condition.DISK_SHORT, None, "disk almost full",
             "the disk has little room for recordings",
-            "free space, or lower `keep_mb` or `rerun_mb_per_hour` under [files]"),
+            "free space, or lower `keep_mb` under [files]"),
     ),
     "A command reaches no daemon": (
         Incident(Condition.STARTING, None, "starting",

@@ -83,22 +83,21 @@ def launched(
     record: Path | None = None,
     skills: Path | None = None,
     settings: Settings | None = None,
-    rerun: bool = True,
     program: tuple[str, ...] = ("-m", "service"),
     network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
-    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, with
-    drawings if `rerun`, and its skills in `skills`. The cell is described by `settings`; `network`
-    is the section [network] of its configuration. Raises LaunchError.
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, and its
+    skills in `skills`. The cell is described by `settings`; `network` is the section [network] of
+    its configuration. Raises LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
     files = {"state": folder / "state", "record": record, "skills": skills}
     config.write_text(
         "# A cell with a free port and its own files.\n"
-        f"{described(settings or Settings())}{network}[files]\nrerun = {json.dumps(rerun)}\n"
+        f"{described(settings or Settings())}{network}[files]\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
     command, environment = python(*program, "serve", "--config", str(config), *_end_with_this(), *arguments)

@@ -1,1 +1,1 @@
-"""The scribe: a process that records each tick and draws it in Rerun."""
+"""The scribe: a process that records each tick and feeds the live view."""

@@ -1,10 +1,11 @@
-"""The scribe's process: it reads messages from a socket, writes recordings, and feeds the viewer.
+"""The scribe's process: it writes the messages from a socket into recordings, and feeds
+the live view.
 
 It ends when the other side of the socket closes or dies, after writing everything received. It
 cannot outlive its daemon for long: the daemon's death continues a stopped scribe, and an alarm ends
 a scribe that hangs. A living daemon replaces a scribe that hangs.
 
-Recording does not wait for drawing: Rerun is imported on the drawing's own thread.
+Recording does not wait for the live view: Rerun is imported on the view's own thread.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from service.core.frame import state_layout
 from service.process import child
 from service.process.pages import release_start_memory, share_one_heap
 from service.scribe.paths import RecordingPaths
-from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, unpack
+from service.scribe.protocol import MAX_PACKET_BYTES, ImageArrival, Note, ScribeReport, ScribeSetup, TickMessage, unpack
 from service.scribe.segments import Segments
 from service.settings.config import urdf_path
 
@@ -40,101 +41,106 @@ if TYPE_CHECKING:
 CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that an arm's driver does not wait for it
 MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
-DRAW_FLUSH_S = 10.0  # a kill loses at most this time of a drawing, which can be drawn again
-FIRST_FLUSH_S = 5.0  # the same, at the begin of a file
-DRAW_END_S = 8.0  # a drawing that does not end within this time is abandoned
-MAX_WAITING_DRAWINGS = 5000  # [ticks] with more, the oldest is dropped
+LIVE_END_S = 8.0  # a live view that does not end within this time is abandoned
+MAX_WAITING_FRAMES = 2500  # with more frames and images waiting for the live view, new ones are left out
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
-# Rerun's log on standard error: plain text, and no warnings of a slow viewer, whose batches
-# are dropped, nor of files without a footer. Arrow's own allocator would keep unused memory.
+# Rerun's log on standard error: plain text, and no warnings of a slow viewer, for which frames are
+# left out. Arrow's own allocator would keep unused memory.
 LIBRARY_OPTIONS = {
-    "RUST_LOG": "warn,re_quota_channel=error,re_log_encoding=error",
+    "RUST_LOG": "warn,re_quota_channel=error",
     "NO_COLOR": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
 SOCKET_POLL_S = 0.02  # polling, because to wake a blocked reader costs the sender 25 µs per tick
 
 
-class DrawingThread:
-    """A thread that makes and uses the viewer, so that a slow viewer does not delay the recording.
+class LiveView:
+    """A thread that makes and feeds a live view, so that slow viewers do not delay the recording.
 
-    Set `is_paused` while the recording is behind; nothing is drawn then.
+    Frames and images for which the thread is too slow are left out until it has drawn all that
+    wait. Log, skills and changes of mode or reason are always drawn. Set `is_paused` while the
+    recording is behind; nothing is drawn then.
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
-        self.viewer: Viewer | None = None
+        self.url: str | None = None
         self.problems: list[str] = []
-        self.dropped, self.is_paused = 0, True
-        self._wanted_file: Path | None = None
-        self._waiting: deque[Callable[[Viewer], object] | Path] = deque()
+        self.left_out = 0  # number of frames and images
+        self.is_paused = True
+        self._waiting: deque[Callable[[Viewer], object]] = deque()
+        self._outcome = (-1, -1)  # mode and reason of the newest frame
+        self._gap = 0  # number of frames and images that were left out last, and are not in the log yet
+        self._overflows = False
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._draw, args=(make,), name="drawing", daemon=True)
+        self._thread = threading.Thread(target=self._draw, args=(make,), name="live view", daemon=True)
         self._thread.start()
 
-    @property
-    def rrd(self) -> str | None:
-        """The file of the present drawing, or of the next one if that is queued."""
-        if self._wanted_file is None:
-            return None if self.viewer is None else self.viewer.rrd
-        return str(self._wanted_file)
-
     def put(self, act: Callable[[Viewer], object]) -> None:
-        """Queue a drawing; beyond MAX_WAITING_DRAWINGS the oldest is dropped."""
-        self._waiting.append(act)
-        if len(self._waiting) > MAX_WAITING_DRAWINGS:
-            oldest = self._waiting.popleft()
-            if isinstance(oldest, Path) and self._waiting:  # keep the change of file, drop the drawing after it
-                self._waiting.popleft()
-                self._waiting.appendleft(oldest)
-            self.dropped += 1
+        """Queue what is always drawn."""
+        if self._thread.is_alive():
+            self._waiting.append(act)
 
-    def draw_into(self, rrd: Path) -> None:
-        """End the file; everything queued from now on is drawn into another."""
-        self._wanted_file = rrd
-        self._waiting.append(rrd)
+    def add(self, received: TickMessage) -> None:
+        """Queue a tick, which is left out if too many wait, unless it changes mode or reason."""
+        frame = received.frame
+        time_ns = int(received.timing["time_ns"])
+        events = [(event.kind, event.payload) for event in received.tick.inbox]
+        outcome = int(frame["mode"]), int(frame["reason"])
+        is_changed = outcome != self._outcome
+        self._outcome = outcome
+        if not is_changed and self._is_left_out():
+            for kind, payload in events:
+                if kind == "skill":
+                    self.put(lambda viewer, skill=payload: viewer.learn(skill))  # type: ignore[misc]
+            return
+        if self._gap:
+            text = f"{self._gap} frames and images before tick {received.tick.index} are left out: too slow to draw"
+            self._gap = 0
+            self.put(lambda viewer: viewer.gap(text, time_ns))
+        self.put(lambda viewer: viewer.add(frame, time_ns, received.timing, events))
+
+    def image(self, image: ImageArrival) -> None:
+        """Queue an image, which is left out if too many entries wait."""
+        if not self._is_left_out():
+            self.put(lambda viewer: viewer.image(image.key, decode_image(image.data), image.time_ns))
+
+    def _is_left_out(self) -> bool:
+        """True if there is no room for a frame or image, which is counted."""
+        self._overflows = len(self._waiting) > (0 if self._overflows else MAX_WAITING_FRAMES)
+        self._gap += self._overflows
+        self.left_out += self._overflows
+        return self._overflows
 
     def _draw(self, make: Callable[[], Viewer]) -> None:
         self._wait()
         try:
-            viewer = self.viewer = make()
-        except Exception as error:  # the recording continues without Rerun
-            self.problems.append(f"nothing is drawn: {in_words(error)}")
-            self._wanted_file = None
-            return
-        flushed, is_fresh = time.monotonic(), True
-        while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
-            while self._waiting:
-                self._wait()
-                next_ = self._waiting.popleft()
-                if isinstance(next_, Path):
-                    viewer.draw_into(next_)
-                    is_fresh = True
-                    if self._wanted_file is next_:
-                        self._wanted_file = None
-                else:
-                    next_(viewer)
-            if time.monotonic() - flushed > (FIRST_FLUSH_S if is_fresh else DRAW_FLUSH_S):
-                viewer.flush()
-                flushed = time.monotonic()
-                if is_fresh:  # neither what the begin of a file needed nor the end of the last one is used again
-                    is_fresh = False
-                    gc.collect()
-                    release_start_memory()
-        viewer.close()
+            viewer = make()
+            self.url = viewer.url
+            gc.collect()
+            release_start_memory()
+            while not (self._ended.wait(SOCKET_POLL_S) and not self._waiting):
+                while self._waiting:
+                    self._wait()
+                    self._waiting.popleft()(viewer)
+            viewer.close()
+        except Exception as error:  # the recording continues without a live view
+            self.problems.append(f"the live view ended: {in_words(error)}")
+            self.url = None
+        self._waiting.clear()
 
     def _wait(self) -> None:
         while self.is_paused and not self._ended.wait(SOCKET_POLL_S):
             pass
 
     def close(self) -> None:
-        """End the file and the live view, within DRAW_END_S."""
+        """End the live view within LIVE_END_S."""
         self._ended.set()
-        self._thread.join(DRAW_END_S)
+        self._thread.join(LIVE_END_S)
 
 
 class ScribeProcess:
-    """Writer and drawer of the messages that the process receives.
+    """Writer of the messages that the process receives, which passes them to the live view too.
 
     A failure is reported and ends only the part that failed.
     """
@@ -143,45 +149,35 @@ class ScribeProcess:
         self._source = source
         self._joints = len(setup.settings.joints.names)
         self._errors: list[str] = []
-        self._drawing: DrawingThread | None = None
-        self._reported_dropped = self._reported_kept = 0
+        self._live: LiveView | None = None
+        self._reported_left_out = 0
+        self._reported_kept = 0
         self._is_behind = True  # at the start, with the higher weight
-        is_drawn = setup.rrd is not None or (setup.folder is not None and setup.settings.files.rerun)
-        if is_drawn or setup.live_port is not None:
-            self._drawing = DrawingThread(lambda: _viewer(setup, skill))
-        paths = RecordingPaths(setup.settings, setup.folder, setup.recording, setup.rrd, attempt=setup.attempt)
+        if setup.live_port is not None:
+            self._live = LiveView(lambda: _viewer(setup, skill))
+        paths = RecordingPaths(setup.settings, setup.folder, setup.recording, attempt=setup.attempt)
         self._segments = Segments(
-            setup.settings,
-            paths,
-            say=self._errors.append,
-            draw=self._draw_into,
-            unmarked=setup.unmarked,
-            constants=setup.constants,
+            setup.settings, paths, say=self._errors.append, unmarked=setup.unmarked, constants=setup.constants
         )
         state = None if setup.state is None else np.frombuffer(setup.state, state_layout(self._joints))[0]
         self._segments.begin(skill, state)
         self.report()
 
-    def _draw_into(self, rrd: Path) -> None:
-        assert self._drawing is not None
-        self._drawing.draw_into(rrd)
-
     def report(self) -> None:
         """Send a report: new errors, paths of files, and the number of ticks on disk."""
-        viewer = None if self._drawing is None else self._drawing.viewer
-        for problems in (drawn.problems for drawn in (self._drawing, viewer) if drawn is not None):
-            while problems:
-                self._errors.append(problems.pop(0))
-        if self._drawing is not None and self._drawing.dropped > 2 * self._reported_dropped:
-            self._reported_dropped = self._drawing.dropped
-            self._errors.append(f"the drawing is too slow: {self._reported_dropped} of its entries were dropped")
+        live = self._live
+        if live is not None:
+            while live.problems:
+                self._errors.append(live.problems.pop(0))
+            if live.left_out > 2 * self._reported_left_out:
+                self._reported_left_out = live.left_out
+                self._errors.append(f"the live view is too slow: {live.left_out} frames and images were left out")
         segments = self._segments
         self._reported_kept = segments.kept
         report = ScribeReport(
             state=segments.state,
             recording=None if segments.path is None else str(segments.path),
-            rrd=None if self._drawing is None else self._drawing.rrd,
-            live=None if viewer is None else viewer.url,
+            live=None if live is None else live.url,
             kept=segments.kept,
             lost=segments.lost,
             unmarked=segments.unmarked,
@@ -202,38 +198,38 @@ class ScribeProcess:
             self.report()
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
-        """Write and draw one message."""
-        received, drawing = unpack(message, skills, joints=self._joints), self._drawing
+        """Write one message, and pass it to the live view."""
+        received = unpack(message, skills, joints=self._joints)
+        live = self._live
         if isinstance(received, Note):
             key, text, noted_ns = received.key, received.text, received.time_ns
             self._segments.note(key, text, noted_ns)
-            if key != "status" and drawing is not None:
-                drawing.put(lambda viewer: viewer.note(key, text, noted_ns))
+            if key != "status" and live is not None:
+                live.put(lambda viewer: viewer.note(key, text, noted_ns))
             return
         if isinstance(received, ImageArrival):
-            image = received
-            self._segments.image(image.key, image.data, image.time_ns)
-            if drawing is not None:
-                drawing.put(lambda viewer: viewer.image(image.key, decode_image(image.data), image.time_ns))
+            self._segments.image(received.key, received.data, received.time_ns)
+            if live is not None:
+                live.image(received)
             return
-        missing, time_ns = self._segments.write(received), int(received.timing["time_ns"])
-        if drawing is None:
+        missing = self._segments.write(received)
+        if live is None:
             return
         if missing:
+            time_ns = int(received.timing["time_ns"])
             gap = f"{missing} ticks before tick {received.tick.index} are not recorded"
-            drawing.put(lambda viewer: viewer.log(gap, "WARN", time_ns))
+            live.put(lambda viewer: viewer.gap(gap, time_ns))
         if (skill := received.skill) is not None:
-            drawing.put(lambda viewer: viewer.learn(skill))
-        events = [(event.kind, event.payload) for event in received.tick.inbox]
-        drawing.put(lambda viewer: viewer.add(received.frame, time_ns, received.timing, events))
+            live.put(lambda viewer: viewer.learn(skill))
+        live.add(received)
 
     def catch_up(self, waiting: int) -> None:
-        """Pause the drawing and raise the process's weight while the recording is behind."""
+        """Pause the live view and raise the process's weight while the recording is behind."""
         if waiting <= BEHIND_MESSAGES / 10 if self._is_behind else waiting > BEHIND_MESSAGES:
             self._is_behind = not self._is_behind
             _run_with(CATCH_UP_NICE if self._is_behind else child.CHILD_NICE)
-            if self._drawing is not None:
-                self._drawing.is_paused = self._is_behind
+            if self._live is not None:
+                self._live.is_paused = self._is_behind
 
     def flush(self) -> None:
         """Pass the recorded data to the operating system and report it."""
@@ -241,11 +237,11 @@ class ScribeProcess:
         self.report()
 
     def close(self) -> None:
-        """End the files."""
+        """End the recording and the live view."""
         self._segments.close()
         self.report()
-        if self._drawing is not None:
-            self._drawing.close()
+        if self._live is not None:
+            self._live.close()
         self.report()
 
 
@@ -259,14 +255,7 @@ def _run_with(nice: int) -> None:
 def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
     from service.viewer.stream import Viewer  # its import takes half a second and starts threads
 
-    settings = setup.settings
-    return Viewer(
-        urdf=urdf_path(settings),
-        live_port=setup.live_port,
-        settings=settings,
-        skill=skill,
-        mb_per_hour=settings.files.rerun_mb_per_hour,
-    )
+    return Viewer(urdf=urdf_path(setup.settings), live_port=setup.live_port, settings=setup.settings, skill=skill)
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
@@ -320,7 +309,7 @@ def _work(source: socket.socket) -> None:
 
 
 def run(source: socket.socket) -> None:
-    """Write and draw the received messages until the other side closes."""
+    """Record and show the received messages until the other side closes."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # it ends with its socket, after writing everything
     share_one_heap()

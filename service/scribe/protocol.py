@@ -108,8 +108,8 @@ def pack_image(key: str, time_ns: int) -> bytes:
 class ScribeSetup(msgspec.Struct, frozen=True):
     """The setup of a scribe; the skill is sent with it as a memory file.
 
-    Without state the scribe begins with the first message that has one. `recording` and `rrd` are
-    explicit paths instead of names in `folder`. `attempt` counts the scribes of a daemon.
+    Without state the scribe begins with the first message that has one. `recording` is an explicit
+    path instead of names in `folder`. `attempt` counts the scribes of a daemon.
     `unmarked` ticks were lost with earlier scribes and are not marked in a recording yet.
     `constants` are `Controller.constants`.
     """
@@ -118,7 +118,6 @@ class ScribeSetup(msgspec.Struct, frozen=True):
     state: bytes | None
     folder: str | None
     recording: str | None
-    rrd: str | None
     live_port: int | None
     attempt: int
     unmarked: int = 0
@@ -126,18 +125,17 @@ class ScribeSetup(msgspec.Struct, frozen=True):
 
 
 class ScribeReport(msgspec.Struct, frozen=True):
-    """A scribe's report, twice a second: the paths of its files, and the numbers of ticks on disk
+    """A scribe's report, twice a second: the path of its file, and the numbers of ticks on disk
     (`kept`), of lost ticks (`lost`), and of lost ticks that no recording marks yet (`unmarked`).
     """
 
     state: Literal["starting", "recording", "interrupted", "drawing"] = "starting"
     recording: str | None = None
-    rrd: str | None = None
     live: str | None = None
     kept: int = 0
     lost: int = 0
     unmarked: int = 0
     errors: tuple[str, ...] = ()  # new error messages
     free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
-    mb_per_hour: float | None = None  # recent growth of recordings and drawings; None: not known yet
+    mb_per_hour: float | None = None  # recent growth of recordings; None: not known yet
     keep_mb_left: float | None = None  # growth until each file takes an older one's place; None: without end

@@ -1,4 +1,4 @@
-"""The daemon's end of the scribe, the process that writes the recording and feeds the viewer.
+"""The daemon's end of the scribe, the process that writes the recording and feeds the live view.
 
 The loop makes one non-blocking send per tick over a socket pair that keeps message boundaries.
 Messages that do not fit wait in a queue of some seconds, so a slow or dead scribe does not delay
@@ -35,7 +35,7 @@ NOT_RECORDED = "ticks are not recorded"
 HUNG_AFTER_S = 5.0  # a scribe that reports twice a second hangs if it made no progress for this time
 CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
 MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
-REPORTED = ("recording", "rrd", "live", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
+REPORTED = ("recording", "live", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
 MAX_SENDS_PER_TICK = 8  # waiting ticks are sent faster than new ones arrive
 
 
@@ -45,10 +45,9 @@ class Scribe:
     `send` and `skip` are for the loop, `start`, `supervise`, `image`, `status` and `close` for one
     other thread, `note` and `keep` for any thread.
 
-    In `folder` the process writes `<cell>-<UTC time>.mcap` and `.rrd`, one after another;
-    `recording` and `rrd` are explicit paths. Without any of these and without `live_port` no
-    process is started. A process that hangs for `silent_s` [s], or for `ready_s` [s] at its start,
-    is replaced.
+    In `folder` the process writes `<cell>-<UTC time>.mcap`, one after another; `recording` is an
+    explicit path. Without any of these and without `live_port` no process is started. A process
+    that hangs for `silent_s` [s], or for `ready_s` [s] at its start, is replaced.
     """
 
     def __init__(
@@ -57,7 +56,6 @@ class Scribe:
         *,
         folder: Path | None = None,
         recording: Path | None = None,
-        rrd: Path | None = None,
         live_port: int | None = None,
         restart_s: float = RESTART_S,
         silent_s: float = HUNG_AFTER_S,
@@ -65,8 +63,8 @@ class Scribe:
     ) -> None:
         self._settings = settings
         self._restart_s, self._silent_s, self._ready_s = restart_s, silent_s, ready_s
-        self._folder, self._recording, self._rrd, self._live_port = folder, recording, rrd, live_port
-        self._wanted = any(value is not None for value in (folder, recording, rrd, live_port))
+        self._folder, self._recording, self._live_port = folder, recording, live_port
+        self._wanted = any(value is not None for value in (folder, recording, live_port))
         self._socket: socket.socket | None = None  # socket to the child; None once the child is dead
         self._child: child.Child | None = None
         self._progress: child.Progress | None = None
@@ -291,11 +289,9 @@ class Scribe:
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> None:
         """Start a process and send it its setup."""
-        folder, recording, rrd = (
-            None if path is None else str(path.absolute()) for path in (self._folder, self._recording, self._rrd)
-        )
+        folder, recording = (None if path is None else str(path.absolute()) for path in (self._folder, self._recording))
         begin = None if state is None else state.tobytes()
-        places = folder, recording, rrd, self._live_port
+        places = folder, recording, self._live_port
         setup = ScribeSetup(self._settings, begin, *places, self._restarts + 1, self._unmarked, self._constants)
         self._child = child.start("scribe", "service.scribe.process", socket.SOCK_SEQPACKET)
         self._progress, self._started = child.Progress(self._child), time.monotonic()

@@ -33,7 +33,7 @@ PRUNE_S = 5.0  # interval at which old recordings are deleted
 class Segments:
     """Writer of ticks and notes. `say` is called once with the message of each failure.
 
-    `draw` is called with the path of each new drawing. `kept` counts the received ticks on disk,
+    `kept` counts the received ticks on disk,
     `lost` the lost ones, and `unmarked` the lost ones that no recording on disk marks yet,
     including those of earlier scribes.
     """
@@ -44,22 +44,20 @@ class Segments:
         paths: RecordingPaths,
         *,
         say: Callable[[str], None],
-        draw: Callable[[Path], None],
         unmarked: int = 0,
         constants: Mapping[str, str] | None = None,
     ) -> None:
         self._constants = constants
-        self._settings, self._paths, self._say, self._draw = settings, paths, say, draw
+        self._settings, self._paths, self._say = settings, paths, say
         self._recorder: Recorder | None = None
         self._wanted = True
         self._skill: bytes | None = None
-        self._rrd: Path | None = None
         self._complete: Path | None = None
         self._kept = self.lost = 0
         self._unmarked = unmarked
         self._marked = self._marked_pending = 0  # lost ticks marked in this recording; those marks not on disk yet
         self._began = self._tried = self._pruned = -1e9
-        self._full = self._moved = self._drawn = False
+        self._full = self._moved = False
         self._failure: object = None  # cause of the last reported failure
         self._written = 0  # [bytes] in files that have ended
         self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], total [bytes]
@@ -93,22 +91,14 @@ class Segments:
             self._recorder = self._opened(state)
 
     def _opened(self, state: Record | None) -> Recorder | None:
-        """A new recording with its drawing; None if it cannot be begun. The first drawing begins in
-        any case.
-        """
+        """A new recording; None if it cannot be begun, or none is required."""
         self._tried = time.monotonic()
-        path, rrd = self._paths.next()
+        path = self._paths.next()
         self._wanted = path is not None
         recorder = None if path is None else self._recorder_at(path, state)
-        if recorder is not None or not self._wanted:
+        if recorder is not None:
             self._marked = self._marked_pending = 0
             self._began, self._moved = self._tried, False
-        elif self._rrd is not None:
-            return None
-        self._written += _bytes_of(self._rrd)
-        self._rrd, self._drawn = rrd, False
-        if rrd is not None:
-            self._draw(rrd)
         return recorder
 
     def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
@@ -133,7 +123,7 @@ class Segments:
         return None
 
     def mb_per_hour(self) -> float | None:
-        """Recent growth of recordings and drawings [MB/h]; None if it is not known yet."""
+        """Recent growth of recordings [MB/h]; None if it is not known yet."""
         if not self._sizes:
             return None
         (begin_s, begin), now_s = self._sizes[0], time.monotonic()
@@ -148,8 +138,8 @@ class Segments:
         return None if left is None else round(left)
 
     def _size(self) -> int:
-        """Bytes in the files being written."""
-        return _bytes_of(self._rrd) + (0 if self._recorder is None else self._recorder.size)
+        """Bytes in the file being written."""
+        return 0 if self._recorder is None else self._recorder.size
 
     def _failed(self, path: Path, error: OSError) -> None:
         self._full = error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -166,14 +156,14 @@ class Segments:
         self._skill = received.skill or self._skill
         now = time.monotonic()
         may_begin = received.state is not None and self._skill is not None
-        if may_begin and self._recorder is None and now - self._tried > REOPEN_S and (self._wanted or self._due(now)):
+        if may_begin and self._recorder is None and now - self._tried > REOPEN_S and self._wanted:
             self._recorder = self._opened(None)
         if self._recorder is None:
             if self._wanted:
                 self.lost += 1
                 self._unmarked += 1 + received.lost
             else:
-                self._kept += 1  # only a drawing is required
+                self._kept += 1  # only a live view is required
             return 0 if self._wanted else received.lost
         missing = received.lost + self._unmarked
         self._marked += missing
@@ -189,10 +179,7 @@ class Segments:
 
     def _due(self, now: float) -> bool:
         files = self._settings.files
-        sizes = [self._recorder.size] if self._recorder is not None else []
-        sizes.append(_bytes_of(self._rrd))
-        too_large = max(sizes, default=0) > files.segment_mb * MB
-        return too_large or self._moved or now - self._began > files.segment_minutes * 60
+        return self._size() > files.segment_mb * MB or self._moved or now - self._began > files.segment_minutes * 60
 
     def _next(self, state: Record) -> None:
         """Continue in a new recording, which begins with the old one's last state, or in the old
@@ -244,11 +231,11 @@ class Segments:
         self._safely(lambda recorder: recorder.image(key, data, time_ns))
 
     def flush(self) -> None:
-        """Pass the written data to the operating system, check that the files are at their paths,
+        """Pass the written data to the operating system, check that the file is at its path,
         and delete the oldest recordings every PRUNE_S.
         """
         self._safely(Recorder.flush)
-        self._check_files()
+        self._check_file()
         if not self._sizes or time.monotonic() - self._sizes[-1][0] > SAMPLE_S:
             self._sizes.append((time.monotonic(), self._written + self._size()))
         if time.monotonic() - self._pruned > PRUNE_S:
@@ -256,7 +243,7 @@ class Segments:
             with contextlib.suppress(OSError):
                 self._paths.prune(self.path)
 
-    def _check_files(self) -> None:
+    def _check_file(self) -> None:
         recorder = self._recorder
         if recorder is None:
             return
@@ -272,9 +259,6 @@ class Segments:
         elif lost_name and not self._moved:
             self._moved = True
             self._say(f"recording {recorder.path} was moved while it was written; the next one begins")
-        if self._rrd is not None:
-            self._moved = self._moved or (self._drawn and not self._rrd.exists())
-            self._drawn = self._rrd.exists()
 
     def close(self) -> None:
         """End the recording."""
@@ -299,13 +283,6 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int, is_last
     )
     if missing:
         recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)
-
-
-def _bytes_of(path: Path | None) -> int:
-    """The size of a file; 0 if there is none."""
-    with contextlib.suppress(OSError):
-        return 0 if path is None else path.stat().st_size
-    return 0
 
 
 def _discard(path: Path) -> None:

@@ -281,16 +281,10 @@ class Files(Section, frozen=True):
     skills: str = ""  # a folder; empty: the shipped recordings
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are stored there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
-    rerun: bool = True  # write an .rrd file beside each recording
-    rerun_mb_per_hour: Annotated[float, msgspec.Meta(ge=0)] = 200.0  # largest growth of .rrd files; 0: draw every tick
     segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
     segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
     keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's .mcap files; 0: no limit
     keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .mcap files older than this are deleted; 0: no limit
-    rerun_keep_mb: Annotated[float, msgspec.Meta(ge=0)] = (
-        10_000.0  # largest size of this cell's .rrd files; 0: no limit
-    )
-    rerun_keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .rrd files older than this are deleted; 0: no limit
 
 
 class RecordingSettings(Section, frozen=True):

@@ -46,7 +46,7 @@ def run(minutes: float, rate_hz: int, *, settings: Settings | None = None) -> di
             "lost": after.scribe["lost"],
             "restarts": after.scribe["restarts"],
             "processes": {who: judged(np.array(values)) for who, values in samples.items()},
-            "files": sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".rrd")),
+            "files": sorted(path.name for path in folder.iterdir() if path.suffix == ".mcap"),
         }
 
 

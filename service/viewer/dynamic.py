@@ -1,4 +1,7 @@
-"""The dynamic part of the drawing: the scene at 100 Hz, curves at the full rate of the loop."""
+"""The dynamic part of the drawing: the scene at 100 Hz, curves at the full rate of the loop.
+
+Where frames are missing, curves are interrupted and trails begin anew.
+"""
 
 from __future__ import annotations
 
@@ -31,29 +34,36 @@ NEAREST_SHOWN_M = 0.5  # a nearer hand is connected with the arm by a line
 SAME_M = 1e-5  # smaller differences of deviations come from rounding
 TINY = 1e-4  # scale that makes the links of an arm invisible; the viewer rejects 0
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
+PAUSE_FRAMES = 2  # a longer step between two frames, in intervals of a recording's frames, is a gap
+BREAK_NS = 1000  # a curve ends this long after the last frame before a gap
 REPEAT_S = 0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
 Columns = Callable[..., rr.chunk.Chunk]
 
 
 class DrawnFrame(NamedTuple):
-    """A frame, its time [ns], its timing, and the joints (J,) measured last [rad]."""
+    """A frame, its time [ns], its timing, the joints (J,) measured last [rad], and whether frames
+    before it are missing.
+    """
 
     frame: Record
     time_ns: int
     timing: Record | None
     measured: NDArray[np.float64] | None
+    after_gap: bool = False
 
 
 class DynamicScene:
     """Convert batches of frames into chunks, with the state that the next batch continues."""
 
-    def __init__(self, models: ArmModels, settings: Settings, *, live: bool) -> None:
+    def __init__(self, models: ArmModels, settings: Settings, *, start_ns: int | None = None) -> None:
+        """Seconds count from `start_ns` [ns] in a live view, and from the first frame in a file."""
         rate_hz, names = settings.rate_hz, settings.joints.names
         self._joints, self._ghost = (
             [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
         )
-        self._live, self._settings, self._repeat_ticks = live, settings, settings.ticks_in(REPEAT_S)
+        self._live, self._settings, self._repeat_ticks = start_ns is not None, settings, settings.ticks_in(REPEAT_S)
         self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
+        self._max_step_ticks = PAUSE_FRAMES * settings.frame_every
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
         self._stale_ticks = settings.ticks_in(settings.hands.stale_ms / 1000)
@@ -65,17 +75,15 @@ class DynamicScene:
         self._forearm, self._hand_radius = people.length / np.linalg.norm(toward) * toward, people.radius
         self._gate: float | None = None
         self._missed = 0
-        self.restart()
-
-    def restart(self) -> None:
-        """Start another file: its time begins at 0, and the mode is sent again."""
         self._followed = False
         self._shown: tuple[int, int, bool] | None = None
         self._mode_sent_tick = 0
         self._last_tick = -1
-        self._start_ns: int | None = None
+        self._last_ns = 0
+        self._start_ns = start_ns
         self.end_s = 0.0
         self.peaks: dict[str, list[float]] = {}  # peaks of each view, one for each batch
+        self._widths: dict[str, int] = {}  # number of values of each curve that has begun, by path
 
     def set_gate(self, deviation_m: float) -> None:
         """Sets the deviation [m] above which the skill in force holds."""
@@ -94,6 +102,30 @@ class DynamicScene:
 
     def chunks(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
         """The chunks that show a batch of frames."""
+        begin = 0
+        for i, shown in enumerate(batch):
+            step_ticks = int(shown.frame["tick"]) - int(batch[i - 1].frame["tick"] if i else self._last_tick)
+            if shown.after_gap or step_ticks > self._max_step_ticks:
+                yield from self._unbroken(batch[begin:i])
+                yield from self._interruption()
+                begin = i
+        yield from self._unbroken(batch[begin:])
+
+    def _interruption(self) -> Iterator[rr.chunk.Chunk]:
+        """The end of all curves and trails after the last frame."""
+        for trail in self._trails.values():
+            trail.clear()
+        after_ns = np.array([self._last_ns + BREAK_NS], np.int64)
+        for path, width in self._widths.items():
+            index = [rr.TimeColumn("tick", sequence=[self._last_tick + 1]), *self.index(after_ns)]
+            nothing = rr.Scalars.columns(scalars=[np.nan] * width).partition([width])
+            yield rr.chunk.Chunk.from_columns(path, index, [*nothing])
+        self._widths = {}
+
+    def _unbroken(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
+        """The chunks that show frames between which none is missing."""
+        if not batch:
+            return
         frames = np.array([shown.frame for shown in batch])
         times = np.array([shown.time_ns for shown in batch], np.int64)
         ticks = frames["tick"]
@@ -111,6 +143,7 @@ class DynamicScene:
         yield from self._curves(batch, frames, seen, columns)
         yield from self._modes(frames, columns)
         before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
+        self._last_ns = int(times[-1])
         sampled = np.flatnonzero(ticks // self._every != before // self._every)
         if len(sampled):
             yield from self._scene(batch, frames, sampled, seen, columns)
@@ -133,8 +166,8 @@ class DynamicScene:
             found = values[rows]
             if len(found):
                 self.peaks.setdefault(view or path, []).append(float(np.nanmax(np.abs(found), initial=0.0)))
-                flat = rr.Scalars.columns(scalars=found.ravel())
-                yield columns(path, rows, flat.partition([values.shape[1]] * len(found)) if values.ndim > 1 else flat)
+                width = self._widths[path] = found[0].size
+                yield columns(path, rows, rr.Scalars.columns(scalars=found.ravel()).partition([width] * len(found)))
 
         every = slice(None)
         yield from scalars("/joints/position", every, frames["joints"])

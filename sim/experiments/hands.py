@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.cli.view import convert
 from service.contract.records import Mode
 from service.files.recording import Recording
 from service.files.shipped import shipped_skill
@@ -59,12 +60,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             found[name] = (None, _in_process(drawn, taught=taught))
             continue
         ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)
-        for suffix in (".mcap", ".rrd"):
-            made = next(scratch.glob(f"*{suffix}"))
-            made.replace(
-                results.folder / ("hands.rrd" if (suffix, name) == (".rrd", "adaptation") else f"hands-{name}{suffix}")
-            )
-        found[name] = (ran, _recorded(results.folder / f"hands-{name}.mcap"))
+        recording = next(scratch.glob("*.mcap")).replace(results.folder / f"hands-{name}.mcap")
+        convert(recording, results.folder / ("hands.rrd" if name == "adaptation" else f"hands-{name}.rrd"))
+        found[name] = (ran, _recorded(recording))
         tries[name] = attempts
         results.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
     if scratch.is_dir():

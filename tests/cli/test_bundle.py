@@ -32,7 +32,6 @@ listen = ["tcp/127.0.0.1:0#iface=lo;connect_private_key_base64={secret}"]
 [files]
 state = "{folder}/state"
 record = "{folder}/recordings"
-rerun = false
 """
 
 
@@ -90,7 +89,7 @@ def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pyt
 
     assert json.loads(found["status.json"])["mode"] == "follow"
     settings = msgspec.json.decode(found["settings.json"], type=Settings)
-    assert (settings.network.listen, settings.files.rerun) == (("tcp/127.0.0.1:0",), False)
+    assert settings.network.listen == ("tcp/127.0.0.1:0",)
     assert "left hand" in found["doctor.txt"].decode()
     versions = found["versions.txt"].decode()
     assert all(f"{name}: " in versions for name in ("thirdhand", "python", "cpu", "eclipse-zenoh"))

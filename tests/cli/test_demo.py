@@ -30,6 +30,7 @@ from service.settings.config import WAM, Settings
 from sim.scene import Scene
 from support.cell import thirdhand, told
 from support.paths import ROOT
+from support.recorded import drawn_ticks
 
 timed = pytest.mark.timed
 SCENE = """
@@ -60,7 +61,8 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
     for name in ("handover", "grasp", "carry"):
         assert report["events"][name]["reached"]
         assert report["events"][name]["error_mm"] <= 30
-    assert Path(report["rrd"]).stat().st_size > 100_000
+    recorded = [step.tick for step in Recording.open(report["recording"]).steps() if step.frame is not None]
+    assert drawn_ticks(Path(report["rrd"]), "/joints/velocity") == recorded
     replayed = told("replay", "--exact", report["recording"])
     assert replayed.returncode == 0, replayed.stdout
     left = {"joints/command", "tool/target", "frame", "objects"}
@@ -117,7 +119,7 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
     """A person's hands are still there when the bench reports, so the arm still follows them."""
     settings, stop, ends = Settings(rate_hz=100), threading.Event(), list[tuple[str, int]]()
     with (
-        launched(tmp_path, "--joints", "state", settings=settings, record=tmp_path, rerun=False) as service,
+        launched(tmp_path, "--joints", "state", settings=settings, record=tmp_path) as service,
         open_session(connect=[service.endpoint]) as session,
         Tracker(session) as tracker,
     ):
@@ -152,7 +154,7 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
     }
     few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
     figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}
-    files = {"recording": "a.mcap", "rrd": "a.rrd"}
+    files = {"recording": "a.mcap", "rrd": None}
     told = {"success": not any(whys), "events": events, "realtime": True, "missing": missing, "busy": ""}
     return told | figures | files | more
 
@@ -174,7 +176,6 @@ def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | No
     assert (f"The recording is not complete: {missing}." in shown) == bool(missing)
 
 
-FILES = ("recording", "rrd")
 BUSY = "the bench paused for 118 ms"
 HELD = report_of(None, "the arm held", None)
 
@@ -196,21 +197,23 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    made = [report | {name: str(tmp_path / f"{i}.{name}") for name in FILES} for i, report in enumerate(reports)]
+    made = [report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)]
     left = iter(made)
 
     def run(*_: Any, **__: Any) -> dict[str, Any]:
         report = next(left)
-        for name in FILES:
-            Path(report[name]).touch()
+        Path(report["recording"]).touch()
         return report
 
     monkeypatch.setattr("service.cli.demo.run", run)
     assert main(["demo", "--output", str(tmp_path)]) == code
     assert len(reports) - len(list(left)) == runs <= DEMO_ATTEMPTS
-    assert {path.name for path in tmp_path.glob("*.*")} == {f"{runs - 1}.{name}" for name in FILES}
-    assert len(list((tmp_path / TOO_BUSY).glob("*"))) == len(FILES) * (runs - 1)
-    assert capsys.readouterr().err.count(f"{BUSY}: it is tried again") == runs - 1
+    assert [path.name for path in tmp_path.glob("*.*")] == [f"{runs - 1}.mcap"]
+    assert len(list((tmp_path / TOO_BUSY).glob("*"))) == runs - 1
+    said = capsys.readouterr()
+    assert said.err.count(f"{BUSY}: it is tried again") == runs - 1
+    assert said.err.count("there is no drawing: ") == 1  # the recordings are empty
+    assert f"thirdhand view {tmp_path}/{runs - 1}.mcap" in said.out
 
 
 def test_each_cause_of_a_failed_demo_is_printed_once() -> None:

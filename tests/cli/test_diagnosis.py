@@ -200,7 +200,7 @@ def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
         (
             {"scribe": {"state": "recording", "free_mb": 2400.0, "mb_per_hour": 3600.0, "keep_mb_left": 9000.0}},
             "disk",
-            ("2.4 GB free", "3.6 GB an hour written: full in 40 min", "1 h", "rerun_mb_per_hour"),
+            ("2.4 GB free", "3.6 GB an hour written: full in 40 min", "1 h", "keep_mb"),
         ),
     ],
 )

@@ -95,7 +95,7 @@ def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> 
 def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own_arm = template()
     with (
-        launched(tmp_path, record=tmp_path / "records", rerun=False, network=PATIENT) as service,
+        launched(tmp_path, record=tmp_path / "records", network=PATIENT) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         daemon = Daemon(service, session)

@@ -433,7 +433,7 @@ def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path
             folder.mkdir(parents=True)
             network = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\nconnect = [{at}]\n'
             arguments = ("--cell", name, "--joints", "assumed", "--rate", "100")
-            service = closing.enter_context(launched(folder, *arguments, network=network, rerun=False))
+            service = closing.enter_context(launched(folder, *arguments, network=network))
             endpoints_of[name], at = service.endpoint, f'"{service.endpoint}"'
         for endpoint in endpoints_of.values():
             shown = until(

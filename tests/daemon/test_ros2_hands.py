@@ -50,7 +50,6 @@ unit = "mm"
 [arm]
 source = "assumed"
 [files]
-rerun = false
 state = "{{state}}"
 """
 TYPES = get_typestore(Stores.ROS2_JAZZY)

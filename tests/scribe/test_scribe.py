@@ -26,12 +26,12 @@ from service.process import child
 from service.process.child import Child, Progress
 from service.scribe.protocol import pack, unpack
 from service.scribe.scribe import Scribe
-from service.settings.config import Files, RecordingSettings, Settings
+from service.settings.config import RecordingSettings, Settings
 from support.pictures import grey
-from support.recorded import SKILL, at_ns, drawn, state_after, tell, ticks, values
+from support.recorded import SKILL, at_ns, state_after, tell, ticks
 
 WHOLE = RecordingSettings(frames_hz=0)
-SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False), recording=WHOLE)
+SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
 
 
 @contextmanager
@@ -64,7 +64,7 @@ def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
         assert told.skill == (SKILL if every["with_skill"] else None)
 
 
-def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
+def test_what_is_told_is_recorded(tmp_path: Path) -> None:
     settings = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
     with scribe(settings, folder=tmp_path) as one:
         told = tell(one, 200)
@@ -82,10 +82,9 @@ def test_what_is_told_is_recorded_and_drawn(tmp_path: Path) -> None:
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in told]
     assert [step.tick for step in steps if step.state is not None] == [49]  # the next one is due 10 s later
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
-    assert Path(status["rrd"]).stat().st_size > 20_000
 
 
-def test_images_of_a_camera_are_recorded_and_drawn_beside_the_ticks(tmp_path: Path) -> None:
+def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> None:
     with_camera = RecordingSettings(also=("camera/front",))
     settings = Settings(cell="hall/bench-1", rate_hz=50, recording=with_camera)
     images = [CompressedImage(at_ns(i), "lens", "jpeg", grey(40 + i)) for i in range(0, 60, 20)]
@@ -99,15 +98,6 @@ def test_images_of_a_camera_are_recorded_and_drawn_beside_the_ticks(tmp_path: Pa
     recording = Recording.open(status["recording"])
     assert [*recording.images()] == [("camera/front", image, at_ns(40 + i)) for i, image in enumerate(images)]
     assert len(list(recording.steps())) == 201
-    blobs = values(drawn(Path(status["rrd"]))["/cameras/camera/front"], "EncodedImage:blob")
-    assert len(blobs) == 1  # one in two seconds
-    assert bytes(blobs[0][0]) == images[0].data
-
-
-def test_a_cell_may_record_without_a_drawing(tmp_path: Path) -> None:
-    with scribe(folder=tmp_path) as one:
-        tell(one, 20)
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mcap"]
 
 
 def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(tmp_path: Path) -> None:
@@ -309,10 +299,10 @@ def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
 DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
-from service.settings.config import Files, RecordingSettings, Settings
+from service.settings.config import RecordingSettings, Settings
 from service.scribe.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
-one = Scribe(Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False)), folder=Path(sys.argv[1]))
+one = Scribe(Settings(cell="hall/bench-1", rate_hz=50), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))
 assert one.ready(60)
 pid = one.status()["pid"]
@@ -344,14 +334,14 @@ def _is_dead(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
-def test_a_recording_that_cannot_be_written_is_told_and_spares_the_drawing(tmp_path: Path, place: str) -> None:
-    with scribe(recording=Path(place), rrd=tmp_path / "a.rrd") as one:
+def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(tmp_path: Path, place: str) -> None:
+    with scribe(recording=Path(place), live_port=0) as one:
         tell(one, 100)
-        one.close(10)
+        until(lambda: one.supervise() or one.status()["live"] is not None)
         status = one.status()
     assert any(place in error and ("No space left" in error or "File exists" in error) for error in status["errors"])
-    assert (status["recording"], status["rrd"]) == (None, str(tmp_path / "a.rrd"))
-    assert (tmp_path / "a.rrd").stat().st_size > 20_000
+    assert status["recording"] is None
+    assert status["live"].startswith("rerun+http://127.0.0.1:")
 
 
 def test_without_anything_to_write_there_is_no_process_and_nothing_is_lost() -> None:

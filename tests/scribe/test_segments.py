@@ -36,9 +36,9 @@ from support.recorded import SKILL, state_after, ticks, write
 from support.wam import URDF
 
 COUNT = 2100
-SMALL = Files(segment_mb=0.1, rerun=True)
+SMALL = Files(segment_mb=0.1)
 WHOLE = RecordingSettings(frames_hz=0)
-CELL = Settings(cell="hall/bench-1", rate_hz=50, files=Files(rerun=False), recording=WHOLE)
+CELL = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,6 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
 
 def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rotated: list[Path]) -> None:
     assert len(rotated) >= 3
-    assert [path.with_suffix(".rrd").stat().st_size > 10_000 for path in rotated] == [True] * len(rotated)
     steps = [step for path in rotated for step in Recording.open(path).steps()]
     decided = [step for step in steps if step.frame is not None or step.checksum is not None]
     assert [step.tick for step in decided] == list(range(COUNT))
@@ -100,35 +99,29 @@ def with_limits(**limits: float) -> Settings:
 
 def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp_path: Path) -> None:
     settings = with_limits()
-    current, rrd = RecordingPaths(settings, str(tmp_path), None, None).next()
+    current = RecordingPaths(settings, str(tmp_path), None).next()
     assert current is not None
-    assert rrd is not None
     old = [tmp_path / f"hall-bench-1-2026010{day}T000000Z.mcap" for day in (1, 2, 3)]
-    for path in old:
+    for path in (*old, current):
         write(path, 3, settings=settings)
-        path.with_suffix(".rrd").write_bytes(bytes(80_000))
     other = msgspec.structs.replace(CELL, cell="hall-bench/1")
     spared = [tmp_path / name for name in ("hall-bench-1-20260101T000001Z.mcap", "north-20200101T000000Z.mcap")]
     write(spared[0], 3, settings=other)  # a name like ours, of another cell
-    spared += [tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.txt")]
+    spared += [tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.rrd")]
     for path in spared[1:]:
         path.write_bytes(bytes(80_000))
-    write(current, 3, settings=settings)
-    rrd.write_bytes(bytes(100_000))
     size_mb = old[0].stat().st_size / 1e6
-    places = RecordingPaths(with_limits(keep_mb=3.5 * size_mb, rerun_keep_mb=0.2), str(tmp_path), None, None)
-    drawings = [path.with_suffix(".rrd") for path in old]
-    assert places.prune(current) == [old[0], *drawings[:2]]  # 4 recordings for 3.5, 340 kB of drawings for 200
-    assert all(path.exists() for path in [*spared, current, rrd, *old[1:], drawings[2]])
+    places = RecordingPaths(with_limits(keep_mb=3.5 * size_mb), str(tmp_path), None)
+    assert places.prune(current) == [old[0]]  # 4 recordings for 3.5
+    assert all(path.exists() for path in [*spared, current, *old[1:]])
     assert places.prune(current) == []
-    assert places.keep_mb_left == pytest.approx(0.5 * size_mb + 0.02, rel=0.05)
-    for path in (old[1], old[2], drawings[2]):
+    assert places.keep_mb_left == pytest.approx(0.5 * size_mb, rel=0.05)
+    for path in old[1:]:
         os.utime(path, (0, 0))
-    for limits, removed in (({"rerun_keep_hours": 0.3}, [drawings[2]]), ({"keep_hours": 0.3}, [old[1], old[2]])):
-        aged = RecordingPaths(with_limits(**limits), str(tmp_path), None, None)
-        assert aged.prune(current) == removed
-        assert aged.keep_mb_left == pytest.approx(60_000, rel=0.01)
-    unlimited = RecordingPaths(with_limits(rerun_keep_mb=0), str(tmp_path), None, None)
+    aged = RecordingPaths(with_limits(keep_hours=0.3), str(tmp_path), None)
+    assert aged.prune(current) == old[1:]
+    assert aged.keep_mb_left == pytest.approx(50_000, rel=0.01)
+    unlimited = RecordingPaths(with_limits(keep_mb=0), str(tmp_path), None)
     assert unlimited.prune(current) == []
     assert unlimited.keep_mb_left is None
 
@@ -141,19 +134,19 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
 def test_a_clock_that_was_set_makes_no_recording_much_older(
     set_years: int, set_before: int, right_after: int, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A drawing an hour, of which those of a day are kept; the clock was set before the last
+    """A recording an hour, of which those of a day are kept; the clock was set before the last
     `set_before` of them, and right again for the last `right_after`.
     """
-    settings, now_s, set_s = with_limits(rerun_keep_hours=24), 1.8e9, set_years * 365 * 86400
+    settings, now_s, set_s = with_limits(keep_hours=24), 1.8e9, set_years * 365 * 86400
     for hours in range(31):
-        path = tmp_path / f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd"
+        path = tmp_path / f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap"
         path.write_bytes(b"")
         changed_s = now_s - 3600 * hours + set_s * (right_after <= hours < set_before)
         os.utime(path, (changed_s, changed_s))
     monkeypatch.setattr("service.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1)
-    RecordingPaths(settings, str(tmp_path), None, None).prune(None)
+    RecordingPaths(settings, str(tmp_path), None).prune(None)
     left = sorted(path.name for path in tmp_path.iterdir())
-    assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.rrd" for hours in reversed(range(count))]
+    assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap" for hours in reversed(range(count))]
 
 
 class Session:
@@ -196,9 +189,9 @@ def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
 
 def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments, "MIN_GROWTH_S", 0.5)
-    settings = msgspec.structs.replace(CELL, files=Files(rerun=False, segment_mb=0.3))
-    paths = RecordingPaths(settings, str(tmp_path), None, None)
-    one = Segments(settings, paths, say=print, draw=print)
+    settings = msgspec.structs.replace(CELL, files=Files(segment_mb=0.3))
+    paths = RecordingPaths(settings, str(tmp_path), None)
+    one = Segments(settings, paths, say=print)
     one.begin(SKILL, state_after(-1))
     one.flush()
     assert one.mb_per_hour() is None
@@ -245,7 +238,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.thorough
 def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> None:
     ballast = small_disk / "ballast"
-    with session(msgspec.structs.replace(CELL, files=Files(rerun=True)), folder=small_disk) as one:
+    with session(folder=small_disk) as one:
         one.until(lambda status: status["sent"] > 200)
         with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
             while file.write(bytes(4096)):
@@ -268,7 +261,6 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
     result = [Recording.open(path) for path in recordings]
     assert [len(list(r.steps())) > 50 for r in result] == [True, True]
     assert [r.truncated for r in result] == [True, False]
-    assert recordings[1].with_suffix(".rrd").stat().st_size > 10_000
 
 
 @pytest.mark.timed

@@ -76,12 +76,11 @@ def serving(
     folder: Path,
     *arguments: str,
     before: str = "",
-    drawn: bool = False,
     network: str = LISTENING,
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Daemon]:
     """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
-    process runs that Python. What it records is `drawn` only where that is looked at.
+    process runs that Python.
     """
     program = (
         ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
@@ -89,7 +88,7 @@ def serving(
         else ("-m", "service")
     )
     with (
-        launched(folder, *arguments, program=program, rerun=drawn, network=network, say=say) as service,
+        launched(folder, *arguments, program=program, network=network, say=say) as service,
         open_session(connect=[service.endpoint]) as session,
     ):
         yield Daemon(service, session)

@@ -120,6 +120,12 @@ def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
     return rows
 
 
+def drawn_ticks(path: Path, curve: str) -> list[int]:
+    """The ticks of a curve in a Rerun file, in order."""
+    batches = [chunk.to_record_batch() for chunk in rr.chunk.RrdReader(path).stream() if chunk.entity_path == curve]
+    return [tick for rows in batches if "tick" in rows.schema.names for tick in rows["tick"].to_pylist()]
+
+
 def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
     """What of a column was logged, in order."""
     return [row[column] for row in rows if row.get(column) is not None]

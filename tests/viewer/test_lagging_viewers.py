@@ -16,9 +16,11 @@ from urllib.parse import urlsplit
 import pytest
 
 from service.cli.live_page import STREAM
+from service.scribe.process import LiveView
+from service.scribe.protocol import TickMessage
 from service.settings.config import WAM, Settings
 from service.viewer.stream import Viewer, rerun_program
-from support.recorded import at_ns, drawn, ticks, values
+from support.recorded import drawn, ticks, values
 
 pytestmark = pytest.mark.thorough
 
@@ -37,16 +39,21 @@ class Fed:
     """A live view that is fed on and on."""
 
     def __init__(self) -> None:
-        self.viewer, self.last = Viewer(urdf=WAM, settings=Settings(), live_port=0), 0
-        assert self.viewer.url is not None
-        self.url, self._ticks = self.viewer.url, ticks(1_000_000)
+        self.view = LiveView(lambda: Viewer(urdf=WAM, settings=Settings(), live_port=0))
+        self.view.is_paused = False
+        self.last = 0
+        until = time.monotonic() + TIMEOUT_S
+        while self.view.url is None:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        self.url, self._ticks = self.view.url, ticks(1_000_000)
 
     def feed(self, scene_s: float) -> None:
         """Adds so much of the scene [s], in a quarter of the time."""
         began = time.monotonic()
         for k in range(round(scene_s * 500)):
             tick, frame, timing = next(self._ticks)
-            self.viewer.add(frame, at_ns(tick.index), timing)
+            self.view.add(TickMessage(tick, frame, timing, None, None, 0))
             self.last = tick.index
             time.sleep(max(0.0, began + k / 500 / TIMES_REAL - time.monotonic()))
 
@@ -102,5 +109,5 @@ def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_
             fed.feed(4.0)
             with contextlib.suppress(OSError, KeyError, RuntimeError):  # before it has anything, or within a message
                 seen = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
-    fed.viewer.close()
-    assert fed.viewer.problems == []
+    fed.view.close()
+    assert fed.view.problems == []

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,7 +26,6 @@ from service.core.skill.model import REGION_95
 from service.core.skill.pose import CLOSED
 from service.core.skill.skill import Skill
 from service.files.mcap_file import RecordingError
-from service.files.recording import OBJECTS_NOTE
 from service.learning.skill_file import with_file
 from service.settings.config import WAM, Settings, parse
 from service.viewer.banner import banner, headline
@@ -60,51 +58,6 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
     assert work == pytest.approx([timing["work_us"] for *_, timing in told])
 
 
-@pytest.mark.parametrize(("rate_hz", "mb_per_hour"), [(500, 200.0), (1000, 200.0), (500, 100.0)])
-@pytest.mark.one_case
-def test_a_file_with_a_budget_keeps_it_and_every_change_of_mode(
-    tmp_path: Path, rate_hz: int, mb_per_hour: float
-) -> None:
-    """One of 30 s with hands that tremble and objects that move; every tick of it would take more
-    than 1.7 GB an hour.
-    """
-    settings, random = Settings(rate_hz=rate_hz), np.random.default_rng(1)
-    one = Viewer(urdf=WAM, settings=settings, mb_per_hour=mb_per_hour, rrd=tmp_path / "a.rrd")
-    period_ns = 1_000_000_000 // rate_hz
-    (_, frame, timing), *_ = list(ticks(600))[-1:]
-    changes, latest, sizes = [], 0.0, []
-    for i in range(30 * rate_hz):
-        shown, measured = frame.copy(), timing.copy()
-        shown["tick"], measured["tick"] = i, i
-        for name in ("joints", "joint_velocities", "joint_accelerations", "hands", "target", "tool", "setpoint"):
-            shown[name] += random.normal(0, 0.002, shown[name].shape)
-        if i % 7001 == 6000:  # for one tick
-            shown["mode"], shown["reason"] = Mode.HOLD, Reason.OPERATOR
-            changes.append(i)
-        measured["lateness_us"] = latest = 5000.0 if i == 8003 else 40.0
-        if i % (rate_hz // 25) == 0:
-            where, look = (0.5, 0.1, 1e-5 * i), ((0.0, 0.0, 0.0, 1.0), (0.08, 0.05, 0.002), (0.0, 0.5, 0.0, 1.0))
-            things = [SceneObject(name, "box", "base", where, *look) for name in ("board", "glass", "iron")]
-            one.note(OBJECTS_NOTE, msgspec.json.encode(things).decode(), i * period_ns)
-        one.add(shown, i * period_ns, measured)
-        if i % (10 * rate_hz) == 10 * rate_hz - 1:
-            one.flush()
-            sizes.append((tmp_path / "a.rrd").stat().st_size)
-    one.close()
-    assert latest == 40.0
-    assert one.problems == []
-    begins, grows = sizes[0] / 1e6, (sizes[2] - sizes[1]) / 1e6
-    assert 6 * begins + 360 * grows < mb_per_hour  # an hour of files of ten minutes
-    assert 360 * grows > 0.5 * mb_per_hour  # and it is made use of
-    rows = drawn(tmp_path / "a.rrd")
-    at = [row["tick"] for row in rows["/joints/position"] if "tick" in row]
-    assert {*changes, *(i + 1 for i in changes)} <= set(at)
-    assert sum(tick >= 20 * rate_hz for tick in at) > 10 * 5 * mb_per_hour / 100  # in the last 10 s
-    late = {row["tick"]: row["Scalars:scalars"][0] for row in rows["/timing/lateness"] if "tick" in row}
-    (peak,) = [tick for tick, value in late.items() if value > 4000]
-    assert 8003 <= peak < 8003 + rate_hz
-
-
 def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     told = list(ticks(600))
@@ -112,7 +65,6 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
         one.add(frame, at_ns(tick.index), timing)
     one.log("handover taught", "INFO", at_ns(300))
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     at = {path: [row["tick"] for row in found if row.get("tick") is not None] for path, found in rows.items()}
     every = list(range(0, 600, 5))
@@ -154,7 +106,7 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
 
 def test_a_live_viewer_gets_the_mode_again_while_a_clock_that_was_set_back_catches_up() -> None:
     """The times of its frames grow by a microsecond a tick."""
-    scene = DynamicScene(ArmModels(WAM, Settings()), Settings(), live=True)
+    scene = DynamicScene(ArmModels(WAM, Settings()), Settings(), start_ns=at_ns(0))
     shown = [DrawnFrame(frame, at_ns(0) + 1000 * k, timing, None) for k, (_, frame, timing) in enumerate(ticks(1200))]
     batches = [[chunk.entity_path for chunk in scene.chunks(shown[k : k + 100])] for k in range(0, 1200, 100)]
     assert sum("/mode" in paths for paths in batches) >= 1200 // Settings().ticks_in(REPEAT_S)
@@ -186,7 +138,6 @@ def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path
         frame["tool"] += [0.02, 0.0, 0.0]
         one.add(frame, at_ns(tick.index), timing)
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     followed = list(range(10, 200))
     assert values(rows["/scene/target"], "tick") == followed[::5]
@@ -205,7 +156,6 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
         told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
         one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told)), ("hold", b"")])
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
     assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
@@ -220,7 +170,6 @@ def test_an_arm_that_slides_is_drawn_in_metres_where_it_is(tmp_path: Path) -> No
         told = JointState(at_ns(tick.index), cell.joints.names, tuple(frame["joints"] + 0.02), ())
         one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     (names,) = values(rows["/joints/velocity"], "SeriesLines:names")
     assert (names[0], names[1]) == ("rail [m/s]", "shoulder pan [rad/s]")
@@ -243,7 +192,6 @@ def test_turns_of_a_continuous_joint_are_no_error(tmp_path: Path) -> None:
         told = JointState(at_ns(tick.index), cell.joints.names, tuple(position), ())
         one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
     one.close()
-    assert one.problems == []
     found = values(drawn(tmp_path / "a.rrd")["/joints/error"], "Scalars:scalars")
     assert np.ravel(found) == pytest.approx(np.full(100, 0.02))
 
@@ -256,7 +204,6 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
             frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
         )
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     for number in range(len(JOINT_NAMES)):
         first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
@@ -277,7 +224,6 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     for tick, frame, timing in told[20:]:
         one.add(frame, at_ns(tick.index), timing)
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
     assert len(lines) >= 5
@@ -303,7 +249,6 @@ def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Pat
             frame["tool_orientation"] = (Rotation.from_quat(frame["orientation"]) * turned).as_quat()
         one.add(frame, at_ns(tick.index), timing)
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     told = {
         path: np.ravel(values(rows[path], "Scalars:scalars")) for path in rows if path.startswith(("/turn", "/grip"))
@@ -319,7 +264,6 @@ def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_th
     for tick, frame, timing in ticks(30):
         one.add(frame, at_ns(tick.index), timing)
     one.close()
-    assert one.problems == []
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/joints/position"], "tick")) == 30
     assert any(text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT))
@@ -387,37 +331,14 @@ def test_missed_deadlines_stand_in_the_log(tmp_path: Path) -> None:
     assert "3 deadlines missed before tick 19" in [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"]]
 
 
-def test_a_destination_that_fails_is_named_and_spares_the_other(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        one = viewer(rrd=tmp_path / "a.rrd", live_port=port)
-        assert one.url is None
-        assert one.problems == [
-            f"the live view ended: port {port} on 127.0.0.1: Address already in use; choose another, or 0 for any"
-        ]
-        for tick, frame, timing in ticks(30):
-            one.add(frame, at_ns(tick.index), timing)
-        one.close()
-    assert len(one.problems) == 1
-    assert len(drawn(tmp_path / "a.rrd")["/joints/position"]) == 31
-
-
 def test_a_full_disk_is_told(tmp_path: Path) -> None:
-    one = viewer(rrd=Path("/dev/full"))
-    for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    assert any("/dev/full" in problem and "No space left" in problem for problem in one.problems)
     write(tmp_path / "a.mcap", 20)
-    with pytest.raises(ViewerError, match="No space left"):
+    with pytest.raises(ViewerError, match=r"/dev/full.*No space left"):
         convert(tmp_path / "a.mcap", "/dev/full")
 
 
 def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
     one = viewer(live_port=0)
-    assert one.problems == []
     assert one.url is not None
     port = int(one.url.rsplit(":", 1)[1].split("/")[0])
     for tick, frame, timing in ticks(300):
@@ -427,7 +348,6 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
     with pytest.raises(OSError, match="refused"), socket.create_connection(("127.0.0.2", port), timeout=5):
         pass
     one.close()
-    assert one.problems == []
 
 
 @pytest.mark.parametrize(("curves_mm", "is_shown"), [(30.0, True), (200.0, True), (20.0, False)])

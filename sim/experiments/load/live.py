@@ -41,7 +41,7 @@ def steady_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool 
 def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = False) -> RunReport:
     """The bench's report of one scene through a service of its own. Raises LaunchError.
 
-    With `record` its recording and Rerun file go into `folder`. If not `taught`, the skill is as it
+    With `record` its recording goes into `folder`. If not `taught`, the skill is as it
     was learned.
     """
     folder.mkdir(parents=True, exist_ok=True)
