@@ -22,8 +22,9 @@ from support.in_process import Loop
 
 LED, NOT_LED = (Event("joints/guided", cdr.encode_bool(led), led) for led in (True, False))
 BY_HAND = "by hand"
-ORDERS = st.tuples(st.sampled_from(("hold", "resume")), st.sampled_from(("", "a", "b")), st.booleans())
-TICKS = st.lists(st.tuples(st.lists(ORDERS, max_size=3), st.sampled_from((LED, NOT_LED)), st.booleans()), max_size=12)
+RARELY = st.sampled_from((*6 * (False,), True))
+ORDERS = st.tuples(st.sampled_from(("hold", "resume")), st.sampled_from(("", "a", "b", "a", "b")), RARELY)
+TICKS = st.lists(st.tuples(st.lists(ORDERS, max_size=2), RARELY, RARELY), min_size=15, max_size=30)
 
 
 class Cell(Loop):
@@ -70,15 +71,15 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(request_inbox, "ADOPTION_TIMEOUT_S", 0.0)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(ticks=TICKS)
 def test_a_resume_ends_what_it_may_end_and_a_hold_is_obeyed(
-    opened: Callable[[], Cell], ticks: list[tuple[list[tuple[str, str, bool]], Event, bool]]
+    opened: Callable[[], Cell], ticks: list[tuple[list[tuple[str, str, bool]], bool, bool]]
 ) -> None:
     cell = opened()
     holders: set[str] = set()  # as the core took them
     is_led = has_failed = False
-    for orders, guiding, fails in ticks:
+    for orders, leads, fails in ticks:
         requests = []
         for kind, by, is_withdrawn in orders:
             pending = cell.inbox.order(kind, by)
@@ -86,7 +87,7 @@ def test_a_resume_ends_what_it_may_end_and_a_hold_is_obeyed(
                 assert "did not take" in refusal(pending)
             else:
                 requests.append((kind, by, pending))
-        cell.tick(guiding, fails=fails)
+        cell.tick(LED if leads else NOT_LED, fails=fails)
         for kind, by, pending in requests:
             is_refused = bool(refusal(pending))
             if fails:
@@ -97,25 +98,33 @@ def test_a_resume_ends_what_it_may_end_and_a_hold_is_obeyed(
                 may_end = not is_led and (not by or holders == {by})
                 assert is_refused != may_end or (is_refused and has_failed)
                 holders = holders if is_refused else set()
-        has_failed = fails or (has_failed and bool(holders))
+        has_failed = (has_failed or fails) and bool(holders)  # what that tick did is unknown
         if not fails:
-            is_led = guiding is LED
+            is_led = leads
             holders |= {BY_HAND} if is_led else set()
         assert cell.is_held == bool(holders)
+
+
+def test_a_request_that_no_tick_completed_changes_no_name(opened: Callable[[], Cell]) -> None:
+    cell = opened()
+    cell.ask("hold", "alice")
+    assert "did not take" in refusal(cell.inbox.order("hold", "bob"))
+    assert not cell.ask("resume", "alice")
+    cell.ask("hold", "alice")
+    cell.inbox.order("resume", "alice")
+    cell.tick(fails=True)
+    cell.ask("hold", "bob")
+    assert "somebody else holds the arm too" in cell.ask("resume", "bob")
 
 
 def test_the_name_beyond_the_last_is_refused_and_its_hold_obeyed(opened: Callable[[], Cell]) -> None:
     cell = opened()
     assert not any(cell.ask("hold", by) for by in ("", *map(str, range(MAX_HOLDERS)), "0"))
     assert "'64' given, but 64 others hold the arm; it holds until a resume without" in cell.ask("hold", "64")
+    assert cell.steps[-1][0].inbox[-1].kind == "hold"
     assert "'64' does not hold the arm" in cell.ask("resume", "64")
     assert not cell.ask("resume")
-    holds = [cell.inbox.order("hold", str(number)) for number in range(MAX_HOLDERS + 1)]
-    resume = cell.inbox.order("resume")
-    beyond = cell.inbox.order("hold", "0")
-    cell.tick()
-    assert [bool(refusal(pending)) for pending in (*holds, resume, beyond)] == [False] * 64 + [True, False, False]
-    assert cell.is_held
+    assert not cell.is_held
 
 
 def test_no_resume_ends_the_hold_of_one_who_leads_the_arm(opened: Callable[[], Cell]) -> None:

@@ -228,6 +228,7 @@ def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
     cell.client.ask("hold")  # taken after whatever else waits
     assert cell.kinds() == ["hold"]
     assert cell.names() == []
+    assert [point.name for point in cell.client.add(PLACES[:1]).points or ()] == [HANDOVER.name]
 
 
 @pytest.mark.parametrize(
