@@ -54,7 +54,8 @@ class Client:
 
     def resume(self, by: str = "") -> Reply:
         """End an operator's hold; returns once that is in force. Without a name, it ends the holds
-        of all; with a name, it is refused while anybody else holds.
+        of all; with a name, it is refused while anybody else holds. Refused while the arm is led by
+        hand.
         """
         return self._typed("resume", {"by": by} if by else None, Reply)
 

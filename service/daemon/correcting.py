@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.contract.records import Mode
 from service.contract.requests import Correct, Orientation, RequestError, ViaPoint
 from service.core.arm.stage import Arm
-from service.core.codes import HELD_SEEN
+from service.core.codes import FAULT, HELD_SEEN, HOLD
 from service.core.frame import Frame, Record, Vector
 from service.core.geometry import quaternion_of
 from service.core.skill.skill import Skill
-from service.daemon.status import MAX_MEASURED_AGE_S, outcome
+from service.daemon.status import MAX_MEASURED_AGE_S
 from service.settings.config import Settings, robot_description
 
 MAX_LED_RADPS = 0.05  # an arm that moves faster than this is still being led
@@ -23,11 +22,30 @@ HOLD_ENDED = "the hold ended while this was computed; nothing was changed. Hold 
 Moment = tuple[Frame, Record]
 
 
+def held_since(state: Record) -> int:
+    """The tick at which the operator's hold began. Raises RequestError if there is none."""
+    mode = int(state["mode"])
+    if mode == FAULT:
+        raise RequestError("the arm is in a fault; `thirdhand reset` and `thirdhand hold` first")
+    if mode != HOLD or not state["operator_hold"]:
+        raise RequestError(NOT_HELD)
+    return int(state["held_tick"])
+
+
+def check_same_hold(held_tick: int, state: Record) -> None:
+    """Raise RequestError unless the operator's hold that began at this tick lasts. The tool then
+    approaches a corrected target at the engaging speed.
+    """
+    if state["mode"] != HOLD or not state["operator_hold"] or state["held_tick"] != held_tick:
+        raise RequestError(HOLD_ENDED)
+
+
 class LedTool(NamedTuple):
     """The hands (6,) [m] and the stage (-1: none) that a correction belongs to, the tool (3,) [m]
-    with its orientation, and the arm's joints (J,) [rad] now.
+    with its orientation, and the arm's joints (J,) [rad] now, in the hold since `held_tick`.
     """
 
+    held_tick: int
     hands: Vector
     stage: int
     tool: Vector
@@ -36,22 +54,24 @@ class LedTool(NamedTuple):
 
 
 class Corrections:
-    """The corrections of one cell since its daemon began, and the via-points that each replaced."""
+    """The corrections of one cell since its daemon began. `replaced` are the via-points that each
+    correction replaced.
+    """
 
     def __init__(self, settings: Settings, moment: Callable[[], Moment]) -> None:
         """`moment` gives the newest frame, and the state after it."""
         self._settings, self._moment = settings, moment
         self._arm: Arm | None = None
-        self._replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
+        self.replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
 
     def led(self, request: Correct, skill: Skill) -> LedTool:
         """The hands and the tool of a correction that is requested now. Raises RequestError."""
         frame, state = self._moment()
-        self.check_held()
+        held_tick = held_since(state)
         hands, stage = self._hands(request, skill, frame, state)
         joints = np.array(state["joints"][0])
         if request.tool is not None:
-            return LedTool(hands, stage, np.array(request.tool), None, joints)
+            return LedTool(held_tick, hands, stage, np.array(request.tool), None, joints)
         settings = self._settings
         if settings.arm.source == "assumed":
             raise RequestError("$.tool: none given; needed, as this daemon does not measure where the arm is")
@@ -70,16 +90,7 @@ class Corrections:
         quaternion_of(here.rotation, quaternion)
         x, y, z, w = (round(value, 6) for value in quaternion.tolist())
         orientation = (x, y, z, w) if request.turned else None
-        return LedTool(hands, stage, np.array(here.position), orientation, np.array(state["measured"]))
-
-    def check_held(self) -> None:
-        """Raise RequestError unless the arm holds for an operator."""
-        frame, state = self._moment()
-        mode, _ = outcome(frame)
-        if mode is Mode.FAULT:
-            raise RequestError("the arm is in a fault; `thirdhand reset` and `thirdhand hold` first")
-        if mode is not Mode.HOLD or not state["operator_hold"]:
-            raise RequestError(NOT_HELD)
+        return LedTool(held_tick, hands, stage, np.array(here.position), orientation, np.array(state["measured"]))
 
     def _hands(self, request: Correct, skill: Skill, frame: Frame, state: Record) -> tuple[Vector, int]:
         """The hands (6,) [m] and the stage of a correction. Raises RequestError."""
@@ -102,11 +113,3 @@ class Corrections:
                 "the stage of the task was not known; name it by `thirdhand stage NAME`, then hold again"
             )
         return hands.reshape(6), stage if skill.model.names else -1
-
-    def made(self, point: ViaPoint, replaced: tuple[ViaPoint, ...]) -> None:
-        """Note a correction that is in force, and the via-points that it replaced."""
-        self._replaced[point] = replaced
-
-    def replaced_by(self, point: ViaPoint) -> tuple[ViaPoint, ...]:
-        """The via-points that a correction replaced, as far as this daemon knows."""
-        return self._replaced.get(point, ())

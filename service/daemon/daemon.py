@@ -95,8 +95,6 @@ class Daemon:
         hold: bool = False,
     ) -> None:
         skill = stored.for_loop()
-        # Files by digest, of the skill in force and of one that the loop adopts next.
-        self._files: dict[bytes, bytes] = {stored.digest: stored.file}
         self._settings = settings
         self._scribe = scribe
         self._stop = threading.Event()
@@ -140,14 +138,13 @@ class Daemon:
             skill_worker=skill_worker,
             skills=skills,
             status=self._status.requested,
-            frame=lambda: self._frame,
             moment=self._moment,
             note=self.note,
             keep=scribe.keep,
             failed=self._fail,
         )
         if hold:
-            self._queryables.begin_in_hold()
+            self._queryables.inbox.order("hold")  # until an operator's `resume`
 
     def stop(self, *_: Any) -> None:
         """Request the loop to stop the arm and end. Safe in a signal handler."""
@@ -216,6 +213,7 @@ class Daemon:
         failure.
         """
         self._scribe.skip()
+        self._queryables.inbox.answer(None)
         tick = int(self._frame["tick"])
         if tick == self._failed_at:
             raise LoopError(f"{what}, and again in the next tick: the arm gets no more commands")
@@ -228,7 +226,7 @@ class Daemon:
         run(self._controller, self._ticks(), (self._publish, self._record), self._lap)
 
     def _ticks(self) -> Iterator[Tick]:
-        inbox: list[Event] = []
+        requests = self._queryables.inbox
         stop_by: float | None = None
         # A period of 1 ms has no time to prepare the next tick.
         prepare = self._warm_up if self._clock.period_ns >= 3 * PREPARE_NS else None
@@ -237,14 +235,6 @@ class Daemon:
             self._newest = index
             self._began_ns = time.perf_counter_ns()
             self._laps = []
-            inbox = self._streams.receive()
-            while self._queryables.inbox:
-                if (event := self._queryables.inbox.popleft().claimed(index)) is not None:
-                    inbox.append(event)
-                    if event.kind == "skill":
-                        self._files = {self._controller.skill.digest: self._file, event.value.digest: event.payload}
-            while self._own:
-                inbox.append(self._own.popleft())
             if self._stop.is_set():
                 if stop_by is None:
                     stop_by = time.monotonic() + REST_TIMEOUT_S
@@ -253,8 +243,15 @@ class Daemon:
                 elif time.monotonic() > stop_by:
                     log.error("the arm did not come to rest within %g s; it gets no more commands", REST_TIMEOUT_S)
                     return
+            inbox = self._streams.receive()
+            if requests:
+                inbox += requests.take(self._controller.state)
+            while self._own:
+                inbox.append(self._own.popleft())
+            if stop_by is not None:
                 inbox.append(order("hold"))  # last, so that no other request overrides it
             yield Tick(index, tuple(inbox))
+            requests.answer(self._frame)  # the frame of this tick
 
     def _warm_up(self) -> None:
         """Run a copy of the controller on a likely next tick, from received to published bytes, so
@@ -305,7 +302,7 @@ class Daemon:
     @property
     def _file(self) -> bytes:
         """The file of the skill in force."""
-        return self._files[self._controller.skill.digest]
+        return self._queryables.file(self._controller.skill.digest)
 
     # --- beside the loop ---
 
@@ -332,13 +329,15 @@ class Daemon:
         while not self._ended.is_set():
             self._status.wait(due_s - time.monotonic())
             is_due, is_published = time.monotonic() >= due_s, self._status.begin()
+            skill = self._controller.skill
             status = self._status_now()
             self._clock.between_ticks()
             payload, errors = encode_json(status), list(status.scribe["errors"])
             if is_due or is_published:
                 self._streams.publish("status", payload)
             try:
-                self._saved_stage.keep(self._controller.skill, status.stage, status.stage_belief)
+                if self._controller.skill is skill:  # else the stage may be that of either
+                    self._saved_stage.keep(skill, status.stage, status.stage_belief)
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             if status.certificate_days is not None and status.certificate_days < RENEW_DAYS:

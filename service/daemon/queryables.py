@@ -5,10 +5,7 @@ from __future__ import annotations
 import functools
 import queue
 import threading
-import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
@@ -18,6 +15,7 @@ import zenoh
 
 from service.client import ENCODINGS
 from service.contract import channels
+from service.contract.explain import in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.contract.requests import (
@@ -40,7 +38,8 @@ from service.contract.requests import (
 from service.core.frame import Event, Frame, order
 from service.daemon import supervised_thread
 from service.daemon.clock import run_beside_real_time
-from service.daemon.correcting import HOLD_ENDED, Corrections, Moment
+from service.daemon.correcting import Corrections, Moment, check_same_hold, held_since
+from service.daemon.request_inbox import ADOPTION_TIMEOUT_S, Check, RequestInbox, accept
 from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker, has_posture_of
 from service.daemon.status import outcome
@@ -58,8 +57,6 @@ from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import in_force, points_made_of, warnings_of
 from service.settings.config import Settings
 
-ADOPTION_TIMEOUT_S = 2.0  # the loop must take an event within this time
-TICK_POLL_S = 0.001
 MAX_TAUGHT_POINTS = 400  # limit of via-points that are not the task's, with the points of their neighbourhoods
 MAX_WAITING_REQUESTS = 16
 MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
@@ -70,48 +67,14 @@ TOGETHER = (*ORDER_KEYS, "status")  # all waiting requests on one of these keys 
 COMPUTED = "teaching"  # name of the queue of requests for which the skill worker computes
 
 
-Order = Callable[[str, str], Reply | RequestError]  # executes hold, resume or reset, for the one who holds
+Received = tuple[str, zenoh.Query, int]  # a key, the query on it, the number of holds that were received until then
+Order = Callable[[str, str], Reply | RequestError]  # executes hold, resume or reset, by the one of a name
 
 
 class Requested(Protocol):
     """A function that makes a status newer than its call, and publishes it if `published`."""
 
     def __call__(self, *, published: bool) -> bytes: ...
-
-
-class PendingEvent:
-    """An event that waits for the loop, and the tick that took it.
-
-    Either the loop takes the event or the requesting thread withdraws it, never both. The loop
-    refuses it if `condition` does not hold any more.
-    """
-
-    def __init__(self, event: Event, condition: Callable[[], bool] = lambda: True) -> None:
-        self._event, self._condition = event, condition
-        self._tick: Future[int] = Future()
-
-    def claimed(self, tick: int) -> Event | None:
-        """The event, taken by this tick; None if it was withdrawn or refused. For the loop."""
-        if not self._tick.set_running_or_notify_cancel():
-            return None
-        if not self._condition():
-            self._tick.set_exception(RequestError(HOLD_ENDED))
-            return None
-        self._tick.set_result(tick)
-        return self._event
-
-    def wait(self) -> int:
-        """The tick that took the event. If none does in time, withdraw it and raise
-        RequestError.
-        """
-        try:
-            return self._tick.result(ADOPTION_TIMEOUT_S)
-        except TimeoutError:
-            if self._tick.cancel():
-                raise RequestError(
-                    "the loop did not take the request: it is starting, ending or stalled; try again"
-                ) from None
-            return self._tick.result()
 
 
 class RequestQueue:
@@ -121,21 +84,20 @@ class RequestQueue:
     one.
     """
 
-    def __init__(
-        self, name: str, answer: Callable[[list[tuple[str, zenoh.Query]]], None], failed: Callable[[str], None]
-    ) -> None:
+    def __init__(self, name: str, answer: Callable[[list[Received]], None], failed: Callable[[str], None]) -> None:
         self._name, self._answer = name, answer
         self._most, self._together = (
             (MAX_WAITING_ORDERS, MAX_WAITING_ORDERS) if name in TOGETHER else (MAX_WAITING_REQUESTS, 1)
         )
-        self._waiting: queue.Queue[tuple[str, zenoh.Query] | None] = queue.Queue(self._most)
+        self._waiting: queue.Queue[Received | None] = queue.Queue(self._most)
         self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
 
-    def enqueue(self, suffix: str, query: zenoh.Query) -> None:
+    def enqueue(self, request: Received) -> None:
         """Add a request, or refuse it if the queue is full. Never waits."""
         try:
-            self._waiting.put_nowait((suffix, query))
+            self._waiting.put_nowait(request)
         except queue.Full:
+            _, query, _ = request
             with query:
                 refusal = f"busy: {self._most} {self._name} requests are waiting; try again later"
                 query.reply_err(refusal.encode(), encoding=TEXT)
@@ -173,21 +135,19 @@ class Queryables:
         skill_worker: SkillWorker,
         skills: Path,
         status: Requested,
-        frame: Callable[[], Frame],
         moment: Callable[[], Moment],
         note: Callable[[str], None],
         keep: Callable[[bytes], object],
         failed: Callable[[str], None],
     ) -> None:
-        self.inbox: deque[PendingEvent] = deque()
-        self._held_by: set[str] = set()  # names of those whose hold is in force; empty for one without a name
-        self._ordering = threading.Lock()  # each of hold and resume has its own thread
+        self.inbox = RequestInbox()
         self._settings = settings
-        self._skill, self._in_force = skill, in_force(skill)
+        # The skill in force and one that the loop adopts next, each with its via-points, by digest.
+        self._adoptable = {skill.digest: (skill, in_force(skill))}
         self._skill_worker, self._beyond_m = skill_worker, functools.partial(skill_worker.compute, beyond_m)
         self._skills = skills
         self._status = status
-        self._frame = frame
+        self._moment = moment
         self._corrections = Corrections(settings, moment)
         self._note = note
         self._keep = keep
@@ -208,10 +168,12 @@ class Queryables:
                 if not hasattr(local, "is_prioritised"):
                     local.is_prioritised = True
                     run_beside_real_time()
+                self.inbox.holds_received += suffix == "hold"
+                request = suffix, query, self.inbox.holds_received
                 if self._is_list(suffix, query):
-                    self._reply(suffix, query, self._order, self._status)
+                    self._reply_together([request])
                 else:
-                    self._queues[suffix if suffix in TOGETHER else COMPUTED].enqueue(suffix, query)
+                    self._queues[suffix if suffix in TOGETHER else COMPUTED].enqueue(request)
             except Exception as error:
                 self._failed(f"receiving {suffix} requests failed: {error!r}")
 
@@ -233,11 +195,13 @@ class Queryables:
         except RequestError:
             return False
 
-    def _reply_together(self, requests: Sequence[tuple[str, zenoh.Query]]) -> None:
+    def _reply_together(self, requests: Sequence[Received]) -> None:
         """Reply to requests that wait together; equal orders pass through the loop once."""
         order_once, status_once = functools.cache(self._order), functools.cache(self._status)
-        for suffix, query in requests:
-            self._reply(suffix, query, order_once, status_once)
+        for suffix, query, holds in requests:
+            # Resumes that a hold separates are different orders.
+            order = functools.partial(order_once, holds if suffix == "resume" else 0)
+            self._reply(suffix, query, order, status_once)
 
     def _reply(self, suffix: str, query: zenoh.Query, order: Order, status: Requested) -> None:
         key = channels.key(self._settings.cell, suffix)
@@ -273,7 +237,8 @@ class Queryables:
             case StageRequest(name):
                 return self._set_stage(name)
             case List():
-                return Reply(int(self._frame()["tick"]), self._in_force)
+                frame, state = self._moment()
+                return Reply(int(frame["tick"]), self._adoptable[state["skill"].tobytes()][1])
             case Add() | Remove() | Clear():
                 return self._teach(request)
             case Correct():
@@ -286,69 +251,42 @@ class Queryables:
                 return reply
         raise RequestError(f"requests on {suffix} are not supported")
 
-    def _order(self, suffix: str, by: str = "") -> Reply | RequestError:
+    def _order(self, holds: int, suffix: str, by: str) -> Reply | RequestError:
         """The reply to hold, resume or reset with the resulting mode, or the error."""
-        before, _ = outcome(self._frame())
+        pending = self.inbox.order(suffix, by, holds)
         try:
-            tick = self._taken(self._ordered(suffix, by))
+            frame = pending.wait()
         except RequestError as error:
             return error
-        mode, reason = outcome(self._frame())
+        reply = _in_force_since(frame)
         note = ""
-        if suffix == "reset" and before is not Mode.FAULT:
+        if suffix == "reset" and pending.mode_before is not Mode.FAULT:
             note = "there was no fault: nothing was reset"
-        elif suffix == "resume" and before is Mode.FOLLOW:
+        elif suffix == "resume" and pending.mode_before is Mode.FOLLOW:
             note = "there was no hold to end"
-        elif suffix == "resume" and mode is Mode.FAULT:
+        elif suffix == "resume" and reply.mode == word(Mode.FAULT):
             note = "resume does not end a fault, reset does"
-        return Reply(tick, mode=word(mode), reason=word(reason), note=note)
+        return msgspec.structs.replace(reply, note=note)
 
     def _set_stage(self, name: str) -> Reply:
         if name not in (names := self._skill.model.names):
             known = ", ".join(names) or "none, as the skill was not learned between via-points"
             raise RequestError(f"$.name: no via-point {name!r} of the task. There are: {known}")
-        tick = self._through_the_loop(order("stage", name))
-        mode, reason = outcome(self._frame())
-        return Reply(tick, mode=word(mode), reason=word(reason))
+        return _in_force_since(self.inbox.send(order("stage", name)).wait())
 
-    def begin_in_hold(self) -> None:
-        """Hold from the first tick on, until an operator's `resume`."""
-        self._ordered("hold", "")
+    @property
+    def _skill(self) -> StoredSkill:
+        """The skill in force, which is that of the loop's state."""
+        return self._adoptable[self._moment()[1]["skill"].tobytes()][0]
 
-    def _ordered(self, suffix: str, by: str) -> PendingEvent:
-        """The event of an order, on its way to the loop. Raises RequestError for the resume of one
-        who holds while others hold too.
-        """
-        pending = PendingEvent(order(suffix))
-        with self._ordering:  # so that no hold arrives between the check and the event
-            if suffix == "hold":
-                self._held_by.add(by)
-            elif suffix == "resume":
-                if by and self._held_by != {by}:
-                    who = "somebody else holds the arm too" if by in self._held_by else f"{by!r} does not hold the arm"
-                    raise RequestError(f"$.by: {who}; a resume without `by` needed, which ends all holds")
-                self._held_by.clear()
-            self.inbox.append(pending)
-        return pending
-
-    def _through_the_loop(self, event: Event, condition: Callable[[], bool] = lambda: True) -> int:
-        """Send an event through the loop; returns the tick that took it, after its frame."""
-        pending = PendingEvent(event, condition)
-        self.inbox.append(pending)
-        return self._taken(pending)
-
-    def _taken(self, pending: PendingEvent) -> int:
-        """The tick that took an event, after its frame."""
-        tick, end = pending.wait(), time.monotonic() + ADOPTION_TIMEOUT_S
-        while int(self._frame()["tick"]) < tick and time.monotonic() < end:
-            time.sleep(TICK_POLL_S)
-        return tick
+    def file(self, digest: bytes) -> bytes:
+        """The file of the skill in force, which has this digest."""
+        return self._adoptable[digest][0].file
 
     def _adopt(
-        self, skill: StoredSkill, *, is_loaded: bool = False, remark: str = "", is_corrected: bool = False
+        self, skill: StoredSkill, *events: Event, check: Check = accept, is_loaded: bool = False, remark: str = ""
     ) -> Reply:
-        """Have the loop adopt a skill, and save its via-points. One that `is_corrected` is adopted
-        only while the arm holds, so that the tool then approaches its target at the engaging speed.
+        """Have the loop adopt a skill and take `events` in one tick, and save its via-points.
 
         Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
         """
@@ -357,16 +295,21 @@ class Queryables:
         if is_loaded and found.is_refused:
             raise RequestError(found.text)
         self._keep(skill.file)
+        before = self._skill
+        points = in_force(skill)
+        self._adoptable = {before.digest: self._adoptable[before.digest], skill.digest: (skill, points)}
         draft = self._saved.draft(skill)  # written first, because via-points that cannot be saved are not adopted
         try:
-            event, holds = Event("skill", skill.file, skill.for_loop()), lambda: outcome(self._frame())[0] is Mode.HOLD
-            tick = self._through_the_loop(event, holds if is_corrected else lambda: True)
+            adoption = Event("skill", skill.file, skill.for_loop())
+            frame = self.inbox.send(adoption, *events, check=check).wait()
             draft.replace(self._saved.path(skill))
+        except OSError as error:  # the skill is in force already
+            remark = f"{remark} the via-points end at a restart: they cannot be saved ({in_words(error)})".strip()
         finally:
             draft.unlink(missing_ok=True)
-        before, self._skill, self._in_force = self._skill, skill, in_force(skill)
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
-        return Reply(tick, self._in_force, (*filter(None, (remark, risk, found.text)), *warnings_of(before, skill)))
+        remarks = filter(None, (remark, risk, found.text))
+        return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
@@ -428,21 +371,23 @@ class Queryables:
                 "of things and of itself"
             )
         after, effect = self._skill_worker.correct(skill, correcting.among(skill.via_points), point)
-        reply = self._adopt(after, is_corrected=True)
-        self._corrections.made(point, correcting.replaced)
-        if request.hands == "held" and led.stage >= 0:  # a hand that led the arm may have looked like another stage
-            self._through_the_loop(order("stage", skill.model.names[led.stage]))
+        # A hand that led the arm may have looked like another stage.
+        has_stage = request.hands == "held" and led.stage >= 0
+        stages = [order("stage", skill.model.names[led.stage])] if has_stage else []
+        reply = self._adopt(after, *stages, check=functools.partial(check_same_hold, led.held_tick))
+        self._corrections.replaced[point] = correcting.replaced
         return self._of_correction(reply, point, effect, undone=False)
 
     def _undo_correction(self) -> Reply:
         """Undo the last correction, with what it replaced."""
-        self._corrections.check_held()
+        held_tick = held_since(self._moment()[1])
         if (point := newest_correction(self._skill.via_points)) is None:
             raise RequestError("no correction is in force")
         kept = tuple(one for one in self._skill.via_points if one != point)
-        points = (*kept, *self._corrections.replaced_by(point))
+        points = (*kept, *self._corrections.replaced.get(point, ()))
         after, effect = self._skill_worker.correct(self._skill, points, point)
-        return self._of_correction(self._adopt(after, is_corrected=True), point, effect, undone=True)
+        reply = self._adopt(after, check=functools.partial(check_same_hold, held_tick))
+        return self._of_correction(reply, point, effect, undone=True)
 
     def _of_correction(self, reply: Reply, point: ViaPoint, effect: Effect, *, undone: bool) -> Reply:
         stage, sizes = stage_of(self._skill, point), (round(effect.moved_m, 4), round(effect.reach_m, 3))
@@ -472,3 +417,9 @@ class Queryables:
                 raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")
             if distance_m > 0.0:
                 raise RequestError(f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")
+
+
+def _in_force_since(frame: Frame) -> Reply:
+    """The reply with the tick, mode and reason of a frame."""
+    mode, reason = outcome(frame)
+    return Reply(int(frame["tick"]), mode=word(mode), reason=word(reason))

@@ -20,7 +20,7 @@ class SavedStage:
 
     def __init__(self, settings: Settings) -> None:
         self._path = state_folder(settings) / "stage.json"
-        self._kept = ""
+        self._kept = ("", "")  # the skill's demonstrations, and the via-point
 
     def read(self, skill: Skill) -> str:
         """The last via-point of a task of this skill; empty if it is not known."""
@@ -34,9 +34,9 @@ class SavedStage:
 
     def keep(self, skill: Skill, stage: tuple[str, ...], belief: float) -> None:
         """Save the present stage, a pair of via-points, if it changed. Raises OSError."""
-        if not stage or belief < MIN_BELIEF or stage[0] == self._kept:
+        if not stage or belief < MIN_BELIEF or (skill.learned_from, stage[0]) == self._kept:
             return
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with whole(self._path) as draft:
             draft.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": stage[0]}))
-        self._kept = stage[0]
+        self._kept = skill.learned_from, stage[0]

@@ -9,12 +9,8 @@ import pytest
 
 from service.client import RefusedError
 from service.contract.records import Mode
-from service.contract.requests import RequestError
 from service.core.codes import HELD_SEEN, HELD_UNSEEN
-from service.core.frame import order
 from service.core.skill.skill import Skill
-from service.daemon.correcting import HOLD_ENDED
-from service.daemon.queryables import PendingEvent
 from service.learning.via_points import adapted
 from support.request_cell import PLACES, Cell
 
@@ -84,6 +80,16 @@ def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> N
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.parametrize(("field", "value"), [("operator_hold", 0), ("held_tick", 950), ("mode", Mode.FOLLOW)])
+def test_a_correction_is_made_in_its_own_hold_alone(
+    held: Cell, monkeypatch: pytest.MonkeyPatch, field: str, value: int
+) -> None:
+    """The hold ends while the correction is computed, and another one may have begun."""
+    monkeypatch.setattr(held.requests, "_keep", lambda file: held.state.__setitem__(field, value))
+    assert held.refusal("correct", ADD).startswith("the hold ended while this was computed; nothing was changed")
+
+
+@pytest.mark.timeout(300)
 def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> None:
     first = held.client.correct()
     assert first.correction is not None
@@ -105,10 +111,3 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     with pytest.raises(RefusedError, match="no correction is in force"):
         held.client.undo_correction()
     assert not held.failures
-
-
-def test_an_event_whose_condition_no_longer_holds_is_not_taken() -> None:
-    pending = PendingEvent(order("hold"), lambda: False)
-    assert pending.claimed(7) is None
-    with pytest.raises(RequestError, match=HOLD_ENDED):
-        pending.wait()

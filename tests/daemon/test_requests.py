@@ -24,10 +24,9 @@ from service.cli.main import main
 from service.client import RefusedError, endpoints
 from service.contract import channels, requests
 from service.contract.records import Mode, Reason
-from service.core.frame import Event
 from service.core.skill.skill import Skill
 from service.daemon.daemon import load_skill
-from service.daemon.queryables import PendingEvent, SavedViaPoints
+from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.skill_worker import SkillWorker
 from service.learning.reach import beyond_m
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
@@ -110,6 +109,13 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
         cell.client.add(PLACES)
     assert cell.kinds() == []
     assert cell.names() == []
+
+
+def test_places_in_force_whose_file_cannot_be_replaced_are_reported(cell: Cell, skill: Skill) -> None:
+    SavedViaPoints(cell.settings).path(skill).mkdir(parents=True)
+    (warning,) = cell.client.add(PLACES).warnings
+    assert warning.startswith("the via-points end at a restart: they cannot be saved (")
+    assert cell.names() == [place.name for place in PLACES]
 
 
 NOT_EMPTY: list[tuple[Any, str]] = [
@@ -206,16 +212,23 @@ def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to
     assert len(cell.client.load_skill("other").points or ()) == 1
 
 
-def test_a_skill_that_was_given_up_is_not_adopted_later(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
-    cell.running = False
-    with pytest.raises(RefusedError):
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [("running", "did not take the request: it is starting, ending or stalled"), ("fails", "failed in the tick")],
+)
+def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, state: str, message: str
+) -> None:
+    monkeypatch.setattr("service.daemon.request_inbox.ADOPTION_TIMEOUT_S", 0.05)
+    setattr(cell, state, state == "fails")
+    with pytest.raises(RefusedError, match=message):
         cell.client.add(PLACES)
     monkeypatch.undo()
-    cell.running = True
+    setattr(cell, state, state == "running")
     cell.client.ask("hold")  # taken after whatever else waits
     assert cell.kinds() == ["hold"]
     assert cell.names() == []
+    assert [point.name for point in cell.client.add(PLACES[:1]).points or ()] == [HANDOVER.name]
 
 
 @pytest.mark.parametrize(
@@ -373,42 +386,16 @@ def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
     assert cell.kinds() == ["hold"]
 
 
-OTHERS, NO_HOLD = "$.by: somebody else holds the arm too", "$.by: 'me' does not hold the arm"
-
-
-@pytest.mark.parametrize(
-    ("holds", "why"),
-    [
-        ([{"by": "me"}, {"by": "me"}], ""),
-        ([{"by": "me"}, {}], OTHERS),  # whoever gives no name is somebody else
-        ([{"by": "you"}, {"by": "me"}], OTHERS),
-        ([{"by": "you"}], NO_HOLD),
-        ([{}], NO_HOLD),
-        ([], NO_HOLD),
-    ],
-)
-def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(
-    cell: Cell, holds: list[dict[str, str]], why: str
-) -> None:
-    for hold in holds:
-        cell.client.ask("hold", hold)
+def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(cell: Cell) -> None:
     mine = {"by": "me"}
-    if why:
-        assert cell.refusal("resume", mine).startswith(why)
-    else:
-        cell.client.ask("resume", mine)
-        assert cell.refusal("resume", mine).startswith(NO_HOLD)  # it has ended
-    assert cell.kinds() == ["hold"] * len(holds) + ["resume"] * (not why)
-    cell.client.ask("resume")  # ends the holds of all
-    cell.client.ask("hold", mine)
-    cell.client.ask("resume", mine)
-
-
-def test_a_loop_that_does_not_take_a_request_is_told(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.queryables.ADOPTION_TIMEOUT_S", 0.05)
-    cell.running = False
-    with pytest.raises(RefusedError, match="the loop did not take the request: it is starting, ending or stalled"):
-        cell.client.ask("hold")
+    for name in ("me", "you"):
+        cell.client.hold(name)
+    assert cell.refusal("resume", mine).startswith("$.by: somebody else holds the arm too")
+    cell.client.resume()
+    assert cell.refusal("resume", mine).startswith("$.by: 'me' does not hold the arm")
+    cell.client.hold("me")
+    cell.client.resume("me")
+    assert cell.kinds() == ["hold", "hold", "resume", "hold", "resume"]
 
 
 def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop) -> None:
@@ -436,10 +423,3 @@ def test_requests_that_wait_are_answered_before_the_end(
         slow.let.set()
         assert teaching.result(20).points
         closing.result(20)
-
-
-def test_a_pending_event_tells_the_tick_that_took_it() -> None:
-    event = Event("hold", b"", None)
-    pending = PendingEvent(event)
-    assert pending.claimed(42) is event
-    assert pending.wait() == 42

@@ -85,6 +85,8 @@ def test_a_tool_that_was_led_goes_there_from_then_on_and_back_when_it_is_undone(
         moved_m = float(np.linalg.norm(np.subtract(tool, before)))
         assert moved_m > 0.03
 
+        with pytest.raises(RefusedError, match="the arm is led by hand, which no resume ends"):
+            daemon.client.resume()
         move(tracker, HALFWAY)
         bench.let_go()
         daemon.until(lambda s: s["reason"] == "operator", 60)

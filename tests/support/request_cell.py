@@ -44,13 +44,13 @@ class Cell:
         self.taken: list[Event] = []
         self.notes: list[str] = []
         self.kept: list[bytes] = []
-        self.running = True
-        self.mode, self.reason = Mode.HOLD, Reason.NO_HANDS
+        self.running, self.fails = True, False
+        self.reason = Reason.NO_HANDS
         self.state = start_state(self.settings, skill)
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
-        tell = {"status": lambda *, published: requests.encode_json(self.status()), "frame": self.frame}
+        tell = {"status": lambda *, published: requests.encode_json(self.status())}
         tell |= {"moment": lambda: (self.frame(), self.state)}
         tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
         self.requests = Queryables(self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
@@ -61,6 +61,14 @@ class Cell:
         self.session = far
         self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
         self.client.wait_until_ready()
+
+    @property
+    def mode(self) -> Mode:
+        return Mode(int(self.state["mode"]))
+
+    @mode.setter
+    def mode(self, mode: Mode) -> None:
+        self.state["mode"] = mode
 
     def status(self) -> requests.Status:
         none = requests.Percentiles()
@@ -87,9 +95,18 @@ class Cell:
     def _drain(self) -> None:
         while not self._end.wait(0.0005):
             self._tick += 1
-            while self.running and self.requests.inbox:
-                event = self.requests.inbox.popleft().claimed(self._tick)
-                self.taken += [event] if event else []
+            if self.running and self.requests.inbox:
+                events = self.requests.inbox.take(self.state)
+                if self.fails:
+                    self.requests.inbox.answer(None)
+                    continue
+                for event in events:
+                    self.taken.append(event)
+                    if event.kind == "skill":
+                        self.state["skill"] = np.frombuffer(event.value.digest, np.uint8)
+                    elif event.kind in ("hold", "resume"):
+                        self.state["operator_hold"] = event.kind == "hold"
+                self.requests.inbox.answer(self.frame())  # type: ignore[arg-type]
 
     def refusal(self, suffix: str, request: Any) -> str:
         """The words in which a request is refused; bytes are sent as they are."""
