@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from support.paths import ROOT
+
+MYPY_CACHE = Path.home() / ".cache" / "thirdhand" / "mypy"  # by content, for every checkout
 
 
 @pytest.mark.parametrize(
@@ -15,7 +18,7 @@ from support.paths import ROOT
     [
         pytest.param(["ruff", "check", "."], marks=pytest.mark.quick),
         pytest.param(["ruff", "format", "--check", "."], marks=pytest.mark.quick),
-        ["mypy"],
+        ["mypy", "--cache-dir", str(MYPY_CACHE)],
     ],
     ids=["lint", "format", "types"],
 )

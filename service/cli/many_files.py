@@ -29,7 +29,7 @@ def of_each(
         return [(paths[0], (alone or work)(paths[0]))]
     found = []
     with progress(what, unit="files", total=len(paths)) as done:
-        outcomes = spread(functools.partial(attempt, work), paths, args.workers or "")
+        outcomes = spread(functools.partial(attempt, work), paths, args.workers or "1")
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True), start=1):
             done(i)
             if isinstance(outcome, ExplainedError):

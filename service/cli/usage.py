@@ -20,7 +20,6 @@ from service.client import ClientSettings, UnreachableError, client_settings, op
 from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from service.contract.explain import did_you_mean, in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
-from service.process.parallel import CLUSTERS
 from service.settings.config import RATES_HZ
 from service.settings.file_content import UnusableError, content
 
@@ -79,11 +78,9 @@ def endpoint(given: str) -> str:
 
 def workers(given: str) -> str:
     """Read workers from the command line, as `spread` takes them."""
-    if re.fullmatch(rf"[1-9]\d{{0,3}}|({'|'.join(CLUSTERS)}):\S+", given):
+    if re.fullmatch(r"[1-9]\d{0,3}|dask:\S+", given):
         return given
-    raise argparse.ArgumentTypeError(
-        f"{given} given; a number of processes, dask:tcp://HOST:8786 or ray:HOST:6379 needed"
-    )
+    raise argparse.ArgumentTypeError(f"{given} given; a number of processes, or dask:tcp://HOST:8786 needed")
 
 
 TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
@@ -96,8 +93,8 @@ TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions tha
 }
 
 WORKERS_HELP = (
-    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of the scheduler) or "
-    "ray:ADDRESS; the output is the same (default: one after the other)"
+    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of the scheduler); "
+    "the output is the same (default: one after the other)"
 )
 ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
 

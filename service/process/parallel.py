@@ -1,80 +1,56 @@
-"""Work on many items, spread over the workers of joblib: processes of this machine, a Dask or Ray
-cluster, or whatever `joblib.parallel_config` sets in a program.
-"""
+"""Work on many items: in this process, in processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import socket
+import functools
+import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
-from typing import Any, TypeVar
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from typing import TypeVar
 
-from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_words
 
-CLUSTERS = {"dask": "distributed", "ray": "ray"}  # back ends of joblib that are clusters, and their packages
 CLUSTER_TIMEOUT_S = 3.0
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
-def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "") -> Iterator[Outcome]:
+def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "1") -> Iterator[Outcome]:
     """The outcome of each item, in order.
 
-    `workers` is a number of processes, `dask:ADDRESS` or `ray:ADDRESS`. If it is empty, joblib
-    decides: by `joblib.parallel_config` where a program set it, else the work is done in this
-    process. Each piece of work has one BLAS thread. Raises ExplainedError without such workers.
+    `workers` is a number of processes, or `dask:ADDRESS`; `work` must be a function that can be
+    pickled. Each piece of work has one BLAS thread. Raises ExplainedError without such workers.
     """
-    from joblib import Parallel, delayed, parallel_config  # slow to import
-    from joblib.parallel import get_active_backend
-
+    alone = functools.partial(_alone, work)
     cluster, _, address = workers.partition(":")
-    backend: dict[str, Any] = {"backend": cluster, "n_jobs": -1} if address else {}  # else Ray gets no work
-    if backend and importlib.util.find_spec(CLUSTERS[cluster]) is None:
-        raise ExplainedError(f"--workers {workers}: the package {CLUSTERS[cluster]} needed here")
-    if workers and not backend:
-        backend = {"backend": "loky", "n_jobs": int(workers)}
-    lost: tuple[type[Exception], ...] = (BrokenExecutor,)
+    if cluster == "dask":
+        yield from _on_cluster(alone, items, address)
+    elif workers == "1":
+        yield from map(alone, items)
+    else:
+        processes = multiprocessing.get_context("forkserver")
+        with ProcessPoolExecutor(int(workers), mp_context=processes) as pool:
+            try:
+                yield from pool.map(alone, items)
+            except BrokenExecutor:
+                raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
+
+
+def _on_cluster(work: Callable[[Item], Outcome], items: Sequence[Item], address: str) -> Iterator[Outcome]:
+    given = f"--workers dask:{address}"
     try:
-        if cluster in CLUSTERS:
-            _try(address)
-        if cluster == "dask":
-            backend["scheduler_host"] = address
-        elif cluster == "ray":
-            lost = (_connect_to_ray(address),)
-        with parallel_config(**backend) if backend else contextlib.nullcontext():
-            in_turn = "generator" if get_active_backend()[0].supports_return_generator else "list"
-            parallel = Parallel(return_as=in_turn, max_nbytes=None)
-    except (OSError, ValueError, RuntimeError, OverflowError) as error:  # no address, or nothing answers there
-        raise ExplainedError(f"--workers {workers}: {in_words(error)}; a running cluster's address needed") from None
+        from distributed import Client, KilledWorker
+    except ImportError:
+        raise ExplainedError(f"{given}: the package distributed needed here") from None
     try:
-        yield from parallel(delayed(_alone)(work, item) for item in items)
-    except lost:
-        raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
-
-
-def _try(address: str) -> None:
-    """Connect to a cluster's address and leave: where nothing listens, its client would wait for
-    minutes. Raises OSError, ValueError, OverflowError.
-    """
-    if (found := tcp_address(f"tcp/{address.rpartition('/')[2]}")) is None:
-        raise ValueError("it has no port")
-    socket.create_connection(found, timeout=CLUSTER_TIMEOUT_S).close()
-
-
-def _connect_to_ray(address: str) -> type[Exception]:
-    """Connect to a Ray cluster, whose workers joblib then knows. Returns the error of a worker that
-    was killed. Raises OSError, ValueError.
-    """
-    import ray
-    from ray.exceptions import RayActorError
-    from ray.util.joblib import register_ray
-
-    register_ray()
-    ray.init(address=address, log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
-    return RayActorError  # type: ignore[no-any-return]  # Ray may not be installed
+        client = Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TypeError, OverflowError) as error:  # no address, or nothing answers there
+        raise ExplainedError(f"{given}: {in_words(error)}; a running cluster's address needed") from None
+    with client:
+        try:
+            yield from (future.result() for future in client.map(work, items, pure=False))
+        except KilledWorker:
+            raise ExplainedError(f"{given}: a worker was killed, perhaps for lack of memory") from None
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

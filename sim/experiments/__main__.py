@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
         p.add_argument(f"--{name}", metavar="DIR", type=Path, help=text)
     people = "the people of `people`: those on whom parameters are chosen, or the others (default: %(default)s)"
     p.add_argument("--set", choices=["tuning", "test"], default="test", help=people)
-    workers = "processes, or the cluster at dask:ADDRESS or ray:ADDRESS, where that helps (default: %(default)s)"
+    workers = "processes, or the cluster at dask:ADDRESS, where that helps (default: %(default)s)"
     p.add_argument("--workers", type=workers_of, default=str(min(2, os.cpu_count() or 1)), help=workers)
     share = "of the full size, for a quick look: above 0, up to 1"
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)

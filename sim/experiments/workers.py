@@ -1,4 +1,4 @@
-"""Tasks of an experiment, distributed over workers of joblib."""
+"""Tasks of an experiment, distributed over workers."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         *((2, "--web and --screenshot given", ("view", "live", *web, "--screenshot", "a.png")) for web in WEB),
         (2, "--web shows a running daemon, not files", ("view", "a.rrd", "--web")),
         (2, "--tab chooses the tab of a picture", ("view", "live", "--web", "--tab", "timing")),
-        *((2, "invalid choice", ("serve", option, "left")) for option in ("--joints", "--arm")),
+        (2, "invalid choice", ("serve", "--joints", "left")),
         (1, "50 Hz is too slow: commands would arrive every 20 ms", ("demo", "--rate", "50")),
         (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
         (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),

@@ -34,22 +34,6 @@ if __name__ == "__main__":
         code = main([*sys.argv[1:], "--workers", f"dask:{cluster.scheduler_address}"])
     sys.exit(code)
 """
-RAY = """
-import os, subprocess, sys
-import ray
-address = ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR").address_info["address"]
-arguments = [*sys.argv[1:], "--workers", f"ray:{address}"]
-sys.exit(subprocess.run([sys.executable, "-m", "service", *arguments]).returncode)
-"""
-
-RAY_WORKERS = """
-import os
-import ray
-from service.process.parallel import spread
-address = ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR").address_info["address"]
-at = list(spread(lambda _: os.getpid(), range(4), f"ray:{address}"))
-print(len(at), os.getpid() in at)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +75,11 @@ def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neith
     assert named_failures(shared.stderr) == [first, last]
 
 
-@pytest.mark.parametrize(("package", "cluster"), [("distributed", DASK), ("ray", RAY)], ids=["dask", "ray"])
 @pytest.mark.thorough
-def test_a_cluster_of_two_workers_prints_the_same(package: str, cluster: str, files: list[str], tmp_path: Path) -> None:
-    pytest.importorskip(package)
+def test_a_cluster_of_two_workers_prints_the_same(files: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
     script = tmp_path / "with_a_cluster.py"
-    script.write_text(cluster, encoding="utf-8")
+    script.write_text(DASK, encoding="utf-8")
     command = ["replay", "--each", *files]
     done = subprocess.run(
         [sys.executable, str(script), *command], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
@@ -106,19 +89,12 @@ def test_a_cluster_of_two_workers_prints_the_same(package: str, cluster: str, fi
     assert named_failures(done.stderr) == named_failures(alone.stderr)
 
 
-def test_a_ray_cluster_does_the_work_itself() -> None:
-    pytest.importorskip("ray")
-    command = [sys.executable, "-c", RAY_WORKERS]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False, cwd=ROOT)
-    assert done.stdout == "4 False\n", done.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("replay", "--workers", "2"), "--workers: --each needed"),
         (("replay", "--each", "--output", "new.mcap"), "--output writes the frames of one recording"),
-        (("report", "--workers", "many"), "many given; a number of processes, dask:tcp://HOST:8786 or"),
+        (("report", "--workers", "many"), "many given; a number of processes, or dask:tcp://HOST:8786"),
         (("tune", "--plot", "tune.png"), "the picture is of one file; 4 given"),
     ],
 )
