@@ -37,7 +37,7 @@ from service.settings.config import Settings, robot_description
 
 ROOT = Path(__file__).parents[1]
 LOOP = str(Path(daemon.__file__))  # this file does what the loop there does
-ARITHMETIC = str(ROOT / "service" / "core" / "vectors.py")  # left out, as operators are
+ARITHMETIC = {str(ROOT / "service/core/vectors.py"), str(ROOT / "kmp/elementary.py")}  # left out, as operators are
 PERIODS = 80
 
 
@@ -64,7 +64,7 @@ class Walk:
     @staticmethod
     def _is_ours(frame: FrameType) -> bool:
         file = frame.f_code.co_filename
-        return file != ARITHMETIC and (file.startswith((f"{ROOT}/service", f"{ROOT}/kmp")) or file == __file__)
+        return file not in ARITHMETIC and (file.startswith((f"{ROOT}/service", f"{ROOT}/kmp")) or file == __file__)
 
     @property
     def files(self) -> list[str]:

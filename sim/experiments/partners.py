@@ -30,7 +30,7 @@ from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.people.into_reach import RigidMap
 from sim.experiments.people.left_out import (
     JUDGED_HZ,
-    RESTS_S,
+    SESSION_RESTS_S,
     Judged,
     LeftOut,
     judged,
@@ -273,7 +273,7 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
             "reasons": list(dict.fromkeys(reasons))[:2],
             "again": {
                 f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
-                for i, rest_s in enumerate(RESTS_S)
+                for i, rest_s in enumerate(SESSION_RESTS_S)
             },
             "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
             "beside_mm": {rival: rows.get("rms_mm") for rival, rows in there.items()},

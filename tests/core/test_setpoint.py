@@ -17,7 +17,7 @@ from service.core.setpoint.bounds import speed_to_come, stop_distance
 from service.core.setpoint.stage import SetpointGenerator, SetpointStage
 from service.core.setpoint.step import slow_down
 from service.core.setpoint.tracker import waiting
-from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, JERK_WEIGHT_S6, RETURN_SHARE
+from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, JERK_WEIGHT, RETURN_SHARE
 from service.core.skill.model import Target, Wanted
 from service.core.stops import fastest_stop
 from service.settings.config import FOLLOWING, Settings, ToolSettings
@@ -137,7 +137,7 @@ def test_a_target_on_a_side_of_the_workspace_is_reached_and_the_setpoint_rests_t
     start = target + random.uniform(0, 0.2) * (BOX.mean(axis=0) - target)
     generator, state = SetpointGenerator(settings), blank(STATE)
     generator.begin(state, at_rest(start))
-    slowest_s = max(JERK_WEIGHT_S6 ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
+    slowest_s = max(JERK_WEIGHT ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
     accelerations = []
     for _ in range(round((3.0 + 2.0 * np.linalg.norm(target - start) / speed + 30 * slowest_s) * rate_hz)):
         generator.step(state, Target(*at_rest(target), clamped=True), BOX, FREE, 1.0)

@@ -52,7 +52,7 @@ def test_a_replay_names_the_stages_whose_constants_are_others(tmp_path: Path, mo
     recording = Recording.open(GOLDEN)
     names = {f"constants of {stage}" for stage in STAGES}
     assert names | {"features", "libc", "kernel"} <= recording.metadata.keys()
-    monkeypatch.setattr(tracker, "JERK_WEIGHT_S6", 3e-9)
+    monkeypatch.setattr(tracker, "JERK_WEIGHT", 3e-9)
     result = replay(GOLDEN)
     assert not result.exact
     assert result.differing == {"setpoint"}

@@ -44,7 +44,11 @@ def test_link_frames_are_where_another_implementation_has_them(description: str,
     data = model.createData()
     assert list(model.names)[1:] == names
     q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + around
-    pin.framesForwardKinematics(model, data, q)
+    turns = [joint.nq == 2 for joint in list(model.joints)[1:]]  # these are given by cosine and sine
+    pairs = zip(turns, q.tolist(), strict=True)
+    pin.framesForwardKinematics(
+        model, data, np.concatenate([[np.cos(x), np.sin(x)] if turn else [x] for turn, x in pairs])
+    )
     placed = {urdf.root: pin.SE3.Identity()}
     for link in urdf.transforms(dict(zip(names, q.tolist(), strict=True))):
         x, y, z, w = link.rotation

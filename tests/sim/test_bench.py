@@ -323,7 +323,7 @@ def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
         "sim",
         "--connect",
         network[1],
-        "--json",
+        "--output",
         str(target),
         "--speed",
         "20",

@@ -14,7 +14,7 @@ from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
 from service.core.setpoint.tuning import (
     GAP_STOPPED_M,
     GAP_WAITING_M,
-    JERK_WEIGHT_S6,
+    JERK_WEIGHT,
     STIFFEST_PER_M,
     TRACKER_RATE_SHARE,
 )
@@ -26,21 +26,21 @@ from service.settings.config import Settings
 def gains_for(settings: Settings) -> Vector:
     """Gains (5,) of `tracker_gains` for the settings, slow enough for tool, joints and loop.
 
-    With jerk_weight w the tracker's rate is w^(-1/6) [1/s]. The weight is JERK_WEIGHT_S6, or the
+    With jerk_weight w the tracker's rate is w^(-1/6) [1/s]. The weight is JERK_WEIGHT, or the
     weight of the largest rate that all can follow, if that is larger:
 
         rate = min(TRACKER_RATE_SHARE * min over joints of (jerk / acceleration),
                    max(TRACKER_RATE_SHARE * tool jerk / tool acceleration,
                        cbrt(STIFFEST_PER_M * tool jerk)),
                    rate_hz / 2)
-        jerk_weight = max(JERK_WEIGHT_S6, max(rate, SLOWEST_PER_S)^-6)
+        jerk_weight = max(JERK_WEIGHT, max(rate, SLOWEST_PER_S)^-6)
 
     The tracker acts once a tick: it would oscillate at the rate of the loop.
     """
     tool = settings.tool
     own = max(TRACKER_RATE_SHARE * tool.jerk / tool.acceleration, math.cbrt(STIFFEST_PER_M * tool.jerk))
     quickest = min(TRACKER_RATE_SHARE * acceleration_rate(settings.joints), own, 0.5 * settings.rate_hz)
-    return tracker_gains(max(JERK_WEIGHT_S6, max(quickest, SLOWEST_PER_S) ** -6))
+    return tracker_gains(max(JERK_WEIGHT, max(quickest, SLOWEST_PER_S) ** -6))
 
 
 def tracker_gains(jerk_weight: float) -> Vector:

@@ -13,7 +13,7 @@ from service.core.intake.tuning import LEAST_NOISE_M
 
 # The tracker: a linear-quadratic one, whose input is jerk.
 # 1e-9 to 1e-7. More: the setpoint follows calmly. Less: it follows faster, as far as joints can.
-JERK_WEIGHT_S6 = 2.8e-9  # weight of a squared jerk beside that of a squared distance
+JERK_WEIGHT = 2.8e-9  # [s⁶] weight of a squared jerk beside that of a squared distance
 # 0.5 to 2. More: the setpoint follows faster. Less: the joints follow calmly.
 TRACKER_RATE_SHARE = 1.1  # largest tracker rate / (jerk / acceleration); joints oscillate with a larger one
 

@@ -38,7 +38,7 @@ from sim.experiments.rivals.method import Observed, Predicted
 
 RATE_HZ, JUDGED_HZ = 125, 25
 LONGEST_SHIFT_S = 1.0
-RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
+SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
 BACK_S = 2.0  # the hands' way back to where the take begins
 FAR_M = 1e3  # the corner of a workspace that clamps nothing
 ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
@@ -127,7 +127,7 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
     """
     seconds, poses, begins = [take.seconds], [np.hstack([take.left, take.right])], [0]
     whole_s, whole = seconds[0], poses[0]
-    for rest_s in RESTS_S:
+    for rest_s in SESSION_RESTS_S:
         for share in (broken_share, 1.0):
             if share == 0.0:
                 continue
