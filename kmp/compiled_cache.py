@@ -28,10 +28,20 @@ from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
-# A symbol of compiled code consists of the function's name, this number, and the numbers of types.
-# Each process numbers them anew. Without a range of its own, two processes could give one symbol to
-# different codes, and a third one, which loads both, would call the wrong one.
-FunctionIdentity._unique_ids = itertools.count(int.from_bytes(os.urandom(6), "big") << 20)  # noqa: SLF001
+
+def _number_anew() -> None:
+    """Give this process a range of its own for the numbers of compiled functions.
+
+    A symbol of compiled code consists of the function's name, this number, and the numbers of
+    types. Each process counts them, and a forked one goes on where the other one is. Without a
+    range of its own, two processes could give one symbol to different codes, and a third one, which
+    loads both, would call the wrong one.
+    """
+    FunctionIdentity._unique_ids = itertools.count(int.from_bytes(os.urandom(6), "big") << 20)  # noqa: SLF001
+
+
+_number_anew()
+os.register_at_fork(after_in_child=_number_anew)
 
 UNUSED_S = 90 * 86400.0  # a file that was not read for this time is removed
 IMPORTS = re.compile(rb"^ *(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +([\w.]+))", re.MULTILINE)

@@ -104,6 +104,20 @@ for size in map(int, sys.argv[1:]):
 """
 
 
+FORKED = """
+import os
+import sys
+import numpy as np
+from steps.length import length
+
+for size in map(int, sys.argv[1:]):
+    if (child := os.fork()) == 0:
+        length(np.zeros(1, [("values", np.float64, (size,))]))
+        os._exit(0)
+    os.waitpid(child, 0)
+"""
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path / "one", tmp_path / "cache")
@@ -133,6 +147,12 @@ def test_processes_that_compile_for_different_types_mix_nothing_up(checkout: Che
     """Each names its first record type alike; the last process loads what both have compiled."""
     assert checkout.run(LENGTHS, "6") == [6]
     assert checkout.run(LENGTHS, "7") == [7]
+    assert checkout.run(LENGTHS, "7", "6") == [7, 6]
+
+
+def test_forked_processes_that_compile_mix_nothing_up(checkout: Checkout) -> None:
+    """They go on where one process was when it was forked."""
+    checkout.run(FORKED, "6", "7")
     assert checkout.run(LENGTHS, "7", "6") == [7, 6]
 
 
