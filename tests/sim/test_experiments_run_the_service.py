@@ -121,7 +121,7 @@ class TestPeople:
         of_two = [one._replace(places=(one.places[0], one.places[2])) for one in by_people(3)]
         learned = learn(of_two)
         assert isinstance(learned.model, StagedKMP)
-        assert learned.model.clock is None
+        assert not learned.model.is_timed
         exact = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
         placed, belief = exact.model.placed, np.eye(1, MOST_STAGES)[0]
 
