@@ -21,9 +21,9 @@ from service.settings.config import Settings
 LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
 LEAST_REST_S = 1.0  # a shorter rest is no pause
 LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
-HALF_WAY = 0.5  # of the way to the nearest begin of another stage, the hands are not at the first one
+HALF_WAY = 0.5  # on this share of the way to the end, or to another stage's begin, hands are not at the begin
 LEAST_NEAR_M = 0.1  # hands within this distance of where demonstrations begin have returned there
-NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of a demonstration's hands
+NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of their begins from the mean
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
 LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
 FIRST_STAMP_NS = 1_000_000_000
@@ -96,7 +96,9 @@ def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> Task
     begins = np.array([one.hands[0] if alone is None else np.tile(one.hands[0, 3 * alone :][:3], 2) for one in tempos])
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
-    near_m = max(LEAST_NEAR_M, NEAR_TIMES * off_m)
+    ends = np.array([one.hands[-1] if alone is None else np.tile(one.hands[-1, 3 * alone :][:3], 2) for one in tempos])
+    ends_m = np.linalg.norm((ends - begin).reshape(-1, 2, 3), axis=2).max(axis=1)
+    near_m = max(LEAST_NEAR_M, min(NEAR_TIMES * off_m, HALF_WAY * float(np.median(ends_m))))
     free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(begin=tuple(begin.tolist()))
     ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
     return free._replace(longest_s=max(ends_s), over_s=min(ends_s))
