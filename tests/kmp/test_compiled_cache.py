@@ -111,10 +111,10 @@ import numpy as np
 from steps.length import length
 
 for size in map(int, sys.argv[1:]):
-    if (child := os.fork()) == 0:
+    if os.fork() == 0:
         length(np.zeros(1, [("values", np.float64, (size,))]))
-        os._exit(0)
-    os.waitpid(child, 0)
+        sys.exit()
+    os.wait()
 """
 
 
