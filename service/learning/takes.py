@@ -21,7 +21,7 @@ from service.learning.regions import BLOCKS
 from service.learning.skill_file import SkillError
 from service.learning.via_points import of_one
 
-LEAST_COMPARED = 4  # of fewer takes, none can be told to stand out
+LEAST_COMPARED = 4  # takes: among fewer, none counts as standing out
 STANDS_OUT_TIMES = 4.0
 COMPARED_TIMES = 100  # shares of the duration at which demonstrations are compared
 REPEATED_M = 0.003  # demonstrations with a smaller root mean square distance are the same one

@@ -39,7 +39,7 @@ def test_the_shipped_skill_does_the_same_in_every_round(taught: Skill) -> None:
         if number:
             hands.append(way(hands[-1][-1], whole[0], period_s))
         rests = round(rest_s / period_s)
-        rests += -(sum(map(len, hands)) + rests) % 5  # so that each round is sampled alike
+        rests += -(sum(map(len, hands)) + rests) % 5  # the tracker samples each round at the same moments
         hands.append(np.repeat(whole[:1], rests, axis=0))
         begins.append(sum(map(len, hands)))
         hands.append(whole[: len(whole) // 2] if number == HALF else whole)

@@ -93,15 +93,19 @@ class Tempo(NamedTuple):
 
 def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
     """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
-    begins = np.array([one.hands[0] if alone is None else np.tile(one.hands[0, 3 * alone :][:3], 2) for one in tempos])
+    begins, ends = (np.array([_conducting(one.hands[row], alone) for one in tempos]) for row in (0, -1))
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
-    ends = np.array([one.hands[-1] if alone is None else np.tile(one.hands[-1, 3 * alone :][:3], 2) for one in tempos])
     ends_m = np.linalg.norm((ends - begin).reshape(-1, 2, 3), axis=2).max(axis=1)
     near_m = max(LEAST_NEAR_M, min(NEAR_TIMES * off_m, HALF_WAY * float(np.median(ends_m))))
     free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(begin=tuple(begin.tolist()))
     ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
     return free._replace(longest_s=max(ends_s), over_s=min(ends_s))
+
+
+def _conducting(hands: Vector, alone: int | None) -> Vector:
+    """Hands (6,) [m]; the one that matters alone, twice."""
+    return hands if alone is None else np.tile(hands[3 * alone :][:3], 2)
 
 
 def _endless(

@@ -143,7 +143,7 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
             ]
             if share == 1.0:
                 begins.append(begin)
-    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)  # so that rounding does not lose the last sample
+    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)  # one sample more, as rounding may cut off the last one
     poses.append(poses[-1][-1:])
     hands, stamps = np.concatenate(poses), np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)
     return take._replace(stamps_ns=stamps, left=hands[:, :7], right=hands[:, 7:], tool=hands[:, :7]), begins
