@@ -7,6 +7,7 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from typing import TypeVar
+from urllib.parse import urlsplit
 
 from service.contract.explain import ExplainedError, in_words
 
@@ -43,8 +44,11 @@ def _on_cluster(work: Callable[[Item], Outcome], items: Sequence[Item], address:
     except ImportError:
         raise ExplainedError(f"{given}: the package distributed needed here") from None
     try:
+        location = urlsplit(address if "://" in address else f"tcp://{address}")
+        if not (location.hostname and location.port):  # Dask would wait for the domain name service
+            raise ValueError("no host and port")
         client = Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError, TypeError, OverflowError) as error:  # no address, or nothing answers there
+    except (OSError, ValueError, TypeError) as error:  # no address, or nothing answers there
         raise ExplainedError(f"{given}: {in_words(error)}; a running cluster's address needed") from None
     with client:
         try:

@@ -16,6 +16,7 @@ from service.process.parallel import spread
         "dask:foo",
         "dask:tcp://foo",
         "dask:tcp://",
+        "dask:tcp://:8786",
         "dask:127.0.0.1:99999",
         "dask:tcp://127.0.0.1:1",
     ],

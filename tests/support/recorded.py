@@ -121,9 +121,14 @@ def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def drawn_ticks(path: Path, curve: str) -> list[int]:
-    """The ticks of a curve in a Rerun file, in order."""
-    batches = [chunk.to_record_batch() for chunk in rr.chunk.RrdReader(path).stream() if chunk.entity_path == curve]
-    return [tick for rows in batches if "tick" in rows.schema.names for tick in rows["tick"].to_pylist()]
+    """The ticks of a curve in a Rerun file, in order, without those that break it after a gap."""
+    ticks: list[int] = []
+    for chunk in rr.chunk.RrdReader(path).stream():
+        rows = chunk.to_record_batch()
+        if chunk.entity_path == curve and "tick" in rows.schema.names:
+            drawn = zip(rows["tick"].to_pylist(), rows["Scalars:scalars"].to_pylist(), strict=True)
+            ticks += [tick for tick, scalars in drawn if np.isfinite(scalars).all()]
+    return ticks
 
 
 def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
