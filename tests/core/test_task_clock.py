@@ -15,6 +15,7 @@ from service.core.skill.task_clock import (
     CLOCK_CHANGE,
     CLOCK_RATE,
     CLOCK_S,
+    CLOCK_SIZE,
     REST_LEFT_S,
     TaskClock,
     count,
@@ -30,12 +31,13 @@ from support.kinds import KINDS, learned, named, takes
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)
 HOME, AWAY = np.array(RUNS.begin), np.array(RUNS.begin) + 0.5
+OWN = HOME + 0.3  # begin of a person whose hands start elsewhere than those of the demonstrations
 PERIOD_S = 0.01
 
 
 def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S) -> np.ndarray:
-    """The clock (T, 5) while the hands move or rest for these times at these positions."""
-    state, out = np.zeros(5), []
+    """The clock (T, CLOCK_SIZE) while the hands move or rest for these times at these positions."""
+    state, out = np.zeros(CLOCK_SIZE), []
     for what, lasts_s, hands in parts:
         for _ in range(round(lasts_s / period_s)):
             moves = what == "move"
@@ -60,6 +62,11 @@ def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: flo
         (RUNS, [("move", 20.0, AWAY), ("rest", 0.5, HOME), ("move", 1.0, AWAY)], 0.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),  # a hesitation
         (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),  # not where demonstrations begin
+        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)], 0.0),  # where this person began
+        (RUNS, 3 * [("rest", 0.5, OWN), ("move", 1.0, AWAY)], 0.9),
+        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, AWAY + 0.2)], 1.4),
+        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)], 1.4),  # a pause before leaving
+        (RUNS, [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)], 2.4),  # first seen in motion
         (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),  # the task was over
         (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),  # too short a rest
     ],
@@ -89,13 +96,23 @@ def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
 
 def test_the_task_begins_again_once_in_each_rest_where_it_begins() -> None:
     rows = RUNS.rows(np.stack([HOME, AWAY]))
-    state, begun = np.zeros(5), []
+    state, begun = np.zeros(CLOCK_SIZE), []
     for speed, hands, stage in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
         begun.append(count(hands, speed, 0.0, PERIOD_S, stage, rows, state))
     assert np.flatnonzero(begun) == pytest.approx(50 + RUNS.home_s / PERIOD_S, abs=1)
     for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a stage begins anew, but not the task
         assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
     assert state[CLOCK_S] == 0.0
+
+
+def test_where_hands_began_is_kept_through_the_stages_of_a_task() -> None:
+    rows, state = RUNS.rows(np.stack([HOME, HOME + 1.0])), np.zeros(CLOCK_SIZE)
+    begun = [
+        count(hands, speed, float(speed == 0.0), PERIOD_S, stage, rows, state)
+        for speed, hands, stage, ticks in [(0.0, OWN, 0, 50), (0.3, AWAY, 0, 50), (0.3, AWAY, 1, 50), (0.0, OWN, 1, 50)]
+        for _ in range(ticks)
+    ]
+    assert np.flatnonzero(begun) == pytest.approx(150 + RUNS.home_s / PERIOD_S, abs=1)
 
 
 def test_numbers_of_a_file_that_are_no_clock_are_refused() -> None:
@@ -179,7 +196,7 @@ def test_each_round_of_a_session_is_predicted_as_the_first_one(kind: str) -> Non
 
 
 def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
-    rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(5), []
+    rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(CLOCK_SIZE), []
     for speed, stage in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
         count(AWAY, speed, float(speed == 0.0), PERIOD_S, stage, rows, state)
         seconds.append(state[CLOCK_S])

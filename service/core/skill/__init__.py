@@ -24,7 +24,7 @@ STATE = (
     Field("memory_ticks", "int64", (2,)),  # tick at which each hand entered `memory` last; -1: not yet
     Field("stage_belief", "float64", (64,)),  # probability of each stage of the task; zeros: not yet known
     Field("turns", "float64", (TURNS, 2, 9)),  # cascaded filters of the hands' rotation matrices
-    Field("task_clock", "float64", (5,)),  # seconds since the hands began task or stage; see `task_clock.count`
+    Field("task_clock", "float64", (12,)),  # seconds since the hands began task or stage; see `task_clock.count`
     Field("unprimed_belief", "float64", (64,)),  # belief in each stage if none is the first
 )
 FRAME = (

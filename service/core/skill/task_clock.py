@@ -11,9 +11,10 @@ t' [s] it advances at a rate r, which follows its goal g with the time constant 
 * g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. If the task may
   be over then (t at least `over_s`), the next motion starts the clock anew. Otherwise the user has
   paused, and the clock continues.
-* t = r = 0 once the hands have rested for `home_s` where demonstrations begin, longer than in any
-  demonstration there. The task begins again: the memory of the hands is that of hands that have
-  always been there, no stage is known, and the next motion starts the clock.
+* t = r = 0 once the hands have rested for `home_s` where demonstrations begin, or have come back to
+  where they rested before they began, longer than in any demonstration there. The task begins
+  again: the memory of the hands is that of hands that have always been there, no stage is known,
+  and the next motion starts the clock.
 * If the task has stages, the clock starts anew in each. When the most probable stage changes, or
   after a rest of `rest_s` where the stage begins, the clock is set to 0, and starts with the next
   motion.
@@ -35,10 +36,12 @@ from kmp.elementary import exp
 from service.core.frame import Records, Vector
 from service.core.numerics import MEMORY_STEP_S
 from service.core.skill import MAX_SKILL_DISTANCE_M
-from service.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS
+from service.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS, OWN_NEAR_M
 from service.core.vectors import norm, squared_distance
 
-CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE = range(5)  # entries of `task_clock` in the state
+CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE, PROGRESS, OWN_BEGIN = range(7)
+CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
+RESTS, BEGINS, LEFT = 0.0, 1.0, 2.0  # progress: the hands have not moved, are near where they began, were elsewhere
 WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
 LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
 
@@ -53,7 +56,7 @@ class TaskClock(NamedTuple):
     longest_s: float  # the clock stops at this time
     over_s: float  # from this time on the task may be over
     rest_s: float  # a longer rest ends the task, or is a pause
-    home_s: float  # at most `rest_s`: after a longer rest near `begin` the task begins again
+    home_s: float  # at most `rest_s`: after a longer rest near a begin the task begins again
     near_m: float  # hands within this distance of `begin` are where demonstrations begin
     begin: tuple[float, ...]  # (6,) [m] mean hands at the begin of the demonstrations
 
@@ -85,41 +88,59 @@ class TaskClock(NamedTuple):
 
 
 @compiled
-def _is_near(hands: Vector, numbers: Vector) -> bool:
-    """True if both hands (6,) [m] are where the task or the stage with these `numbers` begins."""
+def _are_near(hands: Vector, begin: Vector, near_m: float) -> bool:
+    """True if both hands (6,) [m] are within `near_m` [m] of where they are in `begin` (6,) [m]."""
     for side in range(2):
-        begin = numbers[BEGIN_AT + 3 * side : BEGIN_AT + 3 * side + 3]
-        if squared_distance(hands[3 * side : 3 * side + 3], begin) > numbers[NEAR_AT] ** 2:
+        part = slice(3 * side, 3 * side + 3)
+        if squared_distance(hands[part], begin[part]) > near_m**2:
             return False
     return True
 
 
 @compiled
+def _have_returned(hands: Vector, numbers: Vector, clock: Vector) -> bool:
+    """True if the hands (6,) [m] are where demonstrations begin, or again where they began."""
+    if _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
+        return True
+    return clock[PROGRESS] == LEFT and _are_near(hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M))
+
+
+@compiled
 def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> bool:
-    """Advance a clock (5,) by one period `period_s` [s]; see the equations of this module. The
+    """Advance a clock (12,) by one period `period_s` [s]; see the equations of this module. The
     faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
     `still`. Returns true if the task begins again.
 
-    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, and
-    the stage. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages has one
-    row.
+    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, the
+    stage, the progress (RESTS, BEGINS or LEFT), and where (6,) [m] these hands rested before they
+    began. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages has one row.
     """
-    numbers, begins_again = rows[stage], False
+    numbers = rows[stage]
+    begins_again = False
     if clock[CLOCK_STAGE] != stage:
-        clock[:] = 0.0
+        clock[:CLOCK_STAGE] = 0.0
         clock[CLOCK_STAGE] = stage
 
+    if clock[PROGRESS] == RESTS and still > 0.5:
+        clock[OWN_BEGIN:] = hands
     if speed > CLOCK_START_MPS:
+        if clock[PROGRESS] == RESTS:
+            clock[PROGRESS] = BEGINS
+        elif not _are_near(hands, clock[OWN_BEGIN:], OWN_NEAR_M):
+            clock[PROGRESS] = LEFT
         if clock[REST_LEFT_S] <= 0.0 and clock[CLOCK_S] >= numbers[OVER_AT]:
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
         clock[REST_LEFT_S] = numbers[REST_AT]
     else:
         before_s = clock[REST_LEFT_S]
         clock[REST_LEFT_S] = max(before_s - period_s, 0.0)
-        has_returned = clock[REST_LEFT_S] <= numbers[REST_AT] - numbers[HOME_AT] and _is_near(hands, rows[0])
-        if before_s > 0.0 and (has_returned or (clock[REST_LEFT_S] == 0.0 and _is_near(hands, numbers))):
-            clock[CLOCK_S] = clock[CLOCK_RATE] = clock[REST_LEFT_S] = 0.0
-            begins_again = has_returned
+        has_rested = clock[REST_LEFT_S] <= numbers[REST_AT] - numbers[HOME_AT]
+        if before_s > 0.0 and has_rested and _have_returned(hands, rows[0], clock):
+            begins_again = True
+            clock[:CLOCK_STAGE] = 0.0
+            clock[PROGRESS] = RESTS
+        elif before_s > 0.0 and clock[REST_LEFT_S] == 0.0 and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
+            clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
 
     goal = 0.0
     if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
@@ -152,7 +173,7 @@ def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vecto
 
 @compiled
 def _counted(moving: Vector, stages: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector) -> None:
-    clock = np.zeros(5)
+    clock = np.zeros(CLOCK_SIZE)
     for t in range(len(moving)):
         for step in range(steps if t else 0):
             now = moving[t - 1] + (step + 1) / steps * (moving[t] - moving[t - 1])

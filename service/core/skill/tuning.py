@@ -83,6 +83,8 @@ TURN_WEIGHT_M = 0.1  # entries of a rotation matrix become lengths: those of a t
 # 0.03 to 0.2. More: the clock starts later. Less: a restless hand starts it.
 CLOCK_START_MPS = 0.08  # a faster hand has begun the task; tremor and drift are slower
 CLOCK_LAG_S = STILLNESS_LOWPASS_S  # time constant with which the clock's rate changes, as stillness does
+# 0.03 to 0.08. More: more rests within a task count as its begin. Less: fewer returns count.
+OWN_NEAR_M = 0.05  # [m] hands this near to where they began the task have returned there
 
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.

@@ -13,7 +13,7 @@ from service.contract.messages import BASE, PoseStamped
 from service.core.frame import Records, Vector, blank, state_layout
 from service.core.intake.stage import Intake
 from service.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
-from service.core.skill.tuning import CLOCK_START_MPS, LEAST_SEGMENT_M
+from service.core.skill.tuning import CLOCK_START_MPS, LEAST_SEGMENT_M, OWN_NEAR_M
 from service.learning.demonstration import Demonstration
 from service.learning.regions import blocks_of
 from service.settings.config import Settings
@@ -22,7 +22,7 @@ LONGER = 1.5  # the hands may rest this many times as long as in any demonstrati
 LEAST_REST_S = 1.0  # a shorter rest is no pause
 LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
 HALF_WAY = 0.5  # on this share of the way to the end, or to another stage's begin, hands are not at the begin
-LEAST_NEAR_M = 0.1  # hands within this distance of where demonstrations begin have returned there
+LEAST_NEAR_M = 2.0 * OWN_NEAR_M  # hands within this distance of where demonstrations begin have returned there
 NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of their begins from the mean
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
 LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
@@ -85,10 +85,19 @@ class Tempo(NamedTuple):
         latest_motion = np.maximum.accumulate(np.where(is_moving, samples, -1))
         return np.where(latest_motion < 0, 0, samples - latest_motion) * self.period_s
 
-    def is_near(self, begin: Vector, near_m: float, alone: int | None) -> NDArray[np.bool_]:
-        """True (T,) where the hands that matter are within `near_m` of `begin` (6,) [m]."""
-        distances_m = np.linalg.norm((self.hands - begin).reshape(-1, 2, 3), axis=2)
-        return np.asarray((distances_m[:, slice(None) if alone is None else [alone]] <= near_m).all(axis=1))
+    def has_returned(self, begin: Vector, near_m: float, alone: int | None) -> NDArray[np.bool_]:
+        """True (T,) where the hands that matter are within `near_m` of `begin` (6,) [m], or again
+        where they were at first.
+        """
+        is_at_begin, is_at_own = (
+            self._are_near(hands, radius_m, alone)
+            for hands, radius_m in ((begin, near_m), (self.hands[0], min(near_m, OWN_NEAR_M)))
+        )
+        return is_at_begin | (is_at_own & np.maximum.accumulate(~is_at_own))
+
+    def _are_near(self, place: Vector, radius_m: float, alone: int | None) -> NDArray[np.bool_]:
+        distances_m = np.linalg.norm((self.hands - place).reshape(-1, 2, 3), axis=2)
+        return np.asarray((distances_m[:, slice(None) if alone is None else [alone]] <= radius_m).all(axis=1))
 
 
 def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
@@ -115,7 +124,7 @@ def _endless(
     that begin with these hands (6,) [m].
     """
     rested_s = [one.rested_s(alone) for one in tempos]
-    is_home = [tempo.is_near(begin, near_m, alone) for tempo, begin in zip(tempos, begins, strict=True)]
+    is_home = [tempo.has_returned(begin, near_m, alone) for tempo, begin in zip(tempos, begins, strict=True)]
     rest_s = LONGER * max(float(one.max()) for one in rested_s)
     home_s = LONGER * max(float(one[inside].max(initial=0.0)) for one, inside in zip(rested_s, is_home, strict=True))
     rest_s, home_s = max(rest_s, LEAST_REST_S), max(home_s, LEAST_HOME_S)
