@@ -20,7 +20,6 @@ from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.contract.roles import DAEMON, ROLES
 from service.learning.residual_risk import OPTION
 from service.process import interrupt
 from service.process.progress import say
@@ -45,7 +44,7 @@ GROUPS = {
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
-    "set up": ("prepare", "arm", "calibrate", "certificates"),
+    "set up": ("prepare", "arm", "calibrate"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -161,7 +160,7 @@ def parser() -> argparse.ArgumentParser:
         "hands",
         "Publishes your hands, as a headset's browser or a camera of this machine tracks them, or as you drag them "
         "with a mouse or a finger. Open the address that it prints.",
-        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n"
+        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https 192.168.1.20\n"
         "  thirdhand hands --camera --hand-length 0.19",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
@@ -171,8 +170,8 @@ def parser() -> argparse.ArgumentParser:
     option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
     address = "serve the page at this address; port 0: any free one; for other machines with --https"
     option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
-    https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
-    option(c, "--https", "DIR", https)
+    https = "serve the page by HTTPS, for a headset that reaches this machine by this name or address"
+    option(c, "--https", "NAME", https)
     length = "length of your hand, from the crease of the wrist to the tip of the middle finger (--camera)"
     option(c, "--hand-length", "M", length, 0.18, type=within(float, 0.1, 0.3, " m"))
     view = "horizontal angle of view of the lens, in degrees (--camera)"
@@ -397,26 +396,6 @@ def parser() -> argparse.ArgumentParser:
     calibrate_options.add_options(c)
     _reach(c)
 
-    c = command(
-        "certificates",
-        "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
-        "more certificate by the authority in the folder, with --renew it renews all.",
-        "thirdhand certificates secrets --host bench.local\n  thirdhand certificates secrets --renew",
-    )
-    option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
-    option(
-        c,
-        "--host",
-        "NAME",
-        "a name or address at which the daemon and pages are reached; may be repeated",
-        action="append",
-    )
-    c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
-    option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
-    renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
-    flag(c, "--renew", renew)
-    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=within(int, 1, 36500))
-
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
     c.set_defaults(run="cli.sim.sim")
@@ -465,7 +444,7 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
     option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    role = "the folder of your role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
+    role = "the folder of your role, with certificate.pem, key.pem and authority.pem ($THIRDHAND_CERTIFICATE)"
     option(group, "--certificate", "DIR", role)
     option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
     sub.set_defaults(reaches=True)

@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES "
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE TWO_PLACES "
     "CLOCK_SET",
 )
 
@@ -297,9 +297,6 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "ask again; if it still does not answer, read the log of `thirdhand serve`"),
         Incident(Condition.OTHER_CELL, None, "another cell",
             "only daemons of other cells are running", "give the name of the cell by `--cell`"),
-        Incident(Condition.CERTIFICATE_ENDS, None, "certificate ends",
-            "the daemon's certificate, or its authority's, ends within 30 days; then nobody is connected any more",
-            "`thirdhand certificates DIR --renew`, copy it to the daemon's machine and start the daemon again"),
         Incident(Condition.PORT_CLOSED, None, "port closed",
             "nothing listens on the port",
             "start `thirdhand serve`; its first line names the endpoint to give as `--connect`"),

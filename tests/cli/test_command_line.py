@@ -249,7 +249,7 @@ def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["certificates /dev/full", "demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
+    ["demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
 )
 def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> None:
     done = told(*command.split())
