@@ -274,16 +274,6 @@ def parser() -> argparse.ArgumentParser:
         "for it; skill, daemon and status name both"
     )
     option(c, OPTION, "NAME", accept)
-    count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
-    option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
-    ell = "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)"
-    option(c, "--ell", "L", ell, type=positive)
-    components = "take the reference from a mixture of K Gaussians, as in the paper (default: from the demonstrations)"
-    option(c, "--components", "K", components, type=count)
-    option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)
-    option(c, "--seed", None, "the seed of the mixture's start and of the sampled inputs", 0, type=int)
-    delay = "the teacher's delay [s], for demonstrations with via-points (default: chosen by held-out errors)"
-    option(c, "--delay", "S", delay, type=within(float, 0.0, 1.0, " s"))
 
     c = command("via-points", "Adds, lists and removes via-points of a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")

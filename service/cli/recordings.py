@@ -152,7 +152,7 @@ def learn(args: argparse.Namespace) -> int:
     if len(accepted_by) > LONGEST_NAME:
         raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
     if args.demonstrations[0].exists():  # else its reader reports the missing file
-        check_count([path.stem for path in args.demonstrations], args.components)
+        check_count([path.stem for path in args.demonstrations])
     if refined := skill_in(args.refined) if args.refined else None:
         stored_demonstrations(refined)  # raises its errors before the new ones are read
     settings = cell_of(str(args.config)) if args.config else None
@@ -171,12 +171,6 @@ def learn(args: argparse.Namespace) -> int:
             demonstrations,
             name=args.name or args.output.stem,
             names=[path.stem for path in args.demonstrations],
-            components=args.components,
-            points=args.points,
-            ell=args.ell,
-            penalty=args.penalty,
-            seed=args.seed,
-            delay_s=args.delay,
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
             refined=refined,
