@@ -1,4 +1,4 @@
-"""`thirdhand cells`: the daemons on a network, and the status of each, once or live."""
+"""`thirdhand status --all`: the daemons on a network, and the status of each, once or live."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def cells(args: argparse.Namespace) -> int:
         console = Console(highlight=False)
         (console if console.is_terminal else Console(width=MOST_LETTERS)).print(_table(row(one) for one in served))
     if not served:
-        print("thirdhand cells: no daemon is alive on this network", file=sys.stderr)
+        print("thirdhand status: no daemon is alive on this network", file=sys.stderr)
     return 0 if served else 1
 
 

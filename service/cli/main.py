@@ -37,14 +37,13 @@ DEMO_RATE = (
     "the rate of the control loop (default: the rate in the cell's settings; 100 Hz for a shipped arm with --mouse, "
     "because a browser without a GPU needs a core for itself)"
 )
-ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
-    "set up": ("prepare", "arm", "calibrate"),
+    "check": ("doctor", "metrics", "bundle", "replay", "tune", "bench"),
+    "set up": ("arm", "calibrate"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -130,7 +129,6 @@ def parser() -> argparse.ArgumentParser:
     listen = f"listen on this Zenoh endpoint; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "connect to this Zenoh endpoint; may be repeated", action="append")
-    option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
     option(c, "--rate", "HZ", RATE)
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
     joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
@@ -143,7 +141,10 @@ def parser() -> argparse.ArgumentParser:
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
     check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
-    c.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
+    first = c.add_mutually_exclusive_group()
+    first.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
+    prepare = "compile what this cell needs, once on a machine, so that its next start takes seconds, and exit"
+    first.add_argument("--prepare", action="store_const", dest="run", const="cli.prepare.prepare", help=prepare)
     add_end_with(c)
 
     c = command(
@@ -189,15 +190,12 @@ def parser() -> argparse.ArgumentParser:
         "replay",
         "Runs the core on a recording, or on several that follow each other, and compares every frame. Missing and "
         "damaged parts are listed; only with --exact they are failures.",
-        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay yesterday.mcap --config calmer.toml\n"
-        "  thirdhand replay archive/*.mcap --each --workers 8",
+        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay archive/*.mcap --each --workers 8",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
     flag(c, "--exact", "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad")
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
-    compared = "instead, compare the recording's settings with these, for the same hands"
-    option(c, "--config", "CELL", f"{compared}: {ARM_HELP}")
     flag(c, "--each", "replay each recording by itself; no failure stops the others")
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
@@ -328,11 +326,13 @@ def parser() -> argparse.ArgumentParser:
     flag(c, "--turned", "correct the orientation of the tool too")
     flag(c, "--undo", "undo the last correction")
 
-    c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
+    about = "Shows the status of a running daemon, or of all."
+    c = _reach(command("status", about, "thirdhand status --json\n  thirdhand status --all"))
     flag(c, "--json", "print <cell>/status as JSON; with --watch, one line per status")
     kinds = c.add_mutually_exclusive_group()
     flag(kinds, "--watch", "show hands, tool, target and distances as they change")
     flag(kinds, "--exit-code", "exit with code 1 also if the cell is at fault")
+    flag(c, "--all", "list all cells on the network; with --watch in a table, each second")
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     flag(c, "--json", "print the findings as JSON")
@@ -340,13 +340,6 @@ def parser() -> argparse.ArgumentParser:
     _reach(command("hold", "Stops the arm until `resume`.", "thirdhand hold"))
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
     _reach(command("reset", "Ends a fault.", "thirdhand reset"))
-
-    c = command(
-        "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
-    )
-    flag(c, "--json", "print names and statuses as a JSON list; with --watch, each second")
-    flag(c, "--watch", "show all cells in a table, each second, until Ctrl-C")
-    _reach(c, one=False)
 
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
     c = command("bundle", about, "thirdhand bundle --config cell.toml")
@@ -361,11 +354,6 @@ def parser() -> argparse.ArgumentParser:
     c = command("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
     option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
-
-    about = "Compiles, once on a machine, what daemons need, so that `serve` starts at once."
-    c = command("prepare", about, "thirdhand prepare --config /etc/thirdhand/*.toml")
-    option(c, "--config", "CELL", f"the cells, as their arms' numbers of joints matter: {ARM_HELP}", nargs="+")
-    option(c, "--skill", "FILE", "the skill of the cell (default: the shipped soldering skill)", type=Path)
 
     c = command(
         "arm",
@@ -428,15 +416,14 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
     """The same parser with the options by which a daemon is reached, and if `one`, its cell."""
     group = sub.add_argument_group(
         "how the daemon is reached",
-        f"An option that is not given is taken from the variable in its help, else from the file\n{CLIENT_FILE}.",
+        "An option that is not given is taken from the variable in its help, else from the file\n"
+        f"{CLIENT_FILE}.\nThe certificate and Zenoh's own settings are taken from $THIRDHAND_CERTIFICATE and\n"
+        "$THIRDHAND_ZENOH_CONFIG, else from the same file.",
     )
     endpoint = "Zenoh endpoint of the daemon or of a router; if repeated, the first that answers"
     option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    role = "the folder of your role, with certificate.pem, key.pem and authority.pem ($THIRDHAND_CERTIFICATE)"
-    option(group, "--certificate", "DIR", role)
-    option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
     sub.set_defaults(reaches=True)
     return sub
 

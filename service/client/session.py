@@ -213,8 +213,8 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         if folder or not problem:
             return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
         return (
-            f"{endpoint} requires a certificate, and none was given: the folder of your role needed, as "
-            "--certificate or $THIRDHAND_CERTIFICATE"
+            f"{endpoint} requires a certificate, and none was given: the folder of your role needed, in "
+            "$THIRDHAND_CERTIFICATE or in the file of client settings"
         )
     except OSError:
         pass

@@ -304,8 +304,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the host cannot be reached", "check the address, the network and its firewall"),
         Incident(Condition.PORT_FOREIGN, None, "no Zenoh session",
             "something listens on the port, but opens no Zenoh session",
-            "give the `--certificate` of your role, for an endpoint tls/...; or wait, if the daemon is overloaded; "
-            "or choose another `--listen`, if another program has the port"),
+            "for an endpoint tls/..., give your certificate by $THIRDHAND_CERTIFICATE; or wait, if the daemon is "
+            "overloaded; or choose another `--listen`, if another program has the port"),
     ),
 }  # fmt: skip
 

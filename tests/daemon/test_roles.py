@@ -285,9 +285,12 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
 
 
 @pytest.mark.thorough
-def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path, tmp_path: Path) -> None:
+def test_daemons_of_two_cells_see_each_other_by_their_certificates(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of which one connects to the other; a third is of another authority, a fourth has none."""
-    at, operator = "", ("--certificate", str(secrets / "operator"))
+    at = ""
+    monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
     with contextlib.ExitStack() as closing:
         endpoints_of: dict[str, str] = {}
         for name in ("lab/a", "lab/b"):
@@ -301,7 +304,7 @@ def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path
             shown = until(
                 lambda endpoint=endpoint: (
                     shown
-                    if len(shown := json.loads(told("cells", "--json", "--connect", endpoint, *operator).stdout)) == 2
+                    if len(shown := json.loads(told("status", "--all", "--json", "--connect", endpoint).stdout)) == 2
                     and all(cell["status"] for cell in shown)
                     else None
                 )
@@ -319,9 +322,9 @@ def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path
         assert re.search(
             "^thirdhand serve: the certificate of the daemon .* is not from the authority in", foreign.stderr
         )
-        without = thirdhand("cells", "--connect", endpoint)
+        without = thirdhand("status", "--all", "--connect", endpoint, env=os.environ | {"THIRDHAND_CERTIFICATE": ""})
         assert (without.returncode, without.stdout) == (1, "")
-        assert re.search("^thirdhand cells: .* requires a certificate, and none was given", without.stderr)
+        assert re.search("^thirdhand status: .* requires a certificate, and none was given", without.stderr)
 
 
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:
@@ -342,16 +345,20 @@ def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
         open_session(connect=endpoints(false), certificate=secrets / "tracker", timeout_s=1.0)
 
 
-def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path) -> None:
+def test_a_daemon_and_its_commands_by_certificates(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\n'
     with launched(tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
-        at = ("--connect", service.endpoint, "--certificate")
+        at = ("--connect", service.endpoint)
         assert service.endpoint.startswith("tls/127.0.0.1:")
-        held = thirdhand("hold", *at, str(secrets / "operator"))
+        monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
+        held = told("hold", *at)
         assert held.returncode == 0, held.stderr
-        from_shell = thirdhand("status", *at[:2], env=os.environ | {"THIRDHAND_CERTIFICATE": str(secrets / "operator")})
+        from_shell = thirdhand("status", *at)
         assert from_shell.returncode == 0, from_shell.stderr
-        refused = told("resume", *at, str(secrets / "observer"))
+        monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "observer"))
+        refused = told("resume", *at)
         assert refused.returncode == 1
         assert "nobody answers" in refused.stderr
         with (
