@@ -110,14 +110,11 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "bench", "Measures the timing of the control loop on this machine.", "thirdhand bench --rate 1000 --seconds 60"
     )
-    option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
+    option(c, "--seconds", "S", "measure for this time", 24.0, type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)
     flag(c, "--json", "print the report as one JSON object")
     option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
-    other = c.add_mutually_exclusive_group()
-    flag(other, "--loads", "measure under each kind of load beside the loop, --seconds for each")
-    flag(other, "--soak", "measure memory and open files over time, with a sample every 5 s or less")
 
     c = command(
         "serve",
