@@ -358,7 +358,7 @@ def parser() -> argparse.ArgumentParser:
         "thirdhand arm my-arm.urdf",
     )
     option(c, "urdf", "URDF", "the arm's description", type=Path)
-    option(c, "--plate", "LINK", "the link that carries the tool (default: the most probable one)")
+    option(c, "--plate", "LINK", "the link that carries the tool (default: the end of the chain, if it has only one)")
     at = (
         "position of the arm's root in frame base [m] (default: 0 0 0, or nearby if only that reaches the demo's scene)"
     )
