@@ -234,7 +234,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "that agree",
             "look for reflections, and for a second source"),
         Incident(Cause.SWAPPED, None, "hands swapped",
-            "a hand where the other hand was, and the other where it was; accepted after {hands.swapped_s s}",
+            "a hand where the other hand was, and the other where it was; accepted after 2 s",
             "let the tracker see both hands apart for a moment: it takes left for right"),
         Incident(Cause.WRONG_FRAME, None, "wrong frame",
             "a pose in a frame that is neither `base` nor one of `[hands] frame` and `[trackers.NAME]`",

@@ -431,7 +431,7 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
         if points == skill.via_points:
             return skill
-        adapted = skill_of(skill.file, points, tolerance, settings.tool.max_gain)
+        adapted = skill_of(skill.file, points, tolerance)
         names = ", ".join(point.name for point in points) or "none, the skill's own were removed"
         log.info(
             "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand via-points remove "
@@ -479,7 +479,7 @@ def serve(
     Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
     LoopError if the control loop cannot continue.
     """
-    skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
+    skill_worker = SkillWorker()
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
         with ahead_of_others():

@@ -41,9 +41,6 @@ CHANGES: tuple[Change, ...] = (
     {"tool": {"follow": "closely", "max_jerk": 150.0}},
     {"tool": {"max_speed": 0.5}},  # its acceleration and jerk follow from it
     {"tool": {"max_speed": 0.3}},
-    {"hands": {"noise_std_m": 0.005}},
-    {"hands": {"jump": 0.02}},
-    {"hands": {"jump": 0.08, "jump_speed": 3.0}},
     {"hands": {"stale_ms": 200.0, "unseen_ms": 1000.0}},
 )
 TOTALS = ("held_s", "limits_s", "rejected")  # of VariantFigures
