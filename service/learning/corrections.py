@@ -21,8 +21,9 @@ from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.tuning import SEGMENT_END_M
 from service.core.skill.via_points import rest_of
+from service.learning.choice import MAX_GAIN
 from service.learning.skill_file import SkillError, StoredSkill
-from service.learning.via_points import MAX_GAIN, NOTED_M, adapted
+from service.learning.via_points import NOTED_M, adapted
 
 LEAST_CORRECTION_M = NOTED_M  # a tool that is off by less is where the skill has it
 OFFERED_AFTER = 3  # corrections at the same hands after which a demonstration is proposed

@@ -488,14 +488,6 @@ def _absolute(value: str, base: Path, where: str) -> str:
         raise SettingsError(f"{where}: {value!r} given; no user of this name has a folder here") from None
 
 
-def _mistakes(given: Any) -> list[str]:
-    try:
-        validated(given, Settings)
-    except InvalidError as error:
-        return [str(error)]
-    return []
-
-
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from the content of a TOML file; `origin` names it in errors. Raises SettingsError.
 
@@ -507,12 +499,8 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         _make_paths_absolute(given, folder)
         arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            try:
-                own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
-                given = completed(given, Urdf(own, origin=arm["urdf"]))
-            except (UrdfError, SettingsError) as error:  # mistakes outside the arm's tables are reported too
-                others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
-                raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
+            own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
+            given = completed(given, Urdf(own, origin=arm["urdf"]))
         settings = validated(given, Settings)
         urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
         check(settings.joints, urdf, settings.arm.plate)
