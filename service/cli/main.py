@@ -329,7 +329,8 @@ def parser() -> argparse.ArgumentParser:
     kinds = c.add_mutually_exclusive_group()
     flag(kinds, "--watch", "show hands, tool, target and distances as they change")
     flag(kinds, "--exit-code", "exit with code 1 also if the cell is at fault")
-    flag(c, "--all", "list all cells on the network; with --watch in a table, each second")
+    every = "list all cells on the network; with --watch in a table, each second"
+    c.add_argument("--all", action="store_const", dest="run", const="cli.cells.cells", help=every)
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     flag(c, "--json", "print the findings as JSON")

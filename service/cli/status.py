@@ -33,13 +33,7 @@ STUCK = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers, or any with --all; 1 at a fault with --exit-code, and when
-    --watch ends.
-    """
-    if args.all:
-        from service.cli.cells import cells
-
-        return cells(args)
+    """Exit code 0 if a daemon answers; 1 at a fault with --exit-code, and when --watch ends."""
     if args.watch:
         return _watch(args)
     now = msgspec.convert(ask(args, "status"), Status)

@@ -29,14 +29,14 @@ from service.core.intake.tremor import no_tremor, note_tremor
 from service.core.intake.tuning import (
     DELAY_TOLERANCE_S,
     END_SHARE,
+    HAND_STILL_MPS,
+    HAND_STILL_S,
     LEAST_NOISE_M,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
     NOISE_STD_M,
     REAPPEARED_VARIANCE_SHARE,
     SETTLED_SAMPLES,
-    STILL_S,
-    STILL_SPEED_MPS,
     STILLNESS_FALL_S,
     STILLNESS_LOWPASS_S,
     TRACKER_MEMORY_S,
@@ -51,7 +51,7 @@ def smoothing(period_s: float) -> Vector:
     """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
     stillness: 1 - exp(-period / time constant).
     """
-    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, STILL_S, STILLNESS_FALL_S)])
+    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, HAND_STILL_S, STILLNESS_FALL_S)])
 
 
 @compiled
@@ -81,7 +81,7 @@ def stillness_of(velocities: Vector, period_s: float) -> Vector:
     lowpass = np.zeros((2, 3))
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
-            stillness[side] = stillness_after(velocity[side], changes, STILL_SPEED_MPS, lowpass[side], stillness[side])
+            stillness[side] = stillness_after(velocity[side], changes, HAND_STILL_MPS, lowpass[side], stillness[side])
         row[:] = stillness
     return out
 
@@ -101,7 +101,7 @@ class HandEstimator:
         """
         interval_s = ticks * self._period_s
         used_s = min(ticks, len(self._models)) * self._period_s
-        return parameters(**model(used_s), smoothing=smoothing(interval_s), still_speed=STILL_SPEED_MPS)
+        return parameters(**model(used_s), smoothing=smoothing(interval_s), still_speed=HAND_STILL_MPS)
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""

@@ -109,9 +109,9 @@ ARM_STILL_S = MAX_LATE_S  # an arm must be at rest for this time before it is re
 # 1e-4 to 0.01. More: the first second is filtered more. Less: the first second is noisier.
 NOISE_STD_M = 0.002  # noise of each axis before it is estimated
 # 0.01 to 0.5. More: slow reaches count as rest. Less: trembling hands are in motion.
-STILL_SPEED_MPS = 0.05  # a faster hand is in motion
+HAND_STILL_MPS = 0.05  # a faster hand is in motion
 # 0.02 to 2. More: rest is recognised later. Less: turning points look like rest.
-STILL_S = 0.2  # a slow hand counts as still after this time
+HAND_STILL_S = 0.2  # a slow hand counts as still after this time
 # 0.005 to 0.3. More: outliers are followed. Less: quick reaches are rejected.
 JUMP_M = 0.04  # a sample farther from its prediction is a jump
 # 0 to 5. More: outliers after a pause are followed. Less: hands that reappear are rejected.
