@@ -107,9 +107,12 @@ def test_the_places_are_those_of_the_demo() -> None:
 
 
 def test_the_only_end_is_the_plate_and_several_ends_are_listed() -> None:
-    assert plate_of(Urdf((SHIPPED / "ur5.urdf").read_text())) == "tool0"
-    with pytest.raises(UrdfError, match=r"has \d+ ends: name the link that carries the tool by --plate; .*right_hand"):
-        plate_of(Urdf(description(SAWYER, cover=False)))
+    text = (SHIPPED / "ur5.urdf").read_text()
+    assert plate_of(Urdf(text)) == "tool0"
+    camera = '<link name="camera"/><joint name="mount" type="fixed"><parent link="wrist_3_link"/><child link="camera"/>'
+    two_ends = Urdf(text.replace("</robot>", f"{camera}</joint></robot>"))
+    with pytest.raises(UrdfError, match=r"has 2 ends: name .* by --plate; the ends are tool0, camera, and"):
+        plate_of(two_ends)
 
 
 def test_the_tool_of_a_plate_that_points_along_its_x_is_turned() -> None:
