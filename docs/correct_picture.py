@@ -68,7 +68,7 @@ def main() -> None:
     held = begin + SHARE * (end - begin)
     tool = before.mean(held[None], [before.model.names[STAGE + 1]])[0] + LED_M
     made = correction_at(before, held, STAGE, tool)
-    after, effect = corrected(before, made.among(before.via_points), made.point, max_gain=settings.tool.max_gain)
+    after, effect = corrected(before, made.among(before.via_points), made.point)
 
     begun = round(REST_S / settings.period_s)
     hand, old = (one[begun // 2 :] for one in motion(before, before, settings))

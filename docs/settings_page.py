@@ -42,8 +42,8 @@ base_from_tracker = [0.80, 0.0, 0.02, 0.0, 0.0, 1.0, 0.0]
 max_speed = 0.5
 ```
 
-The whole file is checked before anything starts. All mistakes are listed at once, each with the
-values that would have been accepted.
+The whole file is checked before anything starts. A mistake is printed with its place and the values
+that would have been accepted.
 
 * Units are part of the name (`_ms`, `_hz`, `_mb`) or stand in brackets in the last column.
 * Positions are in frame `base`, unless the last column names another frame.

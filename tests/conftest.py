@@ -32,6 +32,14 @@ pytest_plugins = ["support.busy"]
 PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
+PREPARE = """
+from service.cli.prepare import compiled_for
+from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
+for arm in ("wam", "ur5"):
+    print(compiled_for(cell_of(arm), recordings() / SHIPPED_SKILL), flush=True)
+"""
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Begin to compile what the tests call, beside their collection; cached functions take 2 s.
 
@@ -40,7 +48,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(_Instantly(config), "instantly")
-        command, environment = python("-m", "service", "prepare", "--config", "wam", "ur5")
+        command, environment = python("-c", PREPARE)
         process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
         config.stash[PREPARING] = process
         config.add_cleanup(process.kill)
@@ -77,7 +85,7 @@ def pytest_runtestloop(session: pytest.Session) -> None:
     """Begin no test before everything is compiled; workers wait for the process that they serve."""
     preparing = session.config.stash.get(PREPARING, None)
     if preparing is not None and preparing.wait() != 0:
-        pytest.exit("`thirdhand prepare` failed; its output is above", returncode=1)
+        pytest.exit("compilation failed; its output is above", returncode=1)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -1,56 +1,27 @@
-"""The link of a URDF that probably carries the tool, and the direction in which the tool points."""
+"""The link of a URDF that carries the tool, and the direction in which the tool points."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.settings.urdf import Urdf, UrdfJoint
+from service.settings.urdf import Urdf, UrdfError, UrdfJoint
 
 LEAST_ALONG = 0.1  # the last axis points toward the plate if at least this share of the way to it is along the axis
 ALIGNED = 0.9  # two axes are the same from this cosine of their angle on
-# Patterns of a plate's name, from the most to the least certain.
-PLATE_NAMES = (r"tcp|tool_?cent", r"tool", r"(^|_)eef?(_|$)|end_?effector|flange|grasp", r"hand|gripper|palm")
-GRIPPER_NAME = re.compile(r"finger|gripper|jaw|knuckle|claw|thumb", re.IGNORECASE)
 
 
 def plate_of(urdf: Urdf) -> str:
-    """The link that probably carries the tool: behind the last joint of the longest chain without
-    the gripper, the link whose name matches PLATE_NAMES, or else the last.
-    """
-    children: dict[str, list[UrdfJoint]] = {}
-    for joint in urdf.joints:
-        children.setdefault(joint.parent, []).append(joint)
-    depth = dict.fromkeys((urdf.root, *(joint.child for joint in urdf.joints)), 0)
-    for leaf in urdf.leaves:
-        count = 0
-        for joint in reversed(urdf.chain(leaf)):
-            count += joint.kind != "fixed"
-            depth[joint.parent] = max(depth[joint.parent], count)
-    link = last = urdf.root
-    while ahead := [joint for joint in children.get(link, ()) if joint.kind != "fixed" or depth[joint.child]]:
-        fingers = [joint for joint in ahead if joint.kind != "fixed" or depth[joint.child]]
-        best = max(ahead, key=lambda joint: depth[joint.child] + (joint.kind != "fixed"))
-        beyond = depth[best.child] + (best.kind != "fixed")
-        is_gripper = GRIPPER_NAME.search(best.name) or (beyond <= 3 and len(fingers) > 1)
-        if is_gripper:
-            break
-        link = best.child
-        if best.kind != "fixed":
-            last = link
-    found, waiting = [last], [last]
-    while waiting:
-        ahead = [joint for joint in children.get(waiting.pop(), ()) if joint.kind == "fixed"]
-        found += [joint.child for joint in ahead]
-        waiting += [joint.child for joint in ahead]
-    for pattern in PLATE_NAMES:
-        if named := [one for one in found if re.search(pattern, one, re.IGNORECASE)]:
-            return named[-1]
-    return found[-1] if len(found) <= 2 else last
+    """The only end of an arm's chain. Raises UrdfError with the candidates if it has several."""
+    if len(urdf.leaves) == 1:
+        return urdf.leaves[0]
+    raise UrdfError(
+        f"the arm has {len(urdf.leaves)} ends: name the link that carries the tool by --plate; the ends are "
+        f"{', '.join(urdf.leaves)}, and every link before them is accepted too"
+    )
 
 
 def turn_of_tool(chain: Sequence[UrdfJoint]) -> tuple[float, float, float, float]:

@@ -12,17 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from service.cli.calibrate_options import METRES
 from service.cli.keys import EnterPressed
 from service.cli.usage import CONNECT_TIMEOUT_S, UsageError, inputs_session
-from service.contract.explain import in_words
 from service.contract.messages import BASE
 from service.contract.printable import printable_lines
 from service.core.frame import Vector
 from service.files.shipped import ARMS, cell_of
 from service.process.progress import say
 from service.settings.config import Settings
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 from service.trackers.calibration.cell_file import (
     CalibrationRecord,
     hand_settings,
@@ -50,7 +47,6 @@ from service.trackers.calibration.solver import (
 )
 
 CHECK_S = 10.0
-MAX_TOUCHES = 12  # then the points end
 CALIBRATE_POLL_S = 0.02
 HINT_S = 5.0  # progress without a terminal is shown in this interval
 
@@ -59,7 +55,7 @@ def calibrate(args: argparse.Namespace) -> int:
     """Calibrate, check, or both. Exit code 0; 1 if the check finds a hand too far away."""
     given = points_given(args)
     file = Path(args.config) if args.config and args.config not in ARMS else None
-    only_check = args.check and not (args.held or args.points)
+    only_check = args.check and not (args.held or given)
     if file is not None and not only_check:
         real_path(file)  # before the arm is led in vain
     settings = cell_of(args.config) if args.config else None
@@ -84,30 +80,13 @@ def calibrate(args: argparse.Namespace) -> int:
 
 
 def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
-    """The points of the command line and of the file. Raises UsageError."""
-    if (args.at or args.at_file) and not args.points:
-        raise UsageError("--at and --at-file give points to touch: give --points too")
-    if args.points and args.recording is not None:
-        raise UsageError("--points are touched in a running cell: --from needs --held")
-    found = [tuple(map(float, point)) for point in args.at or ()]
-    if args.at_file is not None:
-        try:
-            text = content(args.at_file, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
-        except (OSError, UnusableError, UnicodeDecodeError) as error:
-            raise UsageError(f"--at-file {args.at_file}: {in_words(error, named=False)}") from None
-        for number, line in enumerate(text.splitlines(), 1):
-            words = line.partition("#")[0].replace(",", " ").split()
-            if not words:
-                continue
-            try:
-                x, y, z = map(METRES, words)
-            except (ValueError, argparse.ArgumentTypeError):
-                needed = "three numbers from -5 to 5 m needed"
-                raise UsageError(f"{args.at_file}, line {number}: {line!r} given; {needed}") from None
-            found.append((x, y, z))
-    if found and len(found) < MIN_POINTS:
-        raise UsageError(f"{len(found)} points given; {MIN_POINTS} or more needed")
-    return [(x, y, z) for x, y, z in found]
+    """The points to touch. Raises UsageError."""
+    points: list[tuple[float, float, float]] = [(x, y, z) for x, y, z in args.at or ()]
+    if points and args.recording is not None:
+        raise UsageError("points are touched in a running cell: --from needs no --at")
+    if points and len(points) < MIN_POINTS:
+        raise UsageError(f"{len(points)} points given; {MIN_POINTS} or more needed")
+    return points
 
 
 def _live(
@@ -125,7 +104,7 @@ def _live(
         record = _last(live.led(most_states=1), file, settings, args.hand)
     else:
         begun_s = time.monotonic()
-        if args.points:
+        if given:
             side = _side(live, args)
             track, remarks = live.led(most_states=1).hands[side], list[str]()
             tracker_of(track, settings)
@@ -152,7 +131,7 @@ def _live(
             found = solved(live.led(), settings, corners, args.hand)
             calibration, side, frame, remarks = found.calibration, found.side, found.frame, list(found.remarks)
         remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
-        record = _record(calibration, side, frame or settings.hands.frame, "points" if args.points else "held")
+        record = _record(calibration, side, frame or settings.hands.frame, "points" if given else "held")
         _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
         _write(file, record, frame, settings)
     if not args.check:
@@ -193,10 +172,9 @@ def _touched(
     """The calibration from points that are touched one after another. Raises CalibrationError."""
     hand: list[Vector] = []
     base: list[Vector] = []
-    count = len(given) or MAX_TOUCHES
     try:
-        while len(hand) < count:
-            where = "({:g}, {:g}, {:g}) m".format(*given[len(hand)]) if given else "the tool's point, at a new posture"
+        while len(hand) < len(given):
+            where = "({:g}, {:g}, {:g}) m".format(*given[len(hand)])
             say(f"{len(hand) + 1}: touch {where} with the tracked point of the {side} hand, then press Enter")
             while not pressed():
                 if not pressed.listens:
@@ -206,12 +184,11 @@ def _touched(
             live.collect()
             try:
                 at = live.touch(side)
-                point = np.array(given[len(hand)]) if given else live.tip()
             except CalibrationError as error:
                 say(f"not used: {error}")
                 continue
+            base.append(np.array(given[len(hand)]))
             hand.append(at)
-            base.append(point)
             if len(hand) >= MIN_POINTS:
                 try:
                     found = solve_points(np.array(hand), np.array(base), corners, section=section)

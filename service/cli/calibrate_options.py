@@ -14,7 +14,7 @@ ABOUT_CALIBRATE = (
 )
 CALIBRATE_EXAMPLE = """thirdhand calibrate --config cell.toml
   thirdhand calibrate --config cell.toml --held --check
-  thirdhand calibrate --config cell.toml --points --hand right
+  thirdhand calibrate --hand right --at .6 -.2 0 --at .6 .2 0 --at .9 0 0 --at .8 .1 .15
   thirdhand calibrate --config cell.toml --from led.mcap"""
 MAX_ACCEPTED_MM = 200.0
 METRES = within(float, -5, 5, " m")  # reads a coordinate of a point to touch
@@ -29,8 +29,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--config", "CELL", config)
     how = c.add_mutually_exclusive_group()
     flag(how, "--held", "the hand holds the tool while you lead the arm (the default)")
-    points = "the tracked point of the hand touches the tool at some postures, or points given by --at; Enter each"
-    flag(how, "--points", points)
+    at = "instead, the tracked point of the hand touches this point, in frame base [m], then Enter; four or more points"
+    how.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=at)
     check = (
         "measure for 10 s how far the hand is from where it should be while it holds the tool; with --held, after "
         "the calibration, else by the last one"
@@ -40,9 +40,6 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--hand", None, hand, choices=SIDES)
     recording = "use this recording of hands and joint states, instead of a running cell"
     option(c, "--from", "FILE", recording, dest="recording", type=Path)
-    at = "with --points, a point to touch, in frame base [m]; may be repeated"
-    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=at)
-    option(c, "--at-file", "FILE", "with --points, a file with a point X Y Z in each line", type=Path)
     accept = "accept this standard deviation of a mapped position at the corners of the bench"
     option(c, "--accept", "MM", accept, 10.0, type=within(float, 0.1, MAX_ACCEPTED_MM, " mm"))
     option(c, "--seconds", "S", "lead the tool for this time at most", 120.0, type=within(float, 5, 3600, " s"))

@@ -1,4 +1,4 @@
-"""`thirdhand cells`: the daemons on a network, and the status of each, once or live."""
+"""`thirdhand status --all`: the daemons on a network, and the status of each, once or live."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from service.client import Cell
 from service.client import cells as served_cells
 from service.contract.incidents import in_brief
 from service.contract.requests import ANY_DIRECTION
-from service.contract.roles import RENEW_DAYS
 from service.process import interrupt
 
 WATCH_S = 1.0  # interval of --watch, and the time in which a daemon has to answer
@@ -42,7 +41,7 @@ def cells(args: argparse.Namespace) -> int:
         console = Console(highlight=False)
         (console if console.is_terminal else Console(width=MOST_LETTERS)).print(_table(row(one) for one in served))
     if not served:
-        print("thirdhand cells: no daemon is alive on this network", file=sys.stderr)
+        print("thirdhand status: no daemon is alive on this network", file=sys.stderr)
     return 0 if served else 1
 
 
@@ -90,10 +89,8 @@ def row(cell: Cell, silent_s: float = 0.0) -> tuple[str, ...]:
     if now is None:
         return cell.name, "no status", *none, "it is starting, is busy, or denies access"
     timing = f"{now.rate_hz:.2f}", f"{now.lateness_us.p99:.0f}", f"{now.missed}"
-    note = now.certificate_days is not None and now.certificate_days < RENEW_DAYS
-    ends = f"certificate ends in {now.certificate_days:.0f} days" if note else ""
     hands = ", ".join(now.hand_age_ms) or "no hands"
     limits = f"tool {now.tool_limits[ANY_DIRECTION].text}" if ANY_DIRECTION in now.tool_limits else ""
     bound = f"now limited by {now.binding}" if now.binding else ""
-    notes = ", ".join(filter(None, (ends, limits, bound)))
+    notes = ", ".join(filter(None, (limits, bound)))
     return cell.name, in_brief(now.mode, now.reason), *timing, hands, now.skill, now.version, notes

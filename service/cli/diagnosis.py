@@ -18,7 +18,6 @@ from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_t
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Reason
 from service.contract.requests import Source, Status
-from service.contract.roles import RENEW_DAYS
 from service.contract.ros2 import NO_TYPE_HASH
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
@@ -104,10 +103,6 @@ def _in_order_of_cause(
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
     found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
     yield judged(now.version == own_version, "daemon", found, wanted, what_to_do(Condition.VERSIONS_DIFFER))
-    if now.certificate_days is not None:
-        level = "ok" if now.certificate_days > RENEW_DAYS else "note" if now.certificate_days > 0 else "wrong"
-        found, wanted = f"ends in {now.certificate_days:.0f} days", f"more than {RENEW_DAYS} days"
-        yield Finding(level, "certificate", found, wanted, what_to_do(Condition.CERTIFICATE_ENDS))
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
         return

@@ -7,7 +7,6 @@ import contextlib
 import os
 import re
 import secrets
-import socket
 import string
 import webbrowser
 from pathlib import Path
@@ -22,14 +21,13 @@ from service.trackers.cell_view import Latest
 from service.trackers.hands_page import HandsPage, HeadsetPage
 from service.trackers.mouse_page import MousePage
 from service.trackers.pinch import Pinches
-from service.trackers.web_server import Address, ServerCertificate, server_certificate
+from service.trackers.web_server import Address, server_certificate
 
 ORDER_TIMEOUT_S = 5.0  # a page waits for the answer to its order for this long
-TOKEN_FILE = Path("~/.local/state/thirdhand/page-token")  # kept over restarts: open pages then connect again
+STATE = Path("~/.local/state/thirdhand")  # the user's files of pages
+TOKEN_FILE = STATE / "page-token"  # kept over restarts: open pages then connect again
 TOKEN_LETTERS = string.ascii_lowercase + string.digits
 TOKEN_LENGTH = 12  # 62 bits, and few enough to type on a headset
-ANY_HOST = ("0.0.0.0", "::")
-LOOPBACK_NAMES = {"localhost", "127.0.0.1", "::1"}
 
 
 def hands(args: argparse.Namespace) -> int:
@@ -54,11 +52,11 @@ def _camera(args: argparse.Namespace) -> int:
 
 def _web(args: argparse.Namespace) -> int:
     listen = web_address("--listen", args.listen)
-    certificate = server_certificate(args.https) if args.https else None
+    certificate = server_certificate(args.https, STATE.expanduser()) if args.https else None
     if certificate is None and args.web and not is_local(f"tcp/{listen}"):
         raise UsageError(
-            f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: --https DIR with the "
-            "folder `headset` of `thirdhand certificates` needed, or 127.0.0.1 and a cable (`adb reverse`)"
+            f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: --https NAME with the "
+            "name or address of this machine needed, or 127.0.0.1 and a cable (`adb reverse`)"
         )
     with reached(args, None) as session, Tracker(session, args.cell, timeout_s=None) as tracker:
         client = Client(session, args.cell, timeout_s=ORDER_TIMEOUT_S)
@@ -71,7 +69,7 @@ def _web(args: argparse.Namespace) -> int:
             page = HeadsetPage(tracker, client, Latest(session, args.cell), pinches=pinches, **served)
 
         def listening(address: Address) -> None:
-            shown = Address(_name_for_browsers(address.host, certificate), address.port)
+            shown = Address(certificate.name, address.port) if certificate else address
             url = f"{page.server.scheme}://{shown}/?token={page.server.token}"
             print(url, flush=True)
             if args.mouse:
@@ -118,11 +116,3 @@ def _token() -> str:
     if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", found):
         raise ExplainedError(f"{path}: {TOKEN_LENGTH} or more small letters and digits needed; delete it for a new one")
     return found
-
-
-def _name_for_browsers(host: str, certificate: ServerCertificate | None) -> str:
-    """The host in the page's address: of a server at all addresses, a name in its certificate."""
-    if host not in ANY_HOST or certificate is None:
-        return host
-    names = sorted(certificate.names - LOOPBACK_NAMES - {socket.gethostname()})
-    return names[0] if names else socket.gethostname()

@@ -20,7 +20,6 @@ from service.contract import channels
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
-from service.contract.roles import DAEMON, ROLES
 from service.learning.residual_risk import OPTION
 from service.process import interrupt
 from service.process.progress import say
@@ -38,14 +37,13 @@ DEMO_RATE = (
     "the rate of the control loop (default: the rate in the cell's settings; 100 Hz for a shipped arm with --mouse, "
     "because a browser without a GPU needs a core for itself)"
 )
-ZENOH_CONFIG = "a file with Zenoh's own settings, where the service sets none ($THIRDHAND_ZENOH_CONFIG)"
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "cells", "metrics", "bundle", "replay", "tune", "bench"),
-    "set up": ("prepare", "arm", "calibrate", "certificates"),
+    "check": ("doctor", "metrics", "bundle", "replay", "tune", "bench"),
+    "set up": ("arm", "calibrate"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
 
@@ -112,14 +110,11 @@ def parser() -> argparse.ArgumentParser:
     c = command(
         "bench", "Measures the timing of the control loop on this machine.", "thirdhand bench --rate 1000 --seconds 60"
     )
-    option(c, "--seconds", "S", "measure for this time (default: 24; with --soak 1800)", type=within(float, 0.1, 1e6))
+    option(c, "--seconds", "S", "measure for this time", 24.0, type=within(float, 0.1, 1e6))
     option(c, "--rate", "HZ", RATE)
     flag(c, "--json", "print the report as one JSON object")
     option(c, "--arm", "ARM", ARM_HELP, "wam")
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
-    other = c.add_mutually_exclusive_group()
-    flag(other, "--loads", "measure under each kind of load beside the loop, --seconds for each")
-    flag(other, "--soak", "measure memory and open files over time, with a sample every 5 s or less")
 
     c = command(
         "serve",
@@ -131,7 +126,6 @@ def parser() -> argparse.ArgumentParser:
     listen = f"listen on this Zenoh endpoint; may be repeated (default: {channels.ENDPOINT})"
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "connect to this Zenoh endpoint; may be repeated", action="append")
-    option(c, "--zenoh-config", "FILE", ZENOH_CONFIG)
     option(c, "--rate", "HZ", RATE)
     option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
     joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
@@ -144,7 +138,10 @@ def parser() -> argparse.ArgumentParser:
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
     check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
-    c.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
+    first = c.add_mutually_exclusive_group()
+    first.add_argument("--check", action="store_const", dest="run", const="cli.serve_check.check", help=check)
+    prepare = "compile what this cell needs, once on a machine, so that its next start takes seconds, and exit"
+    first.add_argument("--prepare", action="store_const", dest="run", const="cli.prepare.prepare", help=prepare)
     add_end_with(c)
 
     c = command(
@@ -161,7 +158,7 @@ def parser() -> argparse.ArgumentParser:
         "hands",
         "Publishes your hands, as a headset's browser or a camera of this machine tracks them, or as you drag them "
         "with a mouse or a finger. Open the address that it prints.",
-        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https secrets/headset\n"
+        "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https 192.168.1.20\n"
         "  thirdhand hands --camera --hand-length 0.19",
     )
     kinds = c.add_mutually_exclusive_group(required=True)
@@ -171,8 +168,8 @@ def parser() -> argparse.ArgumentParser:
     option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
     address = "serve the page at this address; port 0: any free one; for other machines with --https"
     option(c, "--listen", "HOST:PORT", address, "127.0.0.1:8443")
-    https = "serve the page by HTTPS with certificate.pem and key.pem in this folder (`thirdhand certificates`)"
-    option(c, "--https", "DIR", https)
+    https = "serve the page by HTTPS, for a headset that reaches this machine by this name or address"
+    option(c, "--https", "NAME", https)
     length = "length of your hand, from the crease of the wrist to the tip of the middle finger (--camera)"
     option(c, "--hand-length", "M", length, 0.18, type=within(float, 0.1, 0.3, " m"))
     view = "horizontal angle of view of the lens, in degrees (--camera)"
@@ -190,15 +187,12 @@ def parser() -> argparse.ArgumentParser:
         "replay",
         "Runs the core on a recording, or on several that follow each other, and compares every frame. Missing and "
         "damaged parts are listed; only with --exact they are failures.",
-        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay yesterday.mcap --config calmer.toml\n"
-        "  thirdhand replay archive/*.mcap --each --workers 8",
+        "thirdhand replay recordings/golden.mcap --exact\n  thirdhand replay archive/*.mcap --each --workers 8",
     )
     option(c, "files", "FILE", "a recording, and those that follow it", nargs="+")
     flag(c, "--exact", "fail for gaps, damage, a cut, and differences below 10 µm and 10 µrad")
     option(c, "--after", "TICK", "start from the first recorded state at or after this tick", type=int)
     option(c, "--output", "FILE", "write the new frames as a recording, for report, view or comparison")
-    compared = "instead, compare the recording's settings with these, for the same hands"
-    option(c, "--config", "CELL", f"{compared}: {ARM_HELP}")
     flag(c, "--each", "replay each recording by itself; no failure stops the others")
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
@@ -275,16 +269,6 @@ def parser() -> argparse.ArgumentParser:
         "for it; skill, daemon and status name both"
     )
     option(c, OPTION, "NAME", accept)
-    count, positive = within(int, 1, 2500), within(float, 1e-3, 1e4)
-    option(c, "--points", "N", "the number of points of the reference trajectory", 200, type=count)
-    ell = "the width parameter of the kernel [1/m²] (default: chosen by held-out errors; 5 with --components)"
-    option(c, "--ell", "L", ell, type=positive)
-    components = "take the reference from a mixture of K Gaussians, as in the paper (default: from the demonstrations)"
-    option(c, "--components", "K", components, type=count)
-    option(c, "--penalty", "L", "lambda of the skill with --components (default: 2)", type=positive)
-    option(c, "--seed", None, "the seed of the mixture's start and of the sampled inputs", 0, type=int)
-    delay = "the teacher's delay [s], for demonstrations with via-points (default: chosen by held-out errors)"
-    option(c, "--delay", "S", delay, type=within(float, 0.0, 1.0, " s"))
 
     c = command("via-points", "Adds, lists and removes via-points of a running daemon.", "thirdhand via-points list")
     actions = c.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -339,11 +323,14 @@ def parser() -> argparse.ArgumentParser:
     flag(c, "--turned", "correct the orientation of the tool too")
     flag(c, "--undo", "undo the last correction")
 
-    c = _reach(command("status", "Shows the status of a running daemon.", "thirdhand status --json"))
+    about = "Shows the status of a running daemon, or of all."
+    c = _reach(command("status", about, "thirdhand status --json\n  thirdhand status --all"))
     flag(c, "--json", "print <cell>/status as JSON; with --watch, one line per status")
     kinds = c.add_mutually_exclusive_group()
     flag(kinds, "--watch", "show hands, tool, target and distances as they change")
     flag(kinds, "--exit-code", "exit with code 1 also if the cell is at fault")
+    every = "list all cells on the network; with --watch in a table, each second"
+    c.add_argument("--all", action="store_const", dest="run", const="cli.cells.cells", help=every)
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = _reach(command("doctor", about, "thirdhand doctor"))
     flag(c, "--json", "print the findings as JSON")
@@ -351,13 +338,6 @@ def parser() -> argparse.ArgumentParser:
     _reach(command("hold", "Stops the arm until `resume`.", "thirdhand hold"))
     _reach(command("resume", "Ends an operator's hold.", "thirdhand resume"))
     _reach(command("reset", "Ends a fault.", "thirdhand reset"))
-
-    c = command(
-        "cells", "Lists the daemons on a network with their status.", "thirdhand cells --connect tcp/127.0.0.1:7447"
-    )
-    flag(c, "--json", "print names and statuses as a JSON list; with --watch, each second")
-    flag(c, "--watch", "show all cells in a table, each second, until Ctrl-C")
-    _reach(c, one=False)
 
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
     c = command("bundle", about, "thirdhand bundle --config cell.toml")
@@ -373,18 +353,13 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--listen", "[HOST:]PORT", "serve the page /metrics at this address", "127.0.0.1:9464")
     _reach(c, one=False)
 
-    about = "Compiles, once on a machine, what daemons need, so that `serve` starts at once."
-    c = command("prepare", about, "thirdhand prepare --config /etc/thirdhand/*.toml")
-    option(c, "--config", "CELL", f"the cells, as their arms' numbers of joints matter: {ARM_HELP}", nargs="+")
-    option(c, "--skill", "FILE", "the skill of the cell (default: the shipped soldering skill)", type=Path)
-
     c = command(
         "arm",
         "Reads an arm's URDF, reports on it, and writes a first cell: settings, and a picture of them.",
         "thirdhand arm my-arm.urdf",
     )
     option(c, "urdf", "URDF", "the arm's description", type=Path)
-    option(c, "--plate", "LINK", "the link that carries the tool (default: the most probable one)")
+    option(c, "--plate", "LINK", "the link that carries the tool (default: the end of the chain, if it has only one)")
     at = (
         "position of the arm's root in frame base [m] (default: 0 0 0, or nearby if only that reaches the demo's scene)"
     )
@@ -396,26 +371,6 @@ def parser() -> argparse.ArgumentParser:
     c = command("calibrate", calibrate_options.ABOUT_CALIBRATE, calibrate_options.CALIBRATE_EXAMPLE)
     calibrate_options.add_options(c)
     _reach(c)
-
-    c = command(
-        "certificates",
-        "Makes an authority, and certificates for the daemon and for each role on a network. With --role it makes one "
-        "more certificate by the authority in the folder, with --renew it renews all.",
-        "thirdhand certificates secrets --host bench.local\n  thirdhand certificates secrets --renew",
-    )
-    option(c, "folder", "DIR", "a new folder, private to its user; with --role the folder of an authority")
-    option(
-        c,
-        "--host",
-        "NAME",
-        "a name or address at which the daemon and pages are reached; may be repeated",
-        action="append",
-    )
-    c.add_argument("--role", choices=(*ROLES, DAEMON), help="make one more certificate, for this role")
-    option(c, "--name", "ROLE-N", "the name of that certificate, like tracker-2 (default: the first that is free)")
-    renew = "renew the authority and all certificates in the folder, with their names and keys, for --days from now"
-    flag(c, "--renew", renew)
-    option(c, "--days", "N", "the certificates are valid for this number of days", 3650, type=within(int, 1, 36500))
 
     # All arguments are passed to `python -m sim`, so there are no options here, not even --help.
     c, abouts["sim"] = commands_of.add_parser("sim", help=SIM, prefix_chars="\0", add_help=False), SIM
@@ -459,15 +414,14 @@ def _reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argume
     """The same parser with the options by which a daemon is reached, and if `one`, its cell."""
     group = sub.add_argument_group(
         "how the daemon is reached",
-        f"An option that is not given is taken from the variable in its help, else from the file\n{CLIENT_FILE}.",
+        "An option that is not given is taken from the variable in its help, else from the file\n"
+        f"{CLIENT_FILE}.\nThe certificate and Zenoh's own settings are taken from $THIRDHAND_CERTIFICATE and\n"
+        "$THIRDHAND_ZENOH_CONFIG, else from the same file.",
     )
     endpoint = "Zenoh endpoint of the daemon or of a router; if repeated, the first that answers"
     option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {channels.ENDPOINT})", action="append")
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    role = "the folder of your role, made by `thirdhand certificates` ($THIRDHAND_CERTIFICATE)"
-    option(group, "--certificate", "DIR", role)
-    option(group, "--zenoh-config", "FILE", ZENOH_CONFIG)
     sub.set_defaults(reaches=True)
     return sub
 

@@ -1,4 +1,4 @@
-"""`thirdhand prepare`: compilation of what daemons need, before their first start."""
+"""`thirdhand serve --prepare`: compilation of what a daemon needs, before its first start."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ import argparse
 import time
 from pathlib import Path
 
-from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
+from service.cli.serve import settings_of, skill_path
 from service.process.progress import progress
 from service.settings.config import Settings
 
 
 def prepare(args: argparse.Namespace) -> int:
-    """Compile and cache the functions of the loops of cells, once for each number of joints; exit
-    code 0. Raises SkillError.
-    """
-    cells = {len(cell.joints.names): cell for cell in map(cell_of, args.config or ["wam"])}
-    for _, settings in sorted(cells.items()):
-        print(compiled_for(settings, args.skill or skills_folder(settings) / SHIPPED_SKILL), flush=True)
+    """Compile and cache the functions of a cell's loop; exit code 0. Raises SkillError."""
+    settings = settings_of(args)
+    print(compiled_for(settings, skill_path(settings, args)), flush=True)
     return 0
 
 

@@ -23,7 +23,6 @@ from service.contract.requests import Status
 from service.files.demonstration_reader import iter_hands, read_demonstration
 from service.files.mcap_file import ends_early
 from service.files.pose_streams import TRACK_NAMES, PoseTopic
-from service.files.recorded_hands import recorded_hands
 from service.files.recording import Recording
 from service.files.replay import replay as replayed
 from service.files.shipped import cell_of
@@ -89,10 +88,8 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
 
 def replay(args: argparse.Namespace) -> int:
     """Replay recordings; exit code 0 if all frames are within tolerance, or with `--exact` complete
-    and identical. With `--config` compare two settings; exit code 0 once they are compared.
+    and identical.
     """
-    if args.config is not None:
-        return _replay_with(args)
     if args.each:
         return _replay_each(args)
     if args.workers:
@@ -119,30 +116,6 @@ def _replay_each(args: argparse.Namespace) -> int:
     return 0 if passing == len(args.files) else 1
 
 
-def _replay_with(args: argparse.Namespace) -> int:
-    """Compare the settings of a recording with others, for the recorded hands."""
-    from service.cli.report_command import plain_console, print_table
-    from service.report.variants import compared  # its import is slow
-
-    if len(args.files) > 1 or args.exact or args.each or args.after is not None or args.output:
-        raise UsageError(
-            "--config compares the settings of one recording: without --exact, --each, --after and --output"
-        )
-    other = cell_of(args.config)
-    hands = recorded_hands(args.files[0])
-    with steps("replaying") as doing:
-        doing("replaying the hands with both settings")
-        tables, sentence = compared(hands, other, args.config)
-    for line in hands.remarks:
-        say(line)
-    console = plain_console()
-    print("The same hands with both settings; the arm is taken to move as commanded.")
-    for one in tables:
-        print_table(console, one)
-    print(f"\n{printable(sentence)}")
-    return 0
-
-
 def learn(args: argparse.Namespace) -> int:
     """Learn a skill; exit code 0 once it is written. An unsafe skill is not written."""
     check_writable(args.output, ".npz")
@@ -152,7 +125,7 @@ def learn(args: argparse.Namespace) -> int:
     if len(accepted_by) > LONGEST_NAME:
         raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
     if args.demonstrations[0].exists():  # else its reader reports the missing file
-        check_count([path.stem for path in args.demonstrations], args.components)
+        check_count([path.stem for path in args.demonstrations])
     if refined := skill_in(args.refined) if args.refined else None:
         stored_demonstrations(refined)  # raises its errors before the new ones are read
     settings = cell_of(str(args.config)) if args.config else None
@@ -171,12 +144,6 @@ def learn(args: argparse.Namespace) -> int:
             demonstrations,
             name=args.name or args.output.stem,
             names=[path.stem for path in args.demonstrations],
-            components=args.components,
-            points=args.points,
-            ell=args.ell,
-            penalty=args.penalty,
-            seed=args.seed,
-            delay_s=args.delay,
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
             refined=refined,

@@ -129,7 +129,6 @@ def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
         (given, "rate_hz", args.rate),
         (given["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
         (given["network"], "connect", args.connect),
-        (given["network"], "zenoh_config", str(args.zenoh_config) if args.zenoh_config else None),
         (given["arm"], "source", args.joints),
         (given["files"], "record", str(args.record) if args.record else None),
     ):

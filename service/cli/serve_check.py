@@ -13,7 +13,7 @@ from typing import Any
 
 from service.cli.serve import settings_of, skill_path
 from service.cli.status import in_gb
-from service.client.session import check_files, valid_until
+from service.client.session import check_files
 from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
@@ -99,10 +99,7 @@ def _disk(files: Files) -> str:
 
 def _certificates(network: Network) -> str:
     check_files(network.certificate, network.zenoh_config)
-    end = valid_until(network.certificate) if network.certificate else None
-    return f"{network.certificate or network.zenoh_config} can be read" + (
-        "" if end is None else f", valid until {end:%Y-%m-%d}"
-    )
+    return f"{network.certificate or network.zenoh_config} can be read"
 
 
 def _endpoint(endpoint: str, settings: Settings | None) -> str:

@@ -136,9 +136,7 @@ def check_writable(path: Path, suffix: str = "") -> None:
 
 def reaching(args: argparse.Namespace) -> ClientSettings:
     """The client settings in a command line. Raises SettingsError."""
-    return client_settings(
-        connect=args.connect, cell=vars(args).get("cell"), certificate=args.certificate, zenoh_config=args.zenoh_config
-    )
+    return client_settings(connect=args.connect, cell=vars(args).get("cell"))
 
 
 def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:

@@ -119,7 +119,7 @@ def check_usage(args: argparse.Namespace) -> None:
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serve the page until Ctrl-C."""
     listen = web_address("--web", args.web)
-    with reached(args) as session, web_viewer(rerun_program(), url, free_port()) as viewer:
+    with reached(args) as session, web_viewer(url) as viewer:
         client = Client(session, args.cell)
         latest = Latest(session, args.cell, client.status())
         page = LivePage(client=client, latest=latest, cell=args.cell, viewer=viewer)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from service.contract.explain import ExplainedError, in_words
 from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
 CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # files in the folder of a role
+FOLDER_NEEDED = f"a folder with {CERTIFICATE}, {KEY} and {AUTHORITY} needed"
 ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
 ATTEMPT_S = 1.0  # timeout of one attempt
 RETRY_S = 0.05  # pause before the next attempt
@@ -81,10 +81,10 @@ def open_session(
     one message on standard error, so that programs may be started in any order. With `at_once`, the
     call fails immediately if the system reports that nothing listens, or that there is no way.
 
-    `certificate` is a folder that `thirdhand certificates` made for a role, for endpoints that
-    begin with `tls/`; None: $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`,
-    $THIRDHAND_ZENOH_CONFIG is used. The caller closes the session. Raises UnreachableError, and
-    CertificateError at once if TLS fails for a certificate.
+    `certificate` is the folder of a role, for endpoints that begin with `tls/`; None:
+    $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`, $THIRDHAND_ZENOH_CONFIG is used.
+    The caller closes the session. Raises UnreachableError, and CertificateError at once if TLS
+    fails for a certificate.
     """
     for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
         if lacks := lacking(endpoint):
@@ -213,8 +213,8 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         if folder or not problem:
             return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
         return (
-            f"{endpoint} requires a certificate, and none was given: the folder of your role, made by "
-            "`thirdhand certificates`, needed, as --certificate or $THIRDHAND_CERTIFICATE"
+            f"{endpoint} requires a certificate, and none was given: the folder of your role needed, in "
+            "$THIRDHAND_CERTIFICATE or in the file of client settings"
         )
     except OSError:
         pass
@@ -293,13 +293,16 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
         raise UnreachableError(f"certificate {folder}: no user of this name has a folder here") from None
     for path in (own, key, authority):
         if not os.access(path, os.R_OK):
-            raise UnreachableError(f"cannot read {path}: a folder made by `thirdhand certificates` needed")
-    check_dates(own)
-    check_dates(authority)
+            raise UnreachableError(f"cannot read {path}: {FOLDER_NEEDED}")
     try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(own, key, password="none")
+        tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        tls.load_verify_locations(authority)
+        tls.load_cert_chain(own, key, password="none")
     except ssl.SSLError:
-        raise UnreachableError(f"{key} is not the key of {own}: that key, without a password, needed") from None
+        raise UnreachableError(
+            f"cannot use {own}, {key} and {authority}: certificates in PEM, and the key of the first without a "
+            "password, needed"
+        ) from None
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
         settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
@@ -311,43 +314,6 @@ def check_files(certificate: str | Path, zenoh_config: str | Path) -> None:
     """Raise UnreachableError if `open_session` would refuse this folder or file; empty: none."""
     _zenoh_config(zenoh_config)
     _tls(certificate)
-
-
-def valid_until(folder: str | Path) -> datetime.datetime | None:
-    """The end of the certificate in a folder, or of its authority if that is earlier. Raises as
-    `check_dates`, and gives None without its package.
-    """
-    own, authority = (check_dates(Path(folder).expanduser() / name) for name in (CERTIFICATE, AUTHORITY))
-    return own and authority and min(own, authority)
-
-
-def check_dates(path: Path) -> datetime.datetime | None:
-    """The end of a certificate's validity. Raises UnreachableError if it is not valid now, as Zenoh
-    gives no reason. Without the package cryptography, which the client alone does not need, nothing
-    is checked.
-    """
-    try:
-        from cryptography import x509  # most sessions need no certificate
-    except ModuleNotFoundError:
-        return None
-
-    try:
-        certificate = x509.load_pem_x509_certificate(path.read_bytes())
-    except ValueError:
-        raise UnreachableError(f"{path} does not hold a certificate, as `thirdhand certificates` makes them") from None
-    begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    now = datetime.datetime.now(datetime.timezone.utc)  # noqa: UP017, as the client runs on Python 3.10 too
-    if now > end:
-        raise UnreachableError(
-            f"{path} expired on {end:%Y-%m-%d %H:%M} UTC: a new certificate needed, by `thirdhand certificates`; the "
-            f"clock here shows {now:%Y-%m-%d %H:%M}"
-        )
-    if now < begin:
-        raise UnreachableError(
-            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on, but the clock here shows {now:%Y-%m-%d %H:%M}: "
-            "is it right?"
-        )
-    return end
 
 
 def endpoints(session: zenoh.Session) -> tuple[str, ...]:

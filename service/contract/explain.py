@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 import errno
 import re
@@ -13,7 +12,6 @@ import msgspec
 from msgspec import inspect
 
 MAX_MESSAGE = 300  # characters of a message of another library
-MAX_PROBLEMS = 50  # problems that are listed at once
 NEEDED = {  # by the operating system's number of an error
     errno.EEXIST: "a folder needed, and that is something else",
     errno.ENOTDIR: "a folder needed, and that is something else",
@@ -81,45 +79,13 @@ class InvalidError(ExplainedError, ValueError):
 
 
 def validated(given: Any, kind: type[T]) -> T:
-    """A struct of structs from the contents of a file. Raises InvalidError with all problems, in
-    the words of `in_file`.
-
-    An invalid value is removed and the rest validated again. Checks of several values together come
-    last; their problems are dropped for sections from which a value was removed.
+    """A struct of structs from the contents of a file. Raises InvalidError with the first problem,
+    or with all contradictions between valid values, in the words of `in_file`.
     """
-    rest, problems, incomplete = copy.deepcopy(given), list[str](), set[str]()
-    while len(problems) < MAX_PROBLEMS:
-        try:
-            value = msgspec.convert(rest, kind)
-        except msgspec.ValidationError as error:
-            lines = explained(error, rest, kind).splitlines()
-            if str(error).startswith("$.") and " - at `" not in str(error):
-                problems += [line for line in lines if not any(f"$.{name}" in line for name in incomplete)]
-                break
-            problems += lines
-            section = _remove(rest, lines[0])
-            if not section:
-                break
-            incomplete.add(section)
-        else:
-            if not problems:
-                return value
-            break
-    raise InvalidError(in_file("\n".join(problems)))
-
-
-def _remove(given: Any, problem: str) -> str:
-    """Remove the value that a problem names; return its section, or an empty text if not found."""
-    found = re.match(r"\$(?:\.(\w+))?(?:\.(\w+))?[^:]*: (?:unknown field '(.*)'; known)?", problem)
-    section, name, unknown = found.groups() if found else (None, None, None)
-    inner = given.get(section) if isinstance(given, dict) and section else given
-    if isinstance(inner, dict) and (key := unknown or name) in inner:
-        del inner[key]
-        return section or str(key)
-    if isinstance(given, dict) and section in given:
-        del given[section]
-        return str(section)
-    return ""
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        raise InvalidError(in_file(explained(error, given, kind))) from None
 
 
 def explained(error: Exception, given: Any, kind: Any) -> str:

@@ -31,7 +31,7 @@ Condition = enum.StrEnum(
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE CERTIFICATE_ENDS TWO_PLACES "
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE TWO_PLACES "
     "CLOCK_SET",
 )
 
@@ -234,7 +234,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "that agree",
             "look for reflections, and for a second source"),
         Incident(Cause.SWAPPED, None, "hands swapped",
-            "a hand where the other hand was, and the other where it was; accepted after {hands.swapped_s s}",
+            "a hand where the other hand was, and the other where it was; accepted after 2 s",
             "let the tracker see both hands apart for a moment: it takes left for right"),
         Incident(Cause.WRONG_FRAME, None, "wrong frame",
             "a pose in a frame that is neither `base` nor one of `[hands] frame` and `[trackers.NAME]`",
@@ -297,9 +297,6 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "ask again; if it still does not answer, read the log of `thirdhand serve`"),
         Incident(Condition.OTHER_CELL, None, "another cell",
             "only daemons of other cells are running", "give the name of the cell by `--cell`"),
-        Incident(Condition.CERTIFICATE_ENDS, None, "certificate ends",
-            "the daemon's certificate, or its authority's, ends within 30 days; then nobody is connected any more",
-            "`thirdhand certificates DIR --renew`, copy it to the daemon's machine and start the daemon again"),
         Incident(Condition.PORT_CLOSED, None, "port closed",
             "nothing listens on the port",
             "start `thirdhand serve`; its first line names the endpoint to give as `--connect`"),
@@ -307,8 +304,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the host cannot be reached", "check the address, the network and its firewall"),
         Incident(Condition.PORT_FOREIGN, None, "no Zenoh session",
             "something listens on the port, but opens no Zenoh session",
-            "give the `--certificate` of your role, for an endpoint tls/...; or wait, if the daemon is overloaded; "
-            "or choose another `--listen`, if another program has the port"),
+            "for an endpoint tls/..., give your certificate by $THIRDHAND_CERTIFICATE; or wait, if the daemon is "
+            "overloaded; or choose another `--listen`, if another program has the port"),
     ),
 }  # fmt: skip
 

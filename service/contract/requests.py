@@ -315,7 +315,6 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     guided: bool = False  # True while the arm's driver reports that it is led by hand
     memory_mb: dict[str, float] = {}  # resident memory of the processes `daemon` and `scribe`
     offer: str = ""  # what to learn from corrections that were repeated; empty: nothing
-    certificate_days: float | None = None  # time until the daemon's certificate ends; None: it has none
 
     @property
     def needed(self) -> tuple[str, ...]:

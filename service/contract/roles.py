@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 from service.contract import channels, ros2
 
 DAEMON, ROUTER, HEADSET = "daemon", "router", "headset"
-SERVERS = (DAEMON, ROUTER, HEADSET)  # others connect to them; browsers to the last one
 HANDS = ("hands/left", "hands/right")
 WISHES = ("clutch", "gripper/wish")
 ARM = ("joints/state", "joints/guided", "gripper/state")
 TOOL, OBJECTS = ("tool/pose",), ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
-RENEW_DAYS = 30  # a certificate that ends within this time [days] is to be renewed
 MOST_OF_A_ROLE = 99  # certificates of a role; access control compares whole names, so all are listed
 
 

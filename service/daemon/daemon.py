@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from service.client import endpoints
-from service.client.session import valid_until
 from service.contract import cdr, channels
 from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import Condition, in_brief, in_full, what_to_do
 from service.contract.messages import Attachment
 from service.contract.records import Reason
 from service.contract.requests import Status, ViaPoint, encode_json
-from service.contract.roles import RENEW_DAYS
 from service.core.controller import Controller, outgoing, run
 from service.core.frame import STAGES, Event, Frame, Outputs, Record, Tick, blank, frame_layout, order, timed
 from service.core.separation import FARTHEST_REPORTED_M
@@ -123,8 +121,6 @@ class Daemon:
         self._newest = -1  # newest tick
         self._laps: list[tuple[str, int]] = []
         self._outputs: Outputs = ()  # messages published in the newest tick
-        network = settings.network
-        self._ends = valid_until(network.certificate) if network.certificate else None
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
@@ -340,9 +336,6 @@ class Daemon:
                     self._saved_stage.keep(skill, status.stage, status.stage_belief)
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
-            if status.certificate_days is not None and status.certificate_days < RENEW_DAYS:
-                advice = what_to_do(Condition.CERTIFICATE_ENDS)
-                errors.append(f"the certificate ends on {self._ends:%Y-%m-%d}: {advice}")
             self._status.end(payload)
             self._start.systemd.progressed(status.tick)
             self._clock.between_ticks()
@@ -419,7 +412,6 @@ class Daemon:
             busy=machine.at_stop or machine.now,
             endpoints=self.endpoints,
             version=self._version,
-            certificate_days=self._ends and round((self._ends.timestamp() - time.time()) / 86400, 2),
             tool_measured_m=self._measured_arm.position(state),
             tool_limits=self._task_limits.of(self._file),
         )
@@ -439,7 +431,7 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
         if points == skill.via_points:
             return skill
-        adapted = skill_of(skill.file, points, tolerance, settings.tool.max_gain)
+        adapted = skill_of(skill.file, points, tolerance)
         names = ", ".join(point.name for point in points) or "none, the skill's own were removed"
         log.info(
             "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand via-points remove "
@@ -487,7 +479,7 @@ def serve(
     Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
     LoopError if the control loop cannot continue.
     """
-    skill_worker = SkillWorker(max_gain=settings.tool.max_gain)
+    skill_worker = SkillWorker()
     try:
         skill_worker.start()  # before the loop, which the start of a process would delay
         with ahead_of_others():

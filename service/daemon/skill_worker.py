@@ -25,7 +25,7 @@ from service.core.tool_limits import limits_of_task, path_of
 from service.core.way_out import WayOut
 from service.learning.corrections import Effect, corrected
 from service.learning.skill_file import SkillError, StoredSkill, decoded, skill_in
-from service.learning.via_points import MAX_GAIN, adapted
+from service.learning.via_points import adapted
 from service.process import child
 from service.settings.config import Settings, robot_description
 
@@ -43,8 +43,7 @@ class SkillWorker:
     Methods may be called from any thread; the worker processes one request at a time.
     """
 
-    def __init__(self, *, max_gain: float = MAX_GAIN) -> None:
-        self._max_gain = max_gain
+    def __init__(self) -> None:
         self._busy = threading.Lock()
         self._child: child.Child | None = None
 
@@ -61,13 +60,13 @@ class SkillWorker:
 
     def adapt(self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
         """The skill with these via-points and no others. Raises SkillError."""
-        return self.compute(skill_of, skill.file, tuple(via_points), tolerance, self._max_gain)
+        return self.compute(skill_of, skill.file, tuple(via_points), tolerance)
 
     def correct(self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
         """The skill with these via-points and no others, and what that changes at the correction
         `at`. Raises SkillError.
         """
-        return self.compute(corrected_skill_of, skill.file, tuple(via_points), at, self._max_gain)
+        return self.compute(corrected_skill_of, skill.file, tuple(via_points), at)
 
     def compute(self, work: Callable[..., Computed], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Computed:
         """The value of `work(*arguments)` in the worker, for a function of a module. Raises
@@ -152,29 +151,23 @@ def tool_limits_of(settings: Settings, file: bytes) -> dict[str, ToolLimits]:
     return limits_of_task(settings, robot_description(settings), path_of(skill), skill.orientation)
 
 
-def skill_of(
-    source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0, max_gain: float = MAX_GAIN
-) -> StoredSkill:
+def skill_of(source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0) -> StoredSkill:
     """The skill in a file, or the skill in force (the bytes of its file) with these via-points.
 
     Raises SkillError.
     """
     if isinstance(source, bytes):
-        skill = adapted(
-            decoded(source, origin="the skill in force"), via_points, tolerance=tolerance, max_gain=max_gain
-        )
+        skill = adapted(decoded(source, origin="the skill in force"), via_points, tolerance=tolerance)
     else:
         skill = skill_in(source)
     return prepared(skill)
 
 
-def corrected_skill_of(
-    source: bytes, via_points: Sequence[ViaPoint], at: ViaPoint, max_gain: float
-) -> tuple[StoredSkill, Effect]:
+def corrected_skill_of(source: bytes, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
     """The skill in force (the bytes of its file) with these via-points, and what they change at the
     correction `at`. Raises SkillError.
     """
-    skill, effect = corrected(decoded(source, origin="the skill in force"), via_points, at, max_gain=max_gain)
+    skill, effect = corrected(decoded(source, origin="the skill in force"), via_points, at)
     return prepared(skill), effect
 
 

@@ -32,7 +32,7 @@ from service.contract.records import Cause, Reason
 from service.core.frame import Vector, as_array, blank, state_layout
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
-from service.core.intake.tuning import CONTESTED_OFF_SHARE, SCATTER_OFF_M, TRACKER_MEMORY_S
+from service.core.intake.tuning import CONTESTED_OFF_SHARE, JUMP_M, JUMP_SPEED_MPS, SCATTER_OFF_M, TRACKER_MEMORY_S
 from service.files.track import Track
 from service.files.track_offsets import STEP_M, displaced
 from service.settings.config import HandSettings, Settings
@@ -221,7 +221,7 @@ def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[Distrust
     lost = [one for one in repeats if _is_lost(poses, seconds, *one)]
     for begin, end in lost if 2 * len(lost) >= len(repeats) else ():
         around = slice(max(begin - 1, 0), begin + 1)
-        came_by_leap = _leaps(poses[around, :3], np.diff(seconds[around]), hands).any()
+        came_by_leap = _leaps(poses[around, :3], np.diff(seconds[around])).any()
         first = begin if came_by_leap else begin + 1
         why[first:end] = [Distrust.LOST] * (end - first)
     return why
@@ -250,7 +250,7 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     at, pauses = track.poses[usable, :3], np.diff(seconds)
     accepted = np.array([not why[i] for i in usable.tolist()])
     doubted = (accepted[1:] != accepted[:-1]) | restarts[usable[1:]]
-    is_leap = doubted & _leaps(at, pauses, hands)
+    is_leap = doubted & _leaps(at, pauses)
     is_pause = (pauses > hands.stale_ms / 1000) | (np.diff(usable) > 1)
     bounds = np.concatenate([[0], np.flatnonzero(is_leap | is_pause) + 1, [len(usable)]])
     begins, ends = bounds[:-1], bounds[1:] - 1
@@ -258,14 +258,14 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     total, before = own.copy(), [(-1, 0, 0)] * len(begins)
     for run in range(1, len(begins)):
         off = np.linalg.norm(at[begins[run]] - at[ends[:run]], axis=1)
-        possible = off <= hands.jump + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
+        possible = off <= JUMP_M + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
         possible[-1] &= not is_leap[ends[run - 1]]
         links = {(int(i), 0, 0): total[i] for i in np.flatnonzero(possible)}
         if not possible[-1]:
             links |= {
                 (run - 1, last, first): total[run - 1] - last - first
                 for last, first in TRIMMED
-                if _continues(at, seconds, int(ends[run - 1]) - last, int(begins[run]) + first, hands)
+                if _continues(at, seconds, int(ends[run - 1]) - last, int(begins[run]) + first)
                 and min(own[run - 1] - last, own[run] - first) >= LEAST_CONTINUED
             }
         if links:
@@ -282,14 +282,14 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     return mask
 
 
-def _continues(at: Vector, seconds: Vector, last: int, first: int, hands: HandSettings) -> bool:
+def _continues(at: Vector, seconds: Vector, last: int, first: int) -> bool:
     """True if the track comes within a jump of `first`, as it moves at index `last`."""
     velocity = (at[last] - at[last - 1]) / (seconds[last] - seconds[last - 1])
     expected = at[last] + velocity * (seconds[first] - seconds[last])
-    return bool(np.linalg.norm(at[first] - expected) <= hands.jump)
+    return bool(np.linalg.norm(at[first] - expected) <= JUMP_M)
 
 
-def _leaps(at: Vector, pauses: Vector, hands: HandSettings) -> Mask:
+def _leaps(at: Vector, pauses: Vector) -> Mask:
     """A mask (N - 1,) of the steps between positions (N, 3) [m] that no hand can make in the pauses
     (N - 1,) [s]: the daemon rejects them as jumps, and they need too much acceleration at both
     ends.
@@ -298,7 +298,7 @@ def _leaps(at: Vector, pauses: Vector, hands: HandSettings) -> Mask:
     off = np.linalg.norm(steps, axis=1)
     turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
     acceleration = np.minimum(np.concatenate([[np.inf], turns]), np.concatenate([turns, [np.inf]]))
-    is_leap: Mask = (off > hands.jump + hands.jump_speed * pauses) & (acceleration > MAX_HAND_MPS2)
+    is_leap: Mask = (off > JUMP_M + JUMP_SPEED_MPS * pauses) & (acceleration > MAX_HAND_MPS2)
     return is_leap
 
 

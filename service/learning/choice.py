@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from kmp.criteria.direct import DirectSelection, Scales
 from service.core.frame import Vector
-from service.settings.config import ToolSettings
 
-MAX_GAIN = ToolSettings().max_gain  # [m/m] largest gain of an affine mean, as between via-points
+MAX_GAIN = 4.0  # [m/m] largest ratio of the tool's motion to the hands', of an affine mean and between via-points
 RIDGE_M = 0.005  # an input that varies by less, as trembling hands do, does not move the affine mean
 NOISE_M = 0.001  # noise of a good tracker on each axis
 DWELL_SHARE = 0.25  # this share of the reference points is even in time, the rest along the hands' path

@@ -21,6 +21,7 @@ from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.tuning import SEGMENT_END_M
 from service.core.skill.via_points import rest_of
+from service.learning.choice import MAX_GAIN
 from service.learning.skill_file import SkillError, StoredSkill
 from service.learning.via_points import NOTED_M, adapted
 
@@ -115,20 +116,18 @@ def stage_of(skill: Skill, point: ViaPoint) -> tuple[str, ...]:
     return () if point.stage not in skill.model.names[:-1] else (str(point.stage), rest_of(point, skill.model.names))
 
 
-def corrected(
-    skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint, *, max_gain: float
-) -> tuple[StoredSkill, Effect]:
+def corrected(skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
     """The skill with these via-points and no others, and what that changes at the correction `at`.
 
-    Raises SkillError, also if the correction moves the tool more than `max_gain` times as far as
+    Raises SkillError, also if the correction moves the tool more than MAX_GAIN times as far as
     the hands, unless it is a via-point of the task.
     """
-    after = adapted(skill, via_points, tolerance=skill.tolerance, max_gain=max_gain)
+    after = adapted(skill, via_points, tolerance=skill.tolerance)
     effect = effect_of(skill, after, at)
-    if effect.gain > max_gain and at.name not in skill.model.names:
+    if effect.gain > MAX_GAIN and at.name not in skill.model.names:
         raise SkillError(
             f"a correction of {100 * effect.moved_m:.0f} cm so near to what was shown or taught would move the tool "
-            f"{effect.gain:.1f} times as far as the hands; {max_gain:g} times accepted. Correct it in smaller steps, "
+            f"{effect.gain:.1f} times as far as the hands; {MAX_GAIN:g} times accepted. Correct it in smaller steps, "
             "or demonstrate this"
         )
     return after, effect

@@ -35,8 +35,7 @@ from service.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT
 from service.learning.residual_risk import ResidualRisk
 from service.settings.file_content import UnusableError, content
 
-POSED = 4  # format of a skill with an orientation or a gripper; other skills have their model's formats
-FORMATS = {*(number for model in MODELS for number in model.formats), POSED}
+SKILL_FORMAT = 6
 TURN, GRIPPER = "turn.", "gripper."  # prefixes of the arrays of their primitives
 LARGEST_FILE = 100_000_000  # [B] unpacked
 MOST_POINTS = 2500  # reference points, which bound the duration of a tick
@@ -120,7 +119,7 @@ def with_file(skill: StoredSkill) -> StoredSkill:
     """A copy of the skill with the bytes of its file."""
     out = io.BytesIO()
     arrays: dict[str, Any] = dict(
-        format=np.array(POSED if skill.turn or skill.gripper else skill.model.formats[-1 if skill.figures else 0]),
+        format=np.array(SKILL_FORMAT),
         units=np.array(skill.model.units),
         name=np.array(skill.name),
         orientation=skill.orientation,
@@ -166,9 +165,10 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
             if size > LARGEST_FILE:
                 raise SkillError(f"{origin}: {size} bytes unpacked, at most {LARGEST_FILE} accepted")
             arrays = dict(archive)
-        if (kind := arrays["format"].item()) not in FORMATS:
-            accepted = ", ".join(map(str, sorted(FORMATS)))
-            raise SkillError(f"{origin}: skill of format {kind}, of {accepted} needed: learn it anew with this version")
+        if (number := arrays["format"].item()) != SKILL_FORMAT:
+            raise SkillError(
+                f"{origin}: skill of format {number}, of {SKILL_FORMAT} needed: learn it anew with this version"
+            )
         for fault in _spoilt(arrays):
             raise SkillError(f"{origin}: {fault}")
         model, via_points = _model(arrays), validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
@@ -185,7 +185,7 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
             tolerance=float(arrays["tolerance"]),
             turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
             gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
-            figures=str(arrays["figures"]) if kind == model.formats[-1] or "figures" in arrays else "",
+            figures=str(arrays.get("figures", "")),
             demonstrations=arrays[DEMONSTRATIONS].tobytes() if DEMONSTRATIONS in arrays else b"",
             file=bytes(data),
             digest=_digest(data),
@@ -226,10 +226,8 @@ def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[
 
 
 def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
-    """The kind of the skill's model, by the format or, if any model may have it, by the arrays."""
-    kind = arrays["format"].item()
-    own = [model for model in MODELS if model.ranges.keys() & arrays.keys() and kind == POSED]
-    return next((model for model in MODELS if kind in model.formats), (*own, MODELS[0])[0])
+    """The kind of the skill's model: the one that has an array of its own in the file."""
+    return next((model for model in MODELS if model.ranges.keys() & arrays.keys()), MODELS[0])
 
 
 def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:

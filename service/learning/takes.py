@@ -139,13 +139,12 @@ def conductor_of(division: Division, fitted: Fitted) -> int | None:
     return division.conductor if fitted.conductor is None else fitted.conductor
 
 
-def check_count(names: Sequence[str], components: int | None, remark: str = "") -> None:
+def check_count(names: Sequence[str], components: int | None = None, remark: str = "") -> None:
     """Raise SkillError if the demonstrations of these names are too few to hold one out."""
     if len(names) == 1 and components is None:
         raise SkillError(
             f"1 demonstration given ({names[0]}): at least 2 needed, as what is learned from the others must predict "
-            "each; record another. Only the paper's method, --components 10, learns from a single one, and its error "
-            f"stays unknown{remark}"
+            f"each; record another{remark}"
         )
 
 

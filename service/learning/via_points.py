@@ -16,22 +16,19 @@ from service.contract.requests import ViaPoint, ViaPointInForce
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.core.skill.via_points import NEIGHBOURS, neighbourhoods, rest_of
+from service.learning.choice import MAX_GAIN
 from service.learning.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from service.learning.skill_file import SkillError, StoredSkill, with_file
-from service.settings.config import ToolSettings
 
-MAX_GAIN = ToolSettings().max_gain
 NEAR_M = 0.001  # tools this near to each other never contradict each other
 DEVIATIONS = 3.0  # nor do tools within this multiple of their standard deviations
 NOTED_M = 0.005  # via-points missed or moved by more are reported
 
 
-def adapted(
-    skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float, max_gain: float = MAX_GAIN
-) -> StoredSkill:
+def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
     """The skill adapted to these via-points and no others, by algorithm 1 of Huang et al. 2019.
 
-    Via-points between which the tool would move more than `max_gain` times as far as the hands
+    Via-points between which the tool would move more than MAX_GAIN times as far as the hands
     contradict each other, as the tool would amplify the trembling of resting hands. Via-points of a
     task do not, as the skill's stages distinguish them.
 
@@ -44,7 +41,7 @@ def adapted(
         via_points = [of_one(point, skill.conductor) for point in via_points]
     inputs = neighbourhoods(via_points)[0]
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
-    check_agreement(via_points, max_gain, skill)
+    check_agreement(via_points, skill)
     check_turns(owners, inputs)
     skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
     try:
@@ -67,22 +64,22 @@ def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
     return msgspec.structs.replace(point, left=at, right=at)
 
 
-def check_agreement(via_points: Sequence[ViaPoint], max_gain: float = MAX_GAIN, skill: Skill | None = None) -> None:
+def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) -> None:
     """Raise SkillError if via-points contradict each other that the skill cannot distinguish:
 
-    |tool_i - tool_j| > max_gain |hands_i - hands_j| + NEAR_M + DEVIATIONS (std_i + std_j)
+    |tool_i - tool_j| > MAX_GAIN |hands_i - hands_j| + NEAR_M + DEVIATIONS (std_i + std_j)
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
     is_distinct = np.zeros((len(owners), len(owners)), bool) if skill is None else _are_distinct(skill, owners)
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
-    allowed = max_gain * hands + NEAR_M + DEVIATIONS * (deviations[:, None] + deviations)
+    allowed = MAX_GAIN * hands + NEAR_M + DEVIATIONS * (deviations[:, None] + deviations)
     for i, j in np.argwhere((tools > allowed) & ~is_distinct)[:1].tolist():
         raise SkillError(
             f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
             f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
-            f"{max_gain:g} times the hands' distance and what their std allow"
+            f"{MAX_GAIN:g} times the hands' distance and what their std allow"
         )
 
 

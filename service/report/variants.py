@@ -23,8 +23,7 @@ from service.core.frame import Records, Vector
 from service.files.mcap_file import RecordingError
 from service.files.recorded_hands import RecordedHands
 from service.files.track_check import in_base_frame
-from service.report.report import Figure, differing, flat
-from service.report.tables import Table, side_by_side
+from service.report.report import Figure
 from service.report.tracking import TrackingFigures, tracking
 from service.report.true_hands import TrueHand, true_hands, with_true_hands
 from service.settings.config import Settings
@@ -42,9 +41,6 @@ CHANGES: tuple[Change, ...] = (
     {"tool": {"follow": "closely", "max_jerk": 150.0}},
     {"tool": {"max_speed": 0.5}},  # its acceleration and jerk follow from it
     {"tool": {"max_speed": 0.3}},
-    {"hands": {"noise_std_m": 0.005}},
-    {"hands": {"jump": 0.02}},
-    {"hands": {"jump": 0.08, "jump_speed": 3.0}},
     {"hands": {"stale_ms": 200.0, "unseen_ms": 1000.0}},
 )
 TOTALS = ("held_s", "limits_s", "rejected")  # of VariantFigures
@@ -275,32 +271,3 @@ def _passed(one: VariantFigures, own: VariantFigures) -> str:
     if math.isnan(own.tracking.overshoot_mm):
         return " unknown without stops"
     return f" {one.tracking.overshoot_mm:.1f} instead of {own.tracking.overshoot_mm:.1f} mm"
-
-
-def compared(hands: RecordedHands, other: Settings, name: str) -> tuple[list[Table], str]:
-    """A recording's hands with its own settings and with others, called `name`, side by side, and
-    a sentence on how far the commands differ.
-
-    Raises RecordingError for settings of another arm or rate.
-    """
-    hands.check_comparable(other, name)
-    judged_hands = JudgedHands.of(hands)
-    frames = hands.frames(other)
-    both = [judged_hands.figures("as recorded", {}, judged_hands.frames), judged_hands.figures(name, {}, frames)]
-    names = [one.name for one in both]
-    tables = [side_by_side(names, [list(one.figures()) for one in both])]
-    differ = differing(*(flat(msgspec.to_builtins(settings)) for settings in (hands.settings, other)))
-    if differ:
-        rows = tuple((setting, str(one), str(another)) for setting, one, another in differ)
-        tables.append(Table("settings", "Settings that differ", ("setting", *names), rows, numbers=9))
-    apart_mm = 1000 * np.linalg.norm(frames["tool"] - judged_hands.frames["tool"], axis=1)
-    joints = np.abs(frames["joints"] - judged_hands.frames["joints"])
-    if not joints.any():
-        return tables, "All commands are the same."
-    at = int(np.argmax(apart_mm))
-    at_s = (int(frames["tick"][at]) - int(frames["tick"][0])) * hands.period_s
-    units = "/".join(dict.fromkeys(hands.settings.joints.units))
-    return tables, (
-        f"The commanded tools are up to {apart_mm[at]:.1f} mm apart, at {at_s:.2f} s, in the median "
-        f"{np.median(apart_mm):.2f} mm; the joints up to {joints.max():.3f} {units}."
-    )

@@ -62,21 +62,15 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class HandSettings(Section, frozen=True):
-    """The tracker's frame, unit and noise, and the limits by which its samples are accepted."""
+    """The tracker's frame and unit, and the times for which a hand may be silent."""
 
     frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
     axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
     base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after unit and axes
-    noise_std_m: Annotated[float, msgspec.Meta(ge=1e-4, le=0.01)] = 0.002  # noise of each axis before it is estimated
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
     stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0  # delays raise `stale_ms` up to this; 0: never
     unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
-    still_speed: Annotated[float, msgspec.Meta(ge=0.01, le=0.5)] = 0.05  # [m/s] a faster hand is in motion
-    still_s: Annotated[float, msgspec.Meta(ge=0.02, le=2)] = 0.2  # a slow hand counts as still after this time
-    jump: Annotated[float, msgspec.Meta(ge=0.005, le=0.3)] = 0.04  # [m] a sample farther from its prediction is a jump
-    jump_speed: Annotated[float, msgspec.Meta(ge=0, le=5)] = 1.5  # [m/s] after a pause `jump` grows at this speed
-    swapped_s: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 2.0  # exchanged hands are accepted after this time
     clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
     clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
     gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
@@ -111,7 +105,6 @@ class ToolSettings(Section, frozen=True):
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
     follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: see `tune`
-    max_gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 4.0  # largest ratio of the tool's motion to the hands'
 
     @property
     def engaging_speed(self) -> float:
@@ -230,7 +223,7 @@ class People(Section, frozen=True):
     hand at the speed from which it can stop `clearance` away from the hand, while the hand
     continues at its present speed and the stop begins `hands.stale_ms` + `reaction_ms` late: a
     hand may move unseen for `hands.stale_ms`, or for `hands.stale_max_ms` if that is longer. A hand
-    out of sight for longer is assumed to accelerate toward the arm at 5 m/s² up to `unknown_speed`.
+    out of sight for longer is assumed to accelerate toward the arm at 5 m/s² up to 1.6 m/s.
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm
@@ -240,8 +233,6 @@ class People(Section, frozen=True):
     brake: Positive = 3.0  # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # interval of samples + one tick + ramp of the braking
     contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
-    unknown_speed: Positive = 1.6  # [m/s] assumed speed of a hand that was only just seen
-    tremor_speed: Positive = 0.1  # [m/s] a slower hand's motion is ignored as tremor; from twice that it counts in full
 
 
 class Box(Section, frozen=True):
@@ -497,14 +488,6 @@ def _absolute(value: str, base: Path, where: str) -> str:
         raise SettingsError(f"{where}: {value!r} given; no user of this name has a folder here") from None
 
 
-def _mistakes(given: Any) -> list[str]:
-    try:
-        validated(given, Settings)
-    except InvalidError as error:
-        return [str(error)]
-    return []
-
-
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from the content of a TOML file; `origin` names it in errors. Raises SettingsError.
 
@@ -516,12 +499,8 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         _make_paths_absolute(given, folder)
         arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            try:
-                own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
-                given = completed(given, Urdf(own, origin=arm["urdf"]))
-            except (UrdfError, SettingsError) as error:  # mistakes outside the arm's tables are reported too
-                others = {name: value for name, value in given.items() if name not in ("arm", "joints", "reach")}
-                raise SettingsError("\n".join([str(error), *_mistakes(others)])) from None
+            own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
+            given = completed(given, Urdf(own, origin=arm["urdf"]))
         settings = validated(given, Settings)
         urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
         check(settings.joints, urdf, settings.arm.plate)

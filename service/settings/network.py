@@ -51,7 +51,7 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     listen: tuple[str, ...] = (ENDPOINT,)  # endpoints on which the daemon listens; port 0: a free one
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
-    certificate: str = ""  # the folder `daemon` that `thirdhand certificates` made; empty: none
+    certificate: str = ""  # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
     revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, that are no longer accepted
     zenoh_config: str = ""  # file with Zenoh's own settings, where the service sets none; empty: none
     ros2_domain: Domain = None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none

@@ -1,1 +1,1 @@
-"""Measurements of the loop: beside an empty loop, under loads, over a long time."""
+"""Measurements of the loop, beside an empty loop."""

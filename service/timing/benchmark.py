@@ -8,7 +8,6 @@ import argparse
 import json
 import os
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +21,10 @@ from service.files.recording import Recording
 from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
 from service.process.progress import say
 from service.settings.config import RecordingSettings
-from service.timing import loads, soak
 from service.timing.probe import EDGES_US, figures, percentiles
 from service.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "service")
-BENCH_S = 24.0  # default duration
-SOAK_S = 1800.0  # default duration of --soak
 DURATION_PARTS = 6  # the duration is divided into two parts each for the empty loop, the core and the whole
 MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (
@@ -46,20 +42,11 @@ def bench(args: argparse.Namespace) -> int:
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
     settings = cell_of(args.arm, rate_hz=args.rate)
-    report: Any
-    read: Callable[[Any], str]
-    seconds = args.seconds or (SOAK_S if args.soak else BENCH_S)
-    if args.soak:
-        report, read = soak.run(seconds / 60, settings.rate_hz, settings=settings), soak.text
-    elif args.loads:
-        report, read = loads.run(settings.rate_hz, seconds, settings=settings), loads.text
-    else:
-        report, read = run(settings.rate_hz, seconds, arm=args.arm, keep=args.output), text
+    report = run(settings.rate_hz, args.seconds, arm=args.arm, keep=args.output)
     if args.output is not None:
         (args.output / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
-        if read is text:
-            draw(report, args.output / "bench.png")
-    print(json.dumps(report, indent=2) if args.json else read(report))
+        draw(report, args.output / "bench.png")
+    print(json.dumps(report, indent=2) if args.json else text(report))
     return 0
 
 

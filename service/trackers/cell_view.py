@@ -6,7 +6,6 @@ import contextlib
 import re
 import time
 from typing import Any
-from urllib.parse import urlsplit
 
 import zenoh
 
@@ -16,7 +15,6 @@ from service.contract.explain import ExplainedError
 from service.contract.incidents import ORDERS, in_brief, title
 from service.contract.messages import BASE, SceneObject, WireError
 from service.contract.requests import Reply, Status
-from service.trackers.web_server import Address
 
 MAX_STATUS_BYTES = 262_144  # a daemon's has 3 to 10 kB, and more with many via-points
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
@@ -54,20 +52,10 @@ class Latest:
         fields = ("name", "shape", "position", "size", "colour")
         return [{name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects]
 
-    @property
-    def stream(self) -> Address:
-        """The server of the live view; it changes when the scribe is started again."""
-        live = self._status.scribe.get("live") if self._status else None
-        try:
-            parts = urlsplit(str(live or "").removeprefix("rerun+"))
-            return Address(parts.hostname or "127.0.0.1", parts.port or 0)
-        except ValueError:  # any program on the network may publish a status
-            return Address("127.0.0.1", 0)
-
     def summary(self) -> dict[str, Any]:
         """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
-        [s], the daemon's time [ms], the live view that it serves, and further facts in one line;
-        empty before the first status.
+        [s], URL and process of the live view, and further facts in one line; empty before the first
+        status.
         """
         now, age_s = self._status, time.monotonic() - self._at
         if now is None:
@@ -80,8 +68,8 @@ class Latest:
             lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
             now.remedy,
         )
-        now_ms, live = now.time_ns / 1e6 + 1000 * age_s, f"{self.stream} {now.scribe.get('pid')}"
-        return shown | {"remedy": remedy, "age_s": age_s, "now_ms": now_ms, "live": live, "facts": facts}
+        live = [now.scribe.get("live"), now.scribe.get("pid")]
+        return shown | {"remedy": remedy, "age_s": age_s, "live": live, "facts": facts}
 
 
 def corrected(client: Client, given: str) -> tuple[bool, str]:

@@ -10,7 +10,6 @@ between them.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,6 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from service.cli.main import parser
 from service.core.skill.model import LEVELS
 from service.learning.learn import learn
 from service.learning.records import Figures
@@ -158,27 +156,18 @@ def part(one: Part) -> Found:
     return found
 
 
-@functools.cache
-def _defaults() -> argparse.Namespace:
-    """The options of `thirdhand learn` that nobody gave."""
-    return parser().parse_args(["learn", "take.mcap", "--output", "skill.npz"])
-
-
 def as_command(
     shown: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
 ) -> tuple[StoredSkill | None, tuple[str, ...]]:
-    """The skill of `thirdhand learn` with its defaults, an arm's reach included, and the reasons
+    """The skill of `thirdhand learn`, an arm's reach included, and the reasons
     why the command writes none. `told`: the takes hold their via-points. `refined`: the skill that
     is given to --from.
     """
-    args = _defaults()
     try:
         skill = learn(
             [one.demonstration if told else one.demonstration._replace(places=()) for one in shown],
-            name=args.output.stem,
             names=[one.name for one in shown],
             refined=refined,
-            **{name: getattr(args, name) for name in ("components", "points", "ell", "penalty", "seed")},
         )
     except SkillError as error:
         return None, (str(error),)

@@ -22,7 +22,7 @@ from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
-from service.core.separation.tuning import SLIP_SPEED_MPS
+from service.core.separation.tuning import SLIP_SPEED_MPS, UNKNOWN_SPEED_MPS
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
@@ -174,7 +174,7 @@ def _judged(
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
     lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
-    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, people.unknown_speed)
+    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, UNKNOWN_SPEED_MPS)
     over = speed - lately
     began = np.flatnonzero(done.time_s > 0)
     pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt

@@ -21,7 +21,7 @@ from service.files.shipped import shipped_skill
 from service.learning.via_points import adapted
 from service.settings.arm_description import description
 from service.settings.config import load, robot_description
-from service.settings.urdf import Urdf
+from service.settings.urdf import Urdf, UrdfError
 from sim.experiments.rehearsal import rehearse
 from sim.scene import Scene
 from sim.script import HandScript
@@ -73,8 +73,7 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
 def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name: str, tmp_path: Path) -> None:
     where, plate = ARMS[name]
     path = where()
-    proposal = proposed(path)
-    assert proposal.plate == plate
+    proposal = proposed(path, plate=plate)
     cell = load(in_folder(proposal, path, tmp_path))
     robot = robot_description(cell)
     arm, posture = Arm(cell, robot), np.array(cell.arm.posture)
@@ -107,17 +106,13 @@ def test_the_places_are_those_of_the_demo() -> None:
     assert not places
 
 
-@pytest.mark.parametrize(
-    ("name", "plate"),
-    [("baxter.urdf", "right_gripper"), ("so101.urdf", "gripper_frame_link"), ("ur5_gripper.urdf", "")],
-)
-def test_the_plate_is_beyond_the_last_joint_that_is_no_grippers(name: str, plate: str) -> None:
-    urdf = Urdf(description(published(name), cover=False))
-    found = plate_of(urdf)
-    assert plate in ("", found)
-    moving = [joint.name for joint in urdf.chain(found) if joint.kind != "fixed"]
-    assert not [one for one in moving if "finger" in one or "knuckle" in one or "jaw" in one]
-    assert len(moving) == {"baxter.urdf": 7, "so101.urdf": 5, "ur5_gripper.urdf": 6}[name]
+def test_the_only_end_is_the_plate_and_several_ends_are_listed() -> None:
+    text = (SHIPPED / "ur5.urdf").read_text()
+    assert plate_of(Urdf(text)) == "tool0"
+    camera = '<link name="camera"/><joint name="mount" type="fixed"><parent link="wrist_3_link"/><child link="camera"/>'
+    two_ends = Urdf(text.replace("</robot>", f"{camera}</joint></robot>"))
+    with pytest.raises(UrdfError, match=r"has 2 ends: name .* by --plate; the ends are tool0, camera, and"):
+        plate_of(two_ends)
 
 
 def test_the_tool_of_a_plate_that_points_along_its_x_is_turned() -> None:

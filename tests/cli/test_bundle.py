@@ -22,6 +22,7 @@ from service.files.mcap_reader import Messages
 from service.files.replay import replay
 from service.settings.config import Settings
 from support.cell import Tracker, serving, told
+from support.certificates import make_certificates
 from support.paths import ROOT
 
 SECRET = "c2VjcmV0LWtleQ"  # the planted parameter of an endpoint
@@ -58,8 +59,8 @@ def everything_in(name: str, content: bytes, folder: Path) -> bytes:
 def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, output = tmp_path / "bench.toml", tmp_path / "bundle.tar.gz"
     config.write_text(f"# {SECRET}\n" + CELL.format(folder=tmp_path, secret=SECRET))
-    assert told("certificates", str(tmp_path / "keys")).returncode == 0
-    keys = [path.read_text() for path in (tmp_path / "keys").rglob("*key*") if path.is_file()]
+    secrets = make_certificates(tmp_path)
+    keys = [path.read_text() for path in secrets.rglob("*key*")]
     assert len(keys) > 5
     network = f'[network]\nlisten = ["tcp/127.0.0.1:0#iface=lo;connect_private_key_base64={SECRET}"]\n'
     arguments = ("--joints", "assumed", "--record", str(tmp_path / "recordings"))

@@ -102,13 +102,12 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         (1, "nowhere does not exist: a folder of takes needed", ("record", "--list", "--folder", "nowhere")),
         (1, "is a daemon or a router running", ("status", *NOBODY)),
         (1, "", ("doctor", *NOBODY)),
-        (1, "", ("cells", *NOBODY)),
+        (1, "", ("status", "--all", *NOBODY)),
         (1, "is a daemon or a router running", ("hold", *NOBODY)),
         *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
         (1, "nowhere.rrd", ("view", "nowhere.rrd")),
         (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
         (1, "at least 2 needed", ("learn", str(RECORDINGS / "demonstration-1.mcap"), "--output", "nowhere.npz")),
-        (1, "no user of this name", ("status", "--certificate", "~nobody-of-this-name/x")),
         (2, "--cell: '", ("status", "--cell", "*")),
         (2, "command line: cell: '*' given", ("serve", "--cell", "*")),
         (2, "--cell: '", ("hold", "--cell", "")),
@@ -249,7 +248,7 @@ def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["certificates /dev/full", "demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
+    ["demo --output /dev/full", "record take --folder /dev/full", "bench --output /dev/full"],
 )
 def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> None:
     done = told(*command.split())

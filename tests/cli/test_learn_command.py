@@ -30,7 +30,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) -> None:
     out, plot = tmp_path / "skill.npz", tmp_path / "skill.png"
-    done = thirdhand("learn", *map(str, files), "--output", str(out), "--plot", str(plot), "--points", "80")
+    done = thirdhand("learn", *map(str, files), "--output", str(out), "--plot", str(plot))
     assert done.returncode == 0, done.stderr
     assert "demonstration-2 " in done.stdout
     assert "gate " in done.stdout
@@ -42,7 +42,7 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
 def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
     people = sorted((RECORDINGS / "people").glob("*.mcap"))[:4]
     out = tmp_path / "skill.npz"
-    done = told("learn", *map(str, people), "--output", str(out), "--points", "80")
+    done = told("learn", *map(str, people), "--output", str(out))
     assert done.returncode == 0, done.stderr
     head, *lines = done.stdout.splitlines()
     assert head.endswith("held   without places   linear   look-up   same elapsed time")
@@ -60,7 +60,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     mirrored = one.tool * np.array([1, -1, 1, 1, 1, 1, 1])
     write_demonstration(tmp_path / "mirrored.mcap", one._replace(tool=mirrored))
     out = tmp_path / "skill.npz"
-    done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out), "--points", "80")
+    done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out))
     assert done.returncode == 1
     assert "was not written: " in done.stderr
     assert "contradict others" in done.stderr
@@ -78,7 +78,7 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
         ((), "it is not served until somebody accepts its residual risk, named above"),
         (("--accept-residual-risk", "Ada"), "its residual risk is accepted by Ada"),
     ):
-        done = told("learn", *map(str, takes), "--output", str(out), "--points", "80", *option)
+        done = told("learn", *map(str, takes), "--output", str(out), *option)
         assert done.returncode == 0, done.stderr
         assert "residual risk: 1" in done.stdout
         assert says in done.stderr
@@ -87,12 +87,12 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
 
 def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Path) -> None:
     theirs, mine = tmp_path / "theirs.npz", tmp_path / "mine.npz"
-    done = told("learn", *map(str, files), "--output", str(theirs), "--points", "80")
+    done = told("learn", *map(str, files), "--output", str(theirs))
     assert done.returncode == 0, done.stderr
     own = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
     for path, one in zip(own, demonstrations(Scene(), count=2, seed=5), strict=True):
         write_demonstration(path, one.every(8))
-    refine = ("learn", *map(str, own), "--output", str(mine), "--points", "80", "--from")
+    refine = ("learn", *map(str, own), "--output", str(mine), "--from")
     done = told(*refine, str(theirs))
     assert done.returncode == 0, done.stderr
     assert "the weight of your demonstrations against the skill's, with errors; " in done.stdout

@@ -1,4 +1,4 @@
-"""`thirdhand tune` and `thirdhand replay --config`: what they print, draw and refuse."""
+"""`thirdhand tune`: what it prints, draws and refuses."""
 
 from __future__ import annotations
 
@@ -50,15 +50,6 @@ def test_a_take_is_tuned_with_the_shipped_cell_and_skill(monkeypatch: pytest.Mon
     assert "Leave the settings." in done.stdout or "Write into the cell's settings:\n\n[" in done.stdout
 
 
-def test_a_recording_is_replayed_with_other_settings(tmp_path: Path) -> None:
-    calm = tmp_path / "calm.toml"
-    calm.write_text("[tool]\nmax_jerk = 100\n", encoding="utf-8")
-    done = told("replay", TAKE, "--config", str(calm))
-    assert done.returncode == 0, done.stderr
-    for words in ("lag [ms]", "jerk of the tool [m/s³]", "speed_limited [s]", "tool.max_jerk", "mm apart"):
-        assert words in done.stdout
-
-
 @pytest.fixture(scope="module")
 def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with files that cannot be tuned to."""
@@ -78,9 +69,6 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("two times [s], the first below the second, needed", 2, ("tune", GOLDEN, "--part", "5", "4")),
     ("skill.npz", 1, ("tune", GOLDEN, "--skill", "skill.npz")),
     ("a name that ends in .png needed", 2, ("tune", GOLDEN, "--plot", "tune.jpg")),
-    ("is of another arm than", 1, ("replay", GOLDEN, "--config", "franka")),
-    ("without --exact, --each, --after and --output", 2, ("replay", GOLDEN, "--config", "wam", "--exact")),
-    ("no arm 'nobody'", 1, ("replay", GOLDEN, "--config", "nobody")),
 ])  # fmt: skip
 def test_a_mistake_is_explained(
     words: str, code: int, arguments: tuple[str, ...], broken: Path, monkeypatch: pytest.MonkeyPatch

@@ -7,26 +7,20 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import os
 import re
-import signal
-import socket
-import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-import psutil
 import pytest
 from PIL import Image
 
-from service.cli.live_page import A_PICTURE, PATIENCE_S, SAMPLES, STREAM, UNKNOWN
+from service.cli.live_page import UNKNOWN
 from service.cli.view import FRESH_S, screenshot
 from service.daemon.launch import free_port
 from service.settings import palette
@@ -35,7 +29,6 @@ from support.cell import Daemon, Tracker, serving
 from support.paths import ROOT
 
 TIMEOUT_S = 90
-EMPTY_GRPC = b"\0\0\0\0\0"  # a message without fields
 
 
 class Page:
@@ -68,23 +61,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
             yield Page(daemon, url)
 
 
-FROZEN = """
-import sys
-from service.__main__ import main
-from service.trackers import web_server
-web_server.FROZEN_S = 2.0
-sys.exit(main())
-"""
-
-
 @contextlib.contextmanager
-def server_of(
-    daemon: Daemon, address: str = "127.0.0.1:0", *, program: tuple[str, ...] = ("-m", "service")
-) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """The URL and the process of a page that `thirdhand view live --web` serves; it must end
-    without a word on standard error.
+def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
+    """The URL of a page that `thirdhand view live --web` serves; it must end without a word on
+    standard error.
     """
-    command = [sys.executable, *program, "view", "live", "--web", address, "--connect", daemon.endpoint]
+    command = [sys.executable, "-m", "service", "view", "live", "--web", address, "--connect", daemon.endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
         clock = threading.Timer(TIMEOUT_S, server.kill)
         clock.start()
@@ -94,20 +76,13 @@ def server_of(
             assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
             url = server.stdout.readline().strip()
             clock.cancel()
-            yield url, server
+            yield url
             server.terminate()
             assert server.wait(TIMEOUT_S) == 0
             assert server.stderr.read() == ""
         finally:
             clock.cancel()
             server.kill()
-
-
-@contextlib.contextmanager
-def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
-    """The URL of such a page."""
-    with server_of(daemon, address) as (url, _):
-        yield url
 
 
 def token_in(text: str) -> str:
@@ -141,107 +116,6 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert (told["because"], told["remedy"]) == (held["because"], "press Resume")
     assert page.ask("POST", "/resume", X_Thirdhand_Token=token)[0] == 200
     page.daemon.until(lambda status: status["mode"] == "follow")
-
-
-@pytest.mark.thorough
-def test_clients_that_are_slow_or_leave_cost_no_thread_and_no_traceback(page: Page) -> None:
-    stream = f"POST {STREAM} HTTP/1.1\r\nHost: {{}}\r\nContent-Type: application/grpc-web+proto\r\n"
-    stream += "Content-Length: 5\r\n\r\n\0\0\0\0\0"
-    with server_of(page.daemon, program=("-c", FROZEN)) as (url, process), contextlib.ExitStack() as closing:
-        slow, parts, server = Page(page.daemon, url), urlsplit(url), psutil.Process(process.pid)
-
-        def client(sends: str, *, reads: int = 0) -> socket.socket:
-            connection = closing.enter_context(socket.create_connection((parts.hostname, parts.port), TIMEOUT_S))
-            connection.sendall(sends.format(parts.netloc).encode())
-            if reads:
-                assert connection.recv(reads)
-            return connection
-
-        assert slow.ask("GET", "/status")[0] == 200
-        before = server.num_threads()
-        unfinished = [client("GET / HTTP/1.1\r\nHost: {}\r\n") for _ in range(160)]
-        file = "GET /viewer/re_viewer_bg.wasm HTTP/1.1\r\nHost: {}\r\n\r\n"
-        unread = [*(client(stream) for _ in range(30)), *(client(file) for _ in range(10))]
-        for sends in (stream, file):
-            for _ in range(20):
-                leaving = client(sends, reads=100)
-                leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # by a reset
-                leaving.close()
-        assert slow.ask("GET", "/status")[0] == 200
-        assert server.num_threads() <= before + 2
-        assert all(connection.recv(100) == b"" for connection in unfinished)
-        with contextlib.suppress(ConnectionResetError):
-            while rest := unread[-1].recv(1 << 20):
-                assert not rest.endswith(b"0\r\n\r\n")  # the file is cut off before its end
-
-
-def test_viewer_and_stream_come_from_the_same_address_and_nothing_from_elsewhere(page: Page) -> None:
-    code, text = page.ask("GET", "/viewer/?0.5")
-    assert code == 200
-    assert "re_viewer.js" in text
-    assert "https:" not in text
-    assert page.ask("GET", "/viewer/re_viewer.js")[0] == 200
-    for path in ("/", "/viewer/", "/nowhere"):  # whatever a script in them asks for, a browser fetches nothing else
-        connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
-        connection.request("GET", path)
-        policy = connection.getresponse().headers["Content-Security-Policy"].split("; ")
-        assert policy[0] == "default-src 'none'"
-        hosts = {source for part in policy for source in part.split(" ")[1:] if ":" in source and "//" in source}
-        assert hosts <= {
-            f"http://localhost:{page.host.split(':')[1]}",
-            f"http://localhost:{page.host.split(':')[1]}/viewer/",
-        }
-        connection.close()
-    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
-    connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
-    answer = connection.getresponse()
-    assert answer.status == 200
-    assert len(answer.read(200_000)) == 200_000  # what was drawn before this client came
-    connection.close()
-
-
-def test_the_page_follows_the_live_view_where_the_scribe_is_started_again(page: Page) -> None:
-    before = json.loads(page.ask("GET", "/status")[1])["live"]
-    os.kill(page.daemon.client.ask("status")["scribe"]["pid"], signal.SIGKILL)
-    until = time.monotonic() + TIMEOUT_S
-    while (now := json.loads(page.ask("GET", "/status")[1])["live"]) == before or now.startswith("127.0.0.1:0 "):
-        assert time.monotonic() < until
-        time.sleep(0.2)
-    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
-    connection.request("POST", STREAM, EMPTY_GRPC, {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"})
-    assert len(connection.getresponse().read(200_000)) == 200_000
-    connection.close()
-
-
-@pytest.mark.thorough
-def test_a_viewer_is_sent_little_more_than_it_has_drawn(page: Page) -> None:
-    connection = http.client.HTTPConnection(page.host, timeout=TIMEOUT_S)
-    known = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1", "Referer": f"{page.url}viewer/?0.5"}
-    connection.request("POST", STREAM, EMPTY_GRPC, known)
-    answer, came = connection.getresponse(), threading.Semaphore(0)
-
-    def read() -> None:
-        with contextlib.suppress(OSError, http.client.HTTPException, ValueError):  # it is closed
-            while len(header := answer.read(5)) == 5:
-                if SAMPLES.fullmatch(answer.read(int.from_bytes(header[1:], "big"))):
-                    came.release()
-
-    def tell_shown(at_s: float) -> None:
-        assert page.ask("POST", "/viewer/shown", str(1000 * at_s).encode(), Referer=known["Referer"])[0] == 200
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    for _ in range(A_PICTURE):
-        assert came.acquire(timeout=PATIENCE_S)
-    assert not came.acquire(timeout=PATIENCE_S / 3)  # what was drawn before, and since, is some thousands
-    tell_shown(time.time() - PATIENCE_S)
-    assert not came.acquire(timeout=1.0)  # it is far behind
-    tell_shown(time.time())
-    assert came.acquire(timeout=PATIENCE_S / 3)
-    assert connection.sock is not None
-    connection.sock.shutdown(socket.SHUT_RDWR)
-    reader.join(TIMEOUT_S)
-    connection.close()
 
 
 @pytest.mark.usefixtures("drawing")
@@ -284,8 +158,7 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         click("resume", until="follow")
         assert grey() == ["resume", "reset"]
         tab.until("document.getElementById('answer').textContent == ''")  # the answer does not stay
-        assert "/viewer/" in tab.ask("document.querySelector('iframe').src")
-        tab.until("/^picture [0-9.]+ s old/.test(document.getElementById('picture').textContent)")
+        assert "/?url=rerun%2Bhttp" in tab.ask("document.querySelector('iframe').src")
         tab.picture(tmp_path / "page.png")
     with Image.open(tmp_path / "page.png") as image:
         assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # beside the word

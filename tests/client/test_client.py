@@ -119,7 +119,7 @@ def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: z
 
 
 def test_a_certificate_that_is_none_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UnreachableError, match=r"cannot read .*certificate\.pem: a folder made by"):
+    with pytest.raises(UnreachableError, match=r"cannot read .*certificate\.pem: a folder with"):
         open_session(connect=["tls/127.0.0.1:1"], certificate=tmp_path)
 
 

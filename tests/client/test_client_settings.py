@@ -97,19 +97,19 @@ def test_a_wrong_variable_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) 
         client_settings()
 
 
-@pytest.mark.parametrize("command", ["status", "record", "view", "hold", "cells"])
+@pytest.mark.parametrize("command", ["status", "record", "view", "hold", "metrics"])
 def test_help_says_where_it_is_taken_from(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([command, "--help"])
     told = " ".join(capsys.readouterr().out.split())
-    named = [f"$THIRDHAND_{name}" for name in VARIABLES if name != "CELL" or command != "cells"]
+    named = [f"$THIRDHAND_{name}" for name in VARIABLES if name != "CELL" or command != "metrics"]
     assert all(name in told for name in (*named, "$XDG_CONFIG_HOME/thirdhand/client.toml"))
 
 
 def test_endpoint_and_cell_are_given_once(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with serving(tmp_path, "--cell", "lab/bench2", "--joints", "assumed") as daemon:
         file.write_text(f'connect = "{daemon.endpoint}"\ncell = "lab/bench2"\n')
-        for command in (["status"], ["hold"], ["resume"], ["via-points", "list"], ["cells"]):
+        for command in (["status"], ["hold"], ["resume"], ["via-points", "list"], ["status", "--all"]):
             assert main(command) == 0, capsys.readouterr().err
         settings = client_settings()
         with settings.session() as session:

@@ -69,7 +69,7 @@ def test_a_reason_is_named_where_it_is_decided_and_explained_and_hardly_elsewher
 
 def test_what_happened_names_the_settings_of_the_cell() -> None:
     cell = Settings(
-        hands=HandSettings(stale_ms=250.0, unseen_ms=700.0, swapped_s=3.0),
+        hands=HandSettings(stale_ms=250.0, unseen_ms=700.0),
         arm=ArmSettings(silent_ms=60.0, fault_error_rad=0.2),
         tool=ToolSettings(fault_speed=1.4),
     )
@@ -79,7 +79,6 @@ def test_what_happened_names_the_settings_of_the_cell() -> None:
         (Reason.ARM_SILENT, "60 ms ([arm] silent_ms)"),
         (Reason.ARM_ERROR, "0.2 rad ([arm] fault_error_rad)"),
         (Reason.TOOL_SPEED, "1.4 m/s ([tool] fault_speed)"),
-        (Cause.SWAPPED, "3 s ([hands] swapped_s)"),
     ):
         assert words in explained(member, Evidence(settings=cell)).why
         assert words.partition("(")[2].rstrip(")") in explained(member).why
@@ -95,6 +94,7 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Flag.STUCK, f"for {STUCK_S:g} s"),
         (Cause.OLDER, f"more than {intake.MAX_LATE_S:g} s"),
         (Cause.JUMPED, f"three samples over {1e3 * intake.CONFIRMED_S:g} ms"),
+        (Cause.SWAPPED, f"after {intake.SWAPPED_S:g} s"),
         (Condition.ARM_UNSETTLED, f"for {intake.ARM_STILL_S:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do

@@ -96,10 +96,8 @@ def test_without_its_via_points_it_is_as_it_was_learned(skill: Skill) -> None:
     assert skill.model.mean(learned.hands).tobytes() != learned.mean(learned.hands).tobytes()
 
 
-def test_models_are_told_apart_by_their_words_and_formats() -> None:
+def test_models_are_told_apart_by_their_words() -> None:
     assert all(len({words(model) for model in MODELS}) == len(MODELS) for words in (measure, units))
-    formats = [number for model in MODELS for number in model.formats]
-    assert len(set(formats)) == len(formats)
 
 
 def measure(model: type[Model]) -> str:

@@ -20,8 +20,8 @@ from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
 from service.core.frame import Tick, Vector, copied, parameters
 from service.core.intake import plausibility, step
+from service.core.intake.tuning import SWAPPED_S
 from service.core.skill.skill import Skill
-from service.settings.config import HandSettings
 from sim.people import person
 from sim.sessions import session
 from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, frames, led
@@ -57,24 +57,18 @@ def test_a_jump_is_believed_once_three_samples_over_20_ms_agree_and_not_at_all_b
     assert hands.fresh()
 
 
-def test_what_counts_as_a_jump_and_how_long_a_swap_is_doubted_are_settings() -> None:
-    leap = (0.5, 0.18, 0.2)
-    for jump, believed in ((0.04, False), (0.1, True)):
-        hands = Hands(HandSettings(jump=jump))
-        tell(hands, [PLACE] * 100 + [leap], 100)
-        assert hands.rejected() == ({} if believed else {Cause.JUMPED: 1})
-    for swapped_s in (0.3, 1.0):
-        hands = Hands(HandSettings(swapped_s=swapped_s))
-        for tick in range(1, 51):
-            hands.hand(tick, PLACE, side=0)
-            hands.hand(tick, ELSEWHERE, side=1)
-            hands.advance()
-        hands.advance(50)
-        tick = 100
-        while float(hands.hand(10**9 + tick, ELSEWHERE)[1]) < 0.2:
-            hands.advance()
-            tick += 1
-        assert tick * 0.002 == pytest.approx(swapped_s + 0.2, abs=0.02)
+def test_a_swap_is_doubted_for_two_seconds() -> None:
+    hands = Hands()
+    for tick in range(1, 51):
+        hands.hand(tick, PLACE, side=0)
+        hands.hand(tick, ELSEWHERE, side=1)
+        hands.advance()
+    hands.advance(50)
+    tick = 100
+    while float(hands.hand(10**9 + tick, ELSEWHERE)[1]) < 0.2:
+        hands.advance()
+        tick += 1
+    assert tick * 0.002 == pytest.approx(SWAPPED_S + 0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])

@@ -93,12 +93,12 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
         if c.key != "gripper/command"
     }
     assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}
-    assert main(["cells", "--connect", lab.endpoint]) == 0
+    assert main(["status", "--all", "--connect", lab.endpoint]) == 0
     heads, *lines = capsys.readouterr().out.splitlines()
     assert re.split("  +", heads.strip()) == list(filter(None, HEADS))
     assert [line.split()[0] for line in lines] == sorted(NAMES)
     assert all("  hold (no_hands)  " in line for line in lines[1:])
-    assert main(["cells", "--json", "--connect", lab.endpoint]) == 0
+    assert main(["status", "--all", "--json", "--connect", lab.endpoint]) == 0
     assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
 
 
@@ -110,7 +110,7 @@ def test_cells_are_watched_as_lines_and_one_that_ends_is_gone() -> None:
         open_session(connect=endpoints(router)) as daemon,
     ):
         token = daemon.liveliness().declare_token(channels.presence("lab/a", str(daemon.zid())))
-        command = [sys.executable, "-m", "service", "cells", "--watch", "--connect", endpoints(router)[0]]
+        command = [sys.executable, "-m", "service", "status", "--all", "--watch", "--connect", endpoints(router)[0]]
         watching = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
         try:
             assert watching.stdout is not None
@@ -231,7 +231,7 @@ def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.Cap
     lab.daemons.kill()
     lab.daemons.wait()
     until(lambda: not cells(lab.session))
-    assert main(["cells", "--connect", lab.endpoint]) == 1
+    assert main(["status", "--all", "--connect", lab.endpoint]) == 1
     assert "no daemon is alive on this network" in capsys.readouterr().err
     with pytest.raises(UnreachableError, match="nobody answers on"):
         Client(lab.session, NAMES[0], timeout_s=1.0).status()
@@ -286,11 +286,12 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
 
 
 def test_a_zenoh_configuration_that_is_none_is_told(
-    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "broken.json5").write_text("{ mode: ")
     for name, words in (("broken.json5", "broken.json5: "), ("missing.json5", "No such file")):
-        assert main(["status", "--zenoh-config", str(tmp_path / name), "--connect", lab.endpoint]) == 1
+        monkeypatch.setenv("THIRDHAND_ZENOH_CONFIG", str(tmp_path / name))
+        assert main(["status", "--connect", lab.endpoint]) == 1
         assert words in (said := capsys.readouterr().err)
         assert said.startswith("thirdhand status: cannot read the Zenoh configuration ")
         assert said.count("\n") == 1

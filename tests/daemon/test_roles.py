@@ -1,12 +1,10 @@
-"""Who may do what on a network: certificates made by the command, and real sessions of each role
-that try everything.
+"""Who may do what on a network: certificates by the commands in docs/access.md, and real sessions
+of each role that try everything.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime
-import itertools
 import json
 import os
 import re
@@ -18,17 +16,16 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from cryptography import x509
 
-from service.cli.main import main
 from service.client import Client, UnreachableError, cells, endpoints, living, open_session
-from service.client.session import CertificateError, valid_until
+from service.client.session import CertificateError
 from service.contract import cdr, channels, ros2
 from service.contract.messages import PoseStamped
 from service.contract.roles import DAEMON, ROLES, ROUTER, TOPICS, access_control, names
 from service.daemon.launch import launched
 from service.daemon.single_instance import NETWORK_BOUNDS, occupy
 from support.cell import LEFT, Tracker, thirdhand, told, until
+from support.certificates import make_certificates
 
 CELL = "bench"
 NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
@@ -41,12 +38,8 @@ PATIENCE_S = 1.0  # what is refused is only seen by waiting
 
 @pytest.fixture(scope="module")
 def secrets(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command makes."""
-    folder = tmp_path_factory.mktemp("certificates") / "secrets"
-    made = thirdhand("certificates", str(folder))
-    assert made.returncode == 0, made.stderr
-    assert "operator: its holder may send requests" in made.stdout
-    return folder
+    """Certificates of one authority, with a second tracker and a second operator."""
+    return make_certificates(tmp_path_factory.mktemp("certificates"), "tracker-2", "operator-2")
 
 
 def keys(suffixes: Iterable[str]) -> set[str]:
@@ -166,10 +159,6 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
 
 def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Path) -> None:
     """Sessions of two trackers and two operators; of each the second was revoked."""
-    for role in ("tracker", "operator"):
-        made = told("certificates", str(secrets), "--role", role)
-        assert made.returncode == 0, made.stderr
-        assert f"{secrets / role}-2: {role}-2, of role {role}; valid until 20" in made.stdout
     full = {key: channels.key(CELL, key) for key in (*INPUTS, *OUTPUTS, *REQUESTS)}
     daemon = Guarded(secrets, revoked=("tracker-2", "operator-2"))
     with contextlib.ExitStack() as closing:
@@ -256,146 +245,19 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     assert {name for policy in told["policies"] for name in policy["subjects"]} == {s["id"] for s in told["subjects"]}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("--role", "tracker", "--name", "left-camera"), 2, "tracker with a number needed, tracker-2 to tracker-99"),
-        (("--name", "tracker-2"), 2, "--role needed with it"),
-        (("--role", "tracker", "--name", "tracker"), 1, "a new name needed"),
-        (("--role", "nobody"), 2, "invalid choice"),
-        (("--role", "tracker", "--host", "not plain \u00fc"), 2, "a name in plain letters, or an address, needed"),
-        (("--role", "daemon", "--days", "0"), 2, "--days: 0 given, 1 to 36500 needed"),
-    ],
-)
-def test_one_more_certificate_that_cannot_be_is_refused_in_words(
-    secrets: Path, arguments: tuple[str, ...], code: int, words: str
-) -> None:
-    done = told("certificates", str(secrets), *arguments)
-    assert done.returncode == code
-    assert words in done.stderr
-    nowhere = told("certificates", str(secrets / "none"), "--role", "tracker")
-    assert nowhere.returncode == 1
-    assert "no authority in" in nowhere.stderr
-
-
-def test_a_name_that_was_given_is_not_given_again_when_its_folder_went_to_its_machine(secrets: Path) -> None:
-    made = [told("certificates", str(secrets), "--role", "bench") for _ in range(2) if _moved(secrets / "bench-2")]
-    assert [done.returncode for done in made] == [0, 0]
-    assert (secrets / "bench-3").is_dir()
-    assert not (secrets / "bench-2").exists()
-
-
-def _moved(folder: Path) -> bool:
-    if folder.exists():
-        folder.rename(folder.parent.parent / folder.name)
-    return True
-
-
-def test_the_daemons_certificate_can_be_made_anew(secrets: Path) -> None:
-    made = told("certificates", str(secrets), "--role", "daemon", "--name", "daemon-7", "--host", "bench.local")
-    assert made.returncode == 0, made.stderr
-    certificate = x509.load_pem_x509_certificate((secrets / "daemon-7" / "certificate.pem").read_bytes())
-    hosts = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    assert "bench.local" in hosts.get_values_for_type(x509.DNSName)
-    with (
-        open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon-7") as renewed,
-        open_session(connect=endpoints(renewed), certificate=secrets / "operator"),
-    ):
-        pass
-
-
-def test_a_certificate_out_of_its_time_is_told_in_words(
-    guarded: Guarded, secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Made by the command, with its clock 30 days off."""
-    shutil.copytree(secrets, tmp_path / "own")
-    today = datetime.datetime.now(datetime.UTC)
-    for days, name, words in (
-        (-30, "tracker-5", r"certificate\.pem expired on 20.* UTC: a new certificate needed"),
-        (30, "tracker-6", r"certificate\.pem is valid from 20.* UTC on, but the clock here shows"),
-    ):
-        made = today + datetime.timedelta(days=days)
-        monkeypatch.setattr("service.cli.certificates.now", lambda made=made: made)
-        assert main(["certificates", str(tmp_path / "own"), "--role", "tracker", "--name", name, "--days", "3"]) == 0
-        with pytest.raises(UnreachableError, match=words):
-            open_session(connect=[guarded.endpoint], certificate=tmp_path / "own" / name, timeout_s=1.0)
-    (tmp_path / "own" / "tracker" / "certificate.pem").write_text("nothing")
-    with pytest.raises(UnreachableError, match="does not hold a certificate"):
-        open_session(connect=[guarded.endpoint], certificate=tmp_path / "own" / "tracker", timeout_s=1.0)
-
-
-def test_certificates_are_renewed_with_their_names_and_keys_and_old_and_new_ones_meet(
-    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where some machines have the old ones, and where only a certificate came back."""
-    old, own = tmp_path / "old", tmp_path / "own"
-    assert told("certificates", str(own), "--host", "bench.local", "--days", "20").returncode == 0
-    shutil.copytree(own, old)
-    (own / "tracker" / "key.pem").unlink()
-    done = told("certificates", str(own), "--renew", "--days", "400")
-    assert done.returncode == 0, done.stderr
-    assert len(re.findall("renewed; valid until", done.stdout)) == len(list(own.glob("*/certificate.pem")))
-    assert f"{datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=400):%Y-%m-%d}" in done.stdout
-    before, after = (
-        x509.load_pem_x509_certificate((folder / "daemon" / "certificate.pem").read_bytes()) for folder in (old, own)
-    )
-    assert (before.subject, before.public_key()) == (after.subject, after.public_key())
-    hosts = after.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    assert "bench.local" in hosts.get_values_for_type(x509.DNSName)
-    assert (valid_until(own / "daemon") - valid_until(old / "daemon")).days == 380
-    shutil.copy(old / "tracker" / "key.pem", own / "tracker")
-    for daemons, clients in ((own, old), (old, own), (own, own)):
-        with (
-            open_session(listen=["tls/127.0.0.1:0"], certificate=daemons / "daemon") as daemon,
-            open_session(connect=endpoints(daemon), certificate=clients / "tracker"),
-        ):
-            pass
-    assert not list(own.rglob("*.new"))
-    for path in own.rglob("*.pem"):
-        assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    shutil.copytree(secrets / "operator", own / "operator-7")
-    refused = told("certificates", str(own), "--renew")
-    assert (refused.returncode, "operator-7/certificate.pem is not by the authority" in refused.stderr) == (1, True)
-    assert told("certificates", str(own), "--renew", "--role", "arm").returncode == 2
-    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=500)  # the authority has expired
-    monkeypatch.setattr("service.cli.certificates.now", lambda: later)
-    shutil.rmtree(own / "operator-7")
-    assert told("certificates", str(own), "--role", "arm").returncode == 1
-    assert told("certificates", str(own), "--renew").returncode == 0
-
-
-def test_a_certificate_that_ends_soon_is_reported_by_daemon_doctor_and_cells(tmp_path: Path) -> None:
-    own = tmp_path / "own"
-    assert told("certificates", str(own), "--days", "20").returncode == 0
-    config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{own}/daemon"\n'
-    with launched(tmp_path, "--joints", "assumed", network=config) as service:
-        at = ("--connect", service.endpoint, "--certificate", str(own / "operator"))
-        assert "certificate ends in 20 days" in told("cells", *at).stdout
-        assert re.search(r"note +certificate +ends in 20 days\n.*\n.*--renew", told("doctor", *at).stdout)
-        until(lambda: "the certificate ends on" in service.log.read_text())
-
-
 @pytest.mark.thorough
-def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
-    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the checks of the own files' dates, as if the clocks of both machines differed."""
-    own, other, ago = tmp_path / "own", tmp_path / "other", datetime.datetime.now(datetime.UTC)
-    shutil.copytree(secrets, own)
-    assert told("certificates", str(other)).returncode == 0
-    ago -= datetime.timedelta(days=30)
-    monkeypatch.setattr("service.cli.certificates.now", lambda: ago)
-    for role, name in (("daemon", "daemon-8"), ("operator", "operator-8")):
-        assert told("certificates", str(own), "--role", role, "--name", name, "--days", "3").returncode == 0
+def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: Path) -> None:
+    """Some have expired, and one is of another authority."""
+    own = make_certificates(tmp_path, expired="daemon-8 operator-8")
+    other = make_certificates(tmp_path / "other")
     shutil.copytree(other / "operator", own / "operator-9")
     shutil.copy(own / "operator" / "authority.pem", own / "operator-9")
-    monkeypatch.setattr("service.client.session.check_dates", lambda path: None)
     for daemon, client, words in (
         ("daemon", None, "requires a certificate, and none was given"),
         (
             "daemon",
             other / "operator",
-            "the certificate of the daemon .* is not from the authority in .*other/operator",
+            "the certificate of the daemon .* is not from the authority in .*other/secrets/operator",
         ),
         ("daemon", own / "operator-8", "refuses the certificate in .*operator-8, which has expired by the clock there"),
         (
@@ -423,9 +285,12 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(
 
 
 @pytest.mark.thorough
-def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path, tmp_path: Path) -> None:
+def test_daemons_of_two_cells_see_each_other_by_their_certificates(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of which one connects to the other; a third is of another authority, a fourth has none."""
-    at, operator = "", ("--certificate", str(secrets / "operator"))
+    at = ""
+    monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
     with contextlib.ExitStack() as closing:
         endpoints_of: dict[str, str] = {}
         for name in ("lab/a", "lab/b"):
@@ -439,7 +304,7 @@ def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path
             shown = until(
                 lambda endpoint=endpoint: (
                     shown
-                    if len(shown := json.loads(told("cells", "--json", "--connect", endpoint, *operator).stdout)) == 2
+                    if len(shown := json.loads(told("status", "--all", "--json", "--connect", endpoint).stdout)) == 2
                     and all(cell["status"] for cell in shown)
                     else None
                 )
@@ -448,23 +313,23 @@ def test_daemons_of_two_cells_see_each_other_by_their_certificates(secrets: Path
                 assert (cell["mode"], cell["reason"], cell["skill"]) == ("hold", "no_hands", "soldering")
                 assert cell["version"]
                 assert cell["lateness_us"]["p99"] > 0
-        assert told("certificates", str(tmp_path / "other")).returncode == 0
+        make_certificates(tmp_path / "other")
         serve = ("serve", "--cell", "lab/c", "--joints", "assumed", "--connect", endpoint)
         config = tmp_path / "c.toml"
-        config.write_text(f'[network]\nlisten = []\ncertificate = "{tmp_path}/other/daemon"\n')
+        config.write_text(f'[network]\nlisten = []\ncertificate = "{tmp_path}/other/secrets/daemon"\n')
         foreign = told(*serve, "--config", str(config))
         assert (foreign.returncode, foreign.stdout) == (1, "")
         assert re.search(
             "^thirdhand serve: the certificate of the daemon .* is not from the authority in", foreign.stderr
         )
-        without = thirdhand("cells", "--connect", endpoint)
+        without = thirdhand("status", "--all", "--connect", endpoint, env=os.environ | {"THIRDHAND_CERTIFICATE": ""})
         assert (without.returncode, without.stdout) == (1, "")
-        assert re.search("^thirdhand cells: .* requires a certificate, and none was given", without.stderr)
+        assert re.search("^thirdhand status: .* requires a certificate, and none was given", without.stderr)
 
 
 def test_a_stranger_does_not_get_in(guarded: Guarded, tmp_path: Path) -> None:
-    assert told("certificates", str(tmp_path / "own")).returncode == 0
-    for certificate, words in ((tmp_path / "own" / "operator", "is not from the authority"), (None, "none was given")):
+    own = make_certificates(tmp_path)
+    for certificate, words in ((own / "operator", "is not from the authority"), (None, "none was given")):
         with pytest.raises(UnreachableError, match=words):
             open_session(connect=[guarded.endpoint], certificate=certificate, timeout_s=1.0)
     with pytest.raises(UnreachableError):
@@ -480,24 +345,20 @@ def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
         open_session(connect=endpoints(false), certificate=secrets / "tracker", timeout_s=1.0)
 
 
-def test_what_the_command_makes_is_private_and_not_written_over(secrets: Path) -> None:
-    for path in itertools.chain([secrets], secrets.rglob("*")):
-        assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
-    again = told("certificates", str(secrets))
-    assert again.returncode == 1
-    assert "not overwritten" in again.stderr
-
-
-def test_a_daemon_and_its_commands_by_certificates(secrets: Path, tmp_path: Path) -> None:
+def test_a_daemon_and_its_commands_by_certificates(
+    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\n'
     with launched(tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
-        at = ("--connect", service.endpoint, "--certificate")
+        at = ("--connect", service.endpoint)
         assert service.endpoint.startswith("tls/127.0.0.1:")
-        held = thirdhand("hold", *at, str(secrets / "operator"))
+        monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
+        held = told("hold", *at)
         assert held.returncode == 0, held.stderr
-        from_shell = thirdhand("status", *at[:2], env=os.environ | {"THIRDHAND_CERTIFICATE": str(secrets / "operator")})
+        from_shell = thirdhand("status", *at)
         assert from_shell.returncode == 0, from_shell.stderr
-        refused = told("resume", *at, str(secrets / "observer"))
+        monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "observer"))
+        refused = told("resume", *at)
         assert refused.returncode == 1
         assert "nobody answers" in refused.stderr
         with (

@@ -27,7 +27,8 @@ from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.replay import replay
 from service.settings.config import parse
 from service.trackers.capture import Capture
-from support.cell import LEFT, RIGHT, Daemon, serving, told, until
+from support.cell import LEFT, RIGHT, Daemon, serving, until
+from support.certificates import make_certificates
 
 DOMAIN = 13
 KIND = "tf2_msgs/msg/TFMessage"
@@ -169,10 +170,9 @@ def assert_refused(daemon: Daemon, session: zenoh.Session) -> None:
 
 def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
     """Behind certificates: a tracker publishes them, and a recorder hears them."""
-    assert told("certificates", str(tmp_path / "secrets")).returncode == 0
+    secrets = make_certificates(tmp_path)
     settings = parse(CELL.format(router="tcp/127.0.0.1:1", state=tmp_path), origin="tf.toml")
     guarded = {**NETWORK_BOUNDS, **access_control(settings.cell, (), DOMAIN, [*ros2.of_settings(settings.ros2)])}
-    secrets = tmp_path / "secrets"
     with open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=guarded) as session:
         at = endpoints(session)
         with (

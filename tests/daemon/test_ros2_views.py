@@ -29,7 +29,8 @@ from service.daemon.ros2_domain import Ros2Domain
 from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.shipped import cell_of
 from service.settings.config import Settings, parse, robot_description
-from support.cell import Tracker, serving, told, until
+from support.cell import Tracker, serving, until
+from support.certificates import make_certificates
 from support.wam import JOINT_NAMES
 
 DOMAIN = 12
@@ -190,11 +191,11 @@ def test_frames_of_every_shipped_arm_are_one_tree_from_base(arm: str) -> None:
 
 def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:
     """An observer, and not a tracker."""
-    assert told("certificates", str(tmp_path / "secrets")).returncode == 0
+    secrets = make_certificates(tmp_path)
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
     topics = list(ros2.of_settings(settings.ros2))
     guarded = {**NETWORK_BOUNDS, **access_control(settings.cell, (), DOMAIN, topics)}
-    listen, secrets = ["tls/127.0.0.1:0"], tmp_path / "secrets"
+    listen = ["tls/127.0.0.1:0"]
     with open_session(listen=listen, certificate=secrets / "daemon", more=guarded) as session:
         failures: list[str] = []
         domain = Ros2Domain(session, settings, topics, failed=failures.append)

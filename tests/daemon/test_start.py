@@ -216,7 +216,7 @@ def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    "command", ["status", "doctor", "hold", "cells", "follow simulated --wait 1", "via-points list"]
+    "command", ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"]
 )
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
     at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]

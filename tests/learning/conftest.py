@@ -15,7 +15,7 @@ from support.taught_scene import PLACES, demonstrated, quickly
 
 @pytest.fixture(scope="session")
 def skill() -> Skill:
-    """A skill learned the paper's way, in the first format."""
+    """A skill learned the paper's way."""
     path = RECORDINGS / "experiments" / "as-paper.npz"
     return decoded(path.read_bytes(), origin=str(path))
 

@@ -60,7 +60,7 @@ def test_demonstrations_that_cannot_be_learned_from_are_refused(taught: list[Dem
         ([one._replace(tool=np.full_like(one.tool, np.nan))], "not finite"),
         ([one._replace(tool=turned)], "not quaternions of norm 1"),
         ([one._replace(left=1000 * one.left)], "is it in metres"),
-        ([one], r"1 demonstration given \(demonstration 1\): at least 2 needed, .*--components 10"),
+        ([one], r"1 demonstration given \(demonstration 1\): at least 2 needed"),
     ):
         with pytest.raises(SkillError, match=message):
             learn(wrong)

@@ -49,7 +49,7 @@ def test_a_correction_moves_the_tool_in_its_stage_and_leaves_the_ends(
 ) -> None:
     hands = hands_in(staged, stage, share)
     made = correction_at(staged, hands, stage, tool_in(staged, hands, stage) + UP)
-    after, effect = corrected(staged, made.among(staged.via_points), made.point, max_gain=4.0)
+    after, effect = corrected(staged, made.among(staged.via_points), made.point)
     names = staged.model.names
     assert (made.point.name, made.point.stage, made.replaced) == ("correction-1", names[stage], ())
     assert stage_of(after, made.point) == names[stage : stage + 2]
@@ -77,7 +77,7 @@ def test_a_correction_at_an_end_of_a_stage_teaches_that_via_point_anew(
     (before,) = made.replaced
     assert (made.point.name, made.point.stage, before.name) == (name, None, name)
     assert (made.point.std, made.point.radius, made.point.follow) == (before.std, before.radius, before.follow)
-    after, _ = corrected(staged, made.among(staged.via_points), made.point, max_gain=4.0)
+    after, _ = corrected(staged, made.among(staged.via_points), made.point)
     assert [point.name for point in after.via_points][-1] == name
     assert len(after.via_points) == len(staged.via_points)
     index = staged.model.names.index(name)
@@ -92,7 +92,7 @@ def test_repeated_corrections_replace_each_other_are_counted_and_offered(staged:
         aside = 0.5 * SEGMENT_END_M * (count % 2) * np.eye(6)[1]
         made = correction_at(skill, hands + aside, 0, tool_in(staged, hands, 0) + count * 0.5 * UP)
         assert len(made.replaced) == (count > 1)
-        skill, _ = corrected(skill, made.among(skill.via_points), made.point, max_gain=4.0)
+        skill, _ = corrected(skill, made.among(skill.via_points), made.point)
         assert (made.point.name, made.point.corrections) == (f"correction-{count}", count)
         assert newest_correction(skill.via_points) == made.point
     assert offer_of(skill).startswith("correction-3 was corrected up to 3 times at nearly the same hands: show")
@@ -104,7 +104,7 @@ def test_a_skill_without_stages_is_corrected_by_its_kernel(skill: StoredSkill) -
     hands = skill.hands[len(skill.hands) // 2].copy()
     made = correction_at(skill, hands, -1, skill.mean(hands[None])[0] + 0.5 * UP)
     assert (made.point.name, made.point.stage) == ("correction-1", None)
-    after, effect = corrected(skill, made.among(()), made.point, max_gain=4.0)
+    after, effect = corrected(skill, made.among(()), made.point)
     assert effect.moved_m == pytest.approx(0.04, abs=2e-3)
     assert 0.0 < effect.reach_m <= 0.4
     assert adapted(after, (), tolerance=skill.tolerance).file == skill.file
@@ -114,4 +114,4 @@ def test_a_correction_that_would_amplify_trembling_hands_is_refused(staged: Stor
     hands = hands_in(staged, 0, 0.2)
     made = correction_at(staged, hands, 0, tool_in(staged, hands, 0) + 5 * UP)
     with pytest.raises(SkillError, match=r"a correction of 40 cm so near to .* times as far as the hands; 4 times acc"):
-        corrected(staged, made.among(staged.via_points), made.point, max_gain=4.0)
+        corrected(staged, made.among(staged.via_points), made.point)

@@ -1,11 +1,10 @@
-"""Settings tried on a recording's hands: the figures, the proposal, and two settings compared."""
+"""Settings tried on a recording's hands: the figures and the proposal."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -21,7 +20,6 @@ from service.report.variants import (
     VariantFigures,
     best,
     changed,
-    compared,
     toml,
     tried,
     written_change,
@@ -104,34 +102,6 @@ def test_the_best_trade_off_costs_nothing_else(variant: VariantFigures, chosen: 
     found, reason = best([figures(6.0, 30.0, change={}), variant], Settings())
     assert (found is variant) is chosen
     assert ("instead of" in reason) is chosen
-
-
-def test_two_settings_are_compared_for_the_same_hands(hands: RecordedHands) -> None:
-    same = compared(hands, hands.settings, "again.toml")
-    assert same[1] == "All commands are the same."
-    assert {row[-1] for row in same[0][0].rows} == {"same"}
-    slow = msgspec.structs.replace(
-        hands.settings,
-        tool=msgspec.structs.replace(hands.settings.tool, max_jerk=100.0),
-        hands=msgspec.structs.replace(hands.settings.hands, stale_ms=30.0),
-    )
-    (figures, settings), sentence = compared(hands, slow, "slow.toml")
-    rows = {row[0]: row[1:] for row in figures.rows}
-    assert float(rows["jerk of the tool [m/s³]"][2]) < -8.0
-    assert rows["rejected: not_finite"][2] == "same"
-    assert float(rows["speed_limited [s]"][2]) > 0.0
-    assert {row[0] for row in settings.rows} == {"hands.stale_ms", "tool.max_jerk"}
-    assert "mm apart" in sentence
-
-
-def test_another_arm_and_another_rate_are_not_compared(hands: RecordedHands) -> None:
-    other = msgspec.structs.replace(
-        hands.settings, joints=msgspec.structs.replace(hands.settings.joints, names=tuple("abcdefg"))
-    )
-    with pytest.raises(RecordingError, match=r"other.toml is of another arm .*: joints a, b, .* given, wam/base_yaw"):
-        compared(hands, other, "other.toml")
-    with pytest.raises(RecordingError, match=r"rate_hz = 250 given, 500 needed"):
-        compared(hands, msgspec.structs.replace(hands.settings, rate_hz=250), "other.toml")
 
 
 def test_a_part_keeps_what_lasts_and_must_hold_ticks() -> None:

@@ -180,17 +180,8 @@ def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, acce
     assert accepted in message.split(path, 1)[1]
 
 
-def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
+def test_all_contradictions_between_valid_values_are_reported_at_once() -> None:
     text = """
-    rate_hz = 7
-    a-b = 1
-    [tool]
-    max_speed = -1
-    colour = 'red'
-    [hands]
-    unit = 'ft'
-    [network]
-    listen = ['tcp/0.0.0.0:1']
     [reach]
     inner = 3
     outer = 2
@@ -200,31 +191,24 @@ def test_all_that_is_wrong_is_told_at_once_and_each_once() -> None:
     """
     lines = refusal(text).removeprefix("cell.toml: ").splitlines()
     assert sorted(re.split("[:;]", line)[0] for line in lines) == [
-        "[hands] unit",
         "[joints] jerk, entry 3",
         "[joints] velocity, entry 1",
         "[joints] velocity, entry 7",
-        "[network] listen, entry 1",
         "[reach] inner",
-        "[tool] max_speed",
-        "rate_hz",
-        "tool",
-        "unknown field 'a-b'",
     ]
 
 
 @pytest.mark.parametrize(
-    ("arm", "told"),
+    ("arm", "first"),
     [
-        ("urdf = 'nowhere.urdf'", ["[arm] urdf"]),
-        (f"urdf = '{WAM}'", ["[arm] plate"]),
-        (f"urdf = '{WAM}'\nplate = 'tool_plate'", ["[joints] acceleration", "[joints] jerk", "[arm] posture"]),
+        ("urdf = 'nowhere.urdf'", "[arm] urdf"),
+        (f"urdf = '{WAM}'", "[arm] plate"),
+        (f"urdf = '{WAM}'\nplate = 'tool_plate'", "[joints] acceleration"),
     ],
 )
-def test_what_else_is_wrong_is_told_beside_a_urdf_that_cannot_be_used(arm: str, told: list[str]) -> None:
+def test_a_urdf_that_cannot_be_used_is_reported_first(arm: str, first: str) -> None:
     text = f"[arm]\n{arm}\n[hands]\nunit = 'ft'\n[tool]\ncolour = 'red'\nmax_speed = -1"
-    lines = refusal(text).removeprefix("cell.toml: ").splitlines()
-    assert [line.split(":")[0] for line in lines] == [*told, "[hands] unit", "tool", "[tool] max_speed"]
+    assert refusal(text).startswith(f"cell.toml: {first}: ")
 
 
 def test_what_follows_from_another_error_is_not_told() -> None:

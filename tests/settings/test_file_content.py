@@ -21,7 +21,6 @@ LARGEST = 1000
 COMMANDS = {
     "configuration": ("serve", "--joints", "assumed", "--config"),
     "via-points": ("via-points", "add", "--file"),
-    "Zenoh configuration": ("status", "--zenoh-config"),
     "recording": ("view",),
 }
 

@@ -9,6 +9,7 @@ import contextlib
 import json
 import math
 import ssl
+import stat
 import struct
 import time
 from collections.abc import AsyncIterator
@@ -27,7 +28,6 @@ from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
 from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
 from service.trackers.hands_page import WORKER, HeadsetPage
 from service.trackers.web_server import FOREIGN, server_certificate
-from support.cell import told
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 
 NAN_PALM, NO_ROTATION = (math.nan, *PALM[1:]), (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
@@ -225,15 +225,16 @@ def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
         asyncio.run(scenario())
 
 
-def test_a_certificate_of_this_command_serves_https_under_its_names_alone(tmp_path: Path) -> None:
-    done = told("certificates", str(tmp_path / "secrets"), "--host", "bench.example")
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "secrets" / "headset"
-    trusted = ssl.create_default_context(cafile=folder / "authority.pem")
+def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: Path) -> None:
+    certificate = server_certificate("Localhost", tmp_path / "state")
+    (file,) = (tmp_path / "state").iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    trusted = ssl.create_default_context(cafile=file)
+    trusted.check_hostname = False  # the connection is by address
 
     async def scenario() -> None:
         async with serving_page(page) as at:
-            for name in ("127.0.0.1", "localhost", "bench.example"):
+            for name in ("127.0.0.1", "localhost"):
                 host = f"{name}:{at.rpartition(':')[2]}"
                 headers = {"Host": host, "Origin": f"https://{host}"}
                 async with opened(page, at, ssl=trusted, headers=headers) as socket:
@@ -246,14 +247,13 @@ def test_a_certificate_of_this_command_serves_https_under_its_names_alone(tmp_pa
                 async with aiohttp.ClientSession() as session, session.get(f"http://{at}/"):
                     pass
 
-    with page_of_hands(certificate=server_certificate(folder)) as (page, heard):
+    with page_of_hands(certificate=certificate) as (page, heard):
         asyncio.run(scenario())
-    (folder / "key.pem").unlink()
-    with pytest.raises(ExplainedError, match=r"key\.pem: No such file"):
-        server_certificate(folder)
-    (folder / "key.pem").write_bytes((tmp_path / "secrets" / "daemon" / "key.pem").read_bytes())
-    with pytest.raises(ExplainedError, match="the key does not belong to the certificate"):
-        server_certificate(folder)
+    file.write_text("nothing")
+    with pytest.raises(ExplainedError, match=r"localhost\.pem: .*; delete the file for a new one"):
+        server_certificate("localhost", tmp_path / "state")
+    with pytest.raises(ExplainedError, match="a name in plain letters, or an address, needed"):
+        server_certificate("not plain", tmp_path / "state")
 
 
 @given(

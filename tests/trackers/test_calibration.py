@@ -564,7 +564,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     for more, code, words in (
         (("--accept", "0.1"), 1, "not accurate enough: 0."),
         (("--hand", "right"), 1, "hands/left moves with the tool, with a residual of 1 mm: if the left hand holds it"),
-        (("--points",), 2, "--points are touched in a running cell: --from needs --held"),
+        (("--at", "0", "0", "0"), 2, "points are touched in a running cell: --from needs no --at"),
     ):
         done = told(*cell, *more)
         assert (done.returncode, words in done.stderr) == (code, True), done.stderr
@@ -609,11 +609,10 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--held", "--points"], 2, "not allowed with argument"),
+        (["--held", "--at", "0", "0", "0"], 2, "not allowed with argument"),
         (["--check"], 2, "--check compares with the last calibration of a cell: give its settings by --config FILE"),
-        (["--at", "0", "0", "0"], 2, "--at and --at-file give points to touch: give --points too"),
-        (["--points", "--at", "0", "0", "0"], 2, "1 points given; 4 or more needed"),
-        (["--points", "--at-file", "FILE"], 2, "line 2: '1 2' given; three numbers from -5 to 5 m needed"),
+        (["--at", "0", "0", "0"], 2, "1 points given; 4 or more needed"),
+        (["--at", "0", "0", "6"], 2, "6 given, -5 to 5 m needed"),
         (["--accept", "0"], 2, "0 given, 0.1 to 200 mm needed"),
         (["--hand", "both"], 2, "invalid choice"),
         (["--config", "nowhere.toml"], 1, "cannot read configuration nowhere.toml"),
@@ -621,11 +620,10 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
         (["--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
     ],
 )
-def test_what_cannot_be_meant_is_said(arguments: list[str], code: int, words: str, tmp_path: Path) -> None:
-    (tmp_path / "points").write_text("# x y z\n1 2\n")
+def test_what_cannot_be_meant_is_said(arguments: list[str], code: int, words: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.cli.calibrate.CONNECT_TIMEOUT_S", 0.2)
-        done = told("calibrate", *[str(tmp_path / "points") if one == "FILE" else one for one in arguments])
+        done = told("calibrate", *arguments)
     assert (done.returncode, words in done.stderr) == (code, True), done.stderr
 
 
@@ -703,7 +701,6 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
 ) -> None:
     cell, endpoint = tmp_path / "my.toml", f"tcp/127.0.0.1:{free_port()}"
     cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
-    (tmp_path / "points.txt").write_text("".join("{} {} {}\n".format(*point) for point in POINTS))
     arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
     with calibrating("--config", str(cell), "--listen", endpoint) as process, LedCell(endpoint, Settings(), arm):
         line_with(process, "hold the tool and lead it")
@@ -731,15 +728,9 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
         status = daemon.until(lambda now: "right" in now["hands_m"] and now["sources"]["right"]["fresh"], 30)
         np.testing.assert_allclose(status["hands_m"]["right"], led_cell.touched, atol=0.01)
         assert status["below_table_m"] == {}
-        points = [
-            "--points",
-            "--config",
-            str(cell),
-            "--connect",
-            daemon.endpoint,
-            "--at-file",
-            str(tmp_path / "points.txt"),
-        ]
+        points = ["--config", str(cell), "--connect", daemon.endpoint]
+        for point in POINTS:
+            points += ["--at", *map(str, point)]
         with calibrating(*points) as process:
             for number, point in enumerate(POINTS, 1):
                 led_cell.touched = point

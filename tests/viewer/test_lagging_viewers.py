@@ -15,7 +15,6 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from service.cli.live_page import STREAM
 from service.scribe.process import LiveView
 from service.scribe.protocol import TickMessage
 from service.settings.config import WAM, Settings
@@ -27,6 +26,7 @@ pytestmark = pytest.mark.thorough
 TIMES_REAL, SCENE_S = 4, 48  # of 500 ticks
 BOUND_MB = 100.0
 TIMEOUT_S = 60.0
+STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which browsers request the stream
 
 
 def resident_mb() -> float:

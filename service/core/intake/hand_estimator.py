@@ -29,9 +29,12 @@ from service.core.intake.tremor import no_tremor, note_tremor
 from service.core.intake.tuning import (
     DELAY_TOLERANCE_S,
     END_SHARE,
+    HAND_STILL_MPS,
+    HAND_STILL_S,
     LEAST_NOISE_M,
     NOISE_OUTLIER_SHARE,
     NOISE_SAMPLES,
+    NOISE_STD_M,
     REAPPEARED_VARIANCE_SHARE,
     SETTLED_SAMPLES,
     STILLNESS_FALL_S,
@@ -40,17 +43,15 @@ from service.core.intake.tuning import (
 )
 from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from service.core.vectors import squared_distance
-from service.settings.config import HandSettings
 
 STILL = np.ones(2)  # stillness of two hands that rest
-USUAL = HandSettings()  # default settings, for recordings without a cell's settings
 
 
-def smoothing(period_s: float, still_s: float) -> Vector:
+def smoothing(period_s: float) -> Vector:
     """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
     stillness: 1 - exp(-period / time constant).
     """
-    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, still_s, STILLNESS_FALL_S)])
+    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, HAND_STILL_S, STILLNESS_FALL_S)])
 
 
 @compiled
@@ -73,13 +74,14 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 
 
-def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUAL) -> Vector:
+def stillness_of(velocities: Vector, period_s: float) -> Vector:
     """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
     out, stillness = np.empty((len(velocities), 2)), STILL.copy()
-    changes, lowpass, speed = smoothing(period_s, hands.still_s), np.zeros((2, 3)), float(hands.still_speed)
+    changes = smoothing(period_s)
+    lowpass = np.zeros((2, 3))
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
-            stillness[side] = stillness_after(velocity[side], changes, speed, lowpass[side], stillness[side])
+            stillness[side] = stillness_after(velocity[side], changes, HAND_STILL_MPS, lowpass[side], stillness[side])
         row[:] = stillness
     return out
 
@@ -87,8 +89,9 @@ def stillness_of(velocities: Vector, period_s: float, hands: HandSettings = USUA
 class HandEstimator:
     """Estimates of both hands; all that is estimated is kept in the state's arrays."""
 
-    def __init__(self, hands: HandSettings, period_s: float, models: Records) -> None:
-        self._hands, self._period_s, self._models = hands, period_s, models
+    def __init__(self, period_s: float, models: Records) -> None:
+        self._period_s = period_s
+        self._models = models
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
@@ -97,13 +100,12 @@ class HandEstimator:
         overflow; beyond the intervals of `models` both hands are stale, and it is not used.
         """
         interval_s = ticks * self._period_s
-        changed = smoothing(interval_s, self._hands.still_s)
         used_s = min(ticks, len(self._models)) * self._period_s
-        return parameters(**model(used_s), smoothing=changed, still_speed=float(self._hands.still_speed))
+        return parameters(**model(used_s), smoothing=smoothing(interval_s), still_speed=HAND_STILL_MPS)
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
-        state["noise_variance"] = self._hands.noise_std_m**2
+        state["noise_variance"] = NOISE_STD_M**2
         state["hand_stillness"] = STILL
         for side in (0, 1):
             no_tremor(as_array(state), side)

@@ -22,7 +22,14 @@ from service.core.intake.arm_samples import still_ticks
 from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
-from service.core.intake.tuning import JOINT_JUMP_RADPS, MAX_LATE_S, MAX_OUTSIDE_RAD
+from service.core.intake.tuning import (
+    JOINT_JUMP_RADPS,
+    JUMP_M,
+    JUMP_SPEED_MPS,
+    MAX_LATE_S,
+    MAX_OUTSIDE_RAD,
+    SWAPPED_S,
+)
 from service.settings.config import HandSettings, Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
@@ -91,9 +98,9 @@ class Intake:
             unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
-            jump=float(hands.jump),
-            jump_speed=float(hands.jump_speed),
-            swapped_s=float(hands.swapped_s),
+            jump=JUMP_M,
+            jump_speed=JUMP_SPEED_MPS,
+            swapped_s=SWAPPED_S,
             joint_jump_speed=max(JOINT_JUMP_RADPS, float((np.array(joints.velocity) / per_rad).max())),
             plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
@@ -109,7 +116,7 @@ class Intake:
             self._mappings[BASE] = np.eye(3, 4), False
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
-        self._estimator = HandEstimator(hands, settings.period_s, self._models)
+        self._estimator = HandEstimator(settings.period_s, self._models)
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""

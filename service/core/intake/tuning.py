@@ -104,3 +104,17 @@ MAX_OUTSIDE_RAD = JOINT_JUMP_RAD  # samples of a joint farther outside its limit
 # 2e-3 to 0.1. More: a moving arm counts as still. Less: a noisy arm never starts.
 ARM_STILL_RAD = 0.02  # an arm is at rest if no joint moves by more than this within ARM_STILL_S
 ARM_STILL_S = MAX_LATE_S  # an arm must be at rest for this time before it is ready; a late state counts
+
+# Hands without an estimate yet, and hands that move.
+# 1e-4 to 0.01. More: the first second is filtered more. Less: the first second is noisier.
+NOISE_STD_M = 0.002  # noise of each axis before it is estimated
+# 0.01 to 0.5. More: slow reaches count as rest. Less: trembling hands are in motion.
+HAND_STILL_MPS = 0.05  # a faster hand is in motion
+# 0.02 to 2. More: rest is recognised later. Less: turning points look like rest.
+HAND_STILL_S = 0.2  # a slow hand counts as still after this time
+# 0.005 to 0.3. More: outliers are followed. Less: quick reaches are rejected.
+JUMP_M = 0.04  # a sample farther from its prediction is a jump
+# 0 to 5. More: outliers after a pause are followed. Less: hands that reappear are rejected.
+JUMP_SPEED_MPS = 1.5  # after a pause the limit of a jump grows at this speed
+# 0.1 to 10. More: a true exchange is rejected longer. Less: swapped hands are followed.
+SWAPPED_S = 2.0  # exchanged hands are accepted after this time

@@ -30,6 +30,8 @@ from service.core.separation.tuning import (
     PLANNED_BRAKE_SHARE,
     PLANNED_MARGIN_M,
     PLANNED_REACTION_S,
+    TREMOR_SPEED_MPS,
+    UNKNOWN_SPEED_MPS,
 )
 from service.core.vectors import times
 from service.settings.config import Settings
@@ -68,10 +70,10 @@ class Separation:
             clearance=np.array([people.clearance, things.clearance, own_clearance(settings)]),
             planned_margin=PLANNED_MARGIN_M,
             contact_speed=float(people.contact_speed),
-            unknown_speed=float(people.unknown_speed),
+            unknown_speed=UNKNOWN_SPEED_MPS,
             unseen_s=np.array([settings.hands.longest_stale_ms, settings.hands.unseen_ms]) / 1000,
             period_s=settings.period_s,
-            tremor_speed=float(people.tremor_speed),
+            tremor_speed=TREMOR_SPEED_MPS,
             hand_radius=float(people.radius),
             forearm=people.length / np.linalg.norm(direction) * direction,
             frames=body.frames,

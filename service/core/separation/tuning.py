@@ -48,3 +48,9 @@ CONTACT_MARGIN_M = 0.02  # a hand may be touched up to this distance beyond a vi
 # The body.
 OWN_CLEARANCE_M = PLANNED_MARGIN_M  # largest clearance between own parts; more would keep the arm from folding
 CAPSULE_EXCESS_M = OWN_CLEARANCE_M  # capsules around meshes exceed them by about as much
+
+# Speeds of hands.
+# 0.5 to 3. More: the arm keeps farther away from a hand that appears. Less: it reacts later.
+UNKNOWN_SPEED_MPS = 1.6  # assumed speed of a hand that was only just seen
+# 0.02 to 0.3. More: slow approaches are ignored. Less: the arm gives way to a tremor.
+TREMOR_SPEED_MPS = 0.1  # a slower hand's motion is ignored as tremor; from twice that it counts in full

@@ -62,7 +62,6 @@ class HandsKMP:
     errors: LocalErrors | None = None
 
     measure: ClassVar[str] = "the target's standard deviation"
-    formats: ClassVar[tuple[int, ...]] = (1, 2)
     units: ClassVar[str] = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {
         "error_inputs": (-1e3, 1e3, ""),

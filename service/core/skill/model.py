@@ -108,8 +108,6 @@ class Model(Protocol):
 
     measure: ClassVar[str]
     """Name of the distance `gate_m`."""
-    formats: ClassVar[tuple[int, ...]]
-    """Numbers of its file formats: without evaluation figures, then with them."""
     units: ClassVar[str]
     """Units of its primitive, as its file states them."""
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]]

@@ -210,7 +210,6 @@ class StagedKMP:
     unknown: Unknown | None = None
 
     measure: ClassVar[str] = "the distance of a hand from its segments"
-    formats: ClassVar[tuple[int, ...]] = (5,)
     units: ClassVar[str] = TASK_UNITS
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = TASK_RANGES
     gripper_ell: ClassVar[float] = 20.0

@@ -154,13 +154,6 @@ class LiveLed(Capture):
             raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
         return np.asarray(np.median(at, axis=0))
 
-    def tip(self) -> Vector:
-        """The present position (3,) [m] of the tool. Raises CalibrationError."""
-        tool = self.led(since_s=TOUCH_S).tool
-        if not len(tool.poses):
-            raise CalibrationError(f"no {JOINT_STATES} in {TOUCH_S:g} s: is the arm's driver running?")
-        return np.asarray(np.median(tool.poses[:, :3], axis=0))
-
 
 def _lately(samples: Sequence[Sample], since_s: float | None) -> Sequence[Sample]:
     """The samples of the last `since_s` [s]; None: all."""
