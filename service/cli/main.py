@@ -258,6 +258,8 @@ def parser() -> argparse.ArgumentParser:
     )
     option(c, "--from", "FILE", refine, dest="refined")
     c.add_argument("--name", help="the name of the skill (default: the name of the file)")
+    delay = "the teacher's delay [s], for demonstrations with via-points (default: chosen by held-out errors)"
+    option(c, "--delay", "S", delay, type=within(float, 0.0, 1.0, " s"))
     option(c, "--config", "CELL", f"the cell, for the tracker's axes and unit and for the arm: {ARM_HELP}")
     places = (
         "the via-points of the task, as `via-points add --file` reads them, for demonstrations without via-points; the "

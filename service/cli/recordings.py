@@ -144,6 +144,7 @@ def learn(args: argparse.Namespace) -> int:
             demonstrations,
             name=args.name or args.output.stem,
             names=[path.stem for path in args.demonstrations],
+            delay_s=args.delay,
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
             refined=refined,
