@@ -32,7 +32,7 @@ from service.contract.records import Cause, Reason
 from service.core.frame import Vector, as_array, blank, state_layout
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
-from service.core.intake.tuning import CONTESTED_OFF_SHARE, SCATTER_OFF_M, TRACKER_MEMORY_S
+from service.core.tuning import TUNING
 from service.files.track import Track
 from service.files.track_offsets import STEP_M, displaced
 from service.settings.config import HandSettings, Settings
@@ -186,13 +186,18 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
             out[side].why[i] = Distrust.__members__.get(Cause(causes[0]).name, Distrust.UNSEEN)
         else:
             out[side].restarts[i] = bool(state["kept_restarts"][side, state["kept_newest"][side]])
-        is_disputed = bool(is_contested(as_array(state), bool(state["reason"] == Reason.TWO_SOURCES)))
+        is_disputed = bool(
+            is_contested(as_array(state), intake.parameters, bool(state["reason"] == Reason.TWO_SOURCES))
+        )
         state["reason"] = Reason.TWO_SOURCES if is_disputed else Reason.NONE
         for one in range(len(tracks)) if is_disputed else ():
-            if state["contested"][one] > CONTESTED_OFF_SHARE or state["noise_variance"][one] > SCATTER_OFF_M**2:
+            if (
+                state["contested"][one] > TUNING.intake.contested_off_share
+                or state["noise_variance"][one] > TUNING.intake.scatter_off_m**2
+            ):
                 disputed_ns[one].append(stamp_ns + start_ns)
     for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
-        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TRACKER_MEMORY_S))
+        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TUNING.intake.tracker_memory_s))
         for i in np.flatnonzero(mask).tolist():
             verdict.why[i] = Distrust.CONTESTED
     return out

@@ -11,9 +11,12 @@ from service.core.frame import Vector, parameters
 from service.core.intake import MODES, STATES, mode_filter
 from service.core.intake.hand_estimator import stillness_of
 from service.core.intake.motion_model import REST, model
-from service.core.intake.tuning import LEAST_NOISE_M
-from service.settings.config import HandSettings
+from service.core.intake.stage import Intake
+from service.core.tuning import TUNING
+from service.settings.config import HandSettings, Settings
 from support.tracked import LEFT, PERIOD_S, Hands, follow
+
+LEAST_NOISE_M = TUNING.intake.least_noise_m
 
 
 def reach(t: float) -> Vector:
@@ -272,7 +275,7 @@ def test_compiled_and_plain_functions_agree(change_m: float) -> None:
         parts = [means.copy(), covariances.copy(), modes.copy()]
         for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
             function = getattr(mode_filter, name)
-            arrays = parts[:2] if name == "advance" else parts
+            arrays = parts[:2] if name == "advance" else [Intake(Settings()).parameters, *parts]
             (function.py_func if plain else function)(*arrays, *more)
         results.append(parts)
     for compiled, plain in zip(*results, strict=True):
