@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from kmp.elementary import exp, log
 from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step, stand
-from service.core.frame import RECORDS, Record, Vector, as_array, parameters
+from service.core.frame import RECORDS, Record, Vector, as_array, parameters, shared_dtype
 from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
@@ -122,7 +122,7 @@ class Arm:
         self._engaging = self.parameters.copy()
         self._engaging["max_tool_speed"] = numbers.tool_speed_share * settings.tool.engaging_speed
         tasks = 6 if settings.tool.orientation == "full" else 5
-        self._kinematics = np.dtype(
+        self._kinematics = shared_dtype(
             [
                 ("joints", np.float64, (joints,)),
                 ("configuration", np.float64, (self._model.nq,)),
