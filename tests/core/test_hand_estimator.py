@@ -269,13 +269,14 @@ def test_compiled_and_plain_functions_agree(change_m: float) -> None:
         if mode != REST:
             means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
     modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
+    intake = Intake(Settings()).parameters
     overs, tremor = parameters(**model(0.002)), np.array([40.0, 2e-7, 1e-7, change_m**2])
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
         for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
             function = getattr(mode_filter, name)
-            arrays = parts[:2] if name == "advance" else [Intake(Settings()).parameters, *parts]
+            arrays = parts[:2] if name == "advance" else [intake.view(np.recarray), *parts]
             (function.py_func if plain else function)(*arrays, *more)
         results.append(parts)
     for compiled, plain in zip(*results, strict=True):

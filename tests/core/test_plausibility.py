@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from service.contract.messages import PoseStamped
 from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, copied, parameters
+from service.core.frame import Tick, Vector, copied
 from service.core.intake import plausibility, step
 from service.core.skill.skill import Skill
 from service.settings.config import HandSettings
@@ -376,14 +376,14 @@ def test_stamps_are_judged_as_the_plain_rule_says(stamp: int, newest: int, fresh
 
 def test_compiled_and_plain_memory_agree() -> None:
     hands, random = Hands(), np.random.default_rng(7)
-    given = parameters(period_s=0.002, stale_ticks=50, swapped_s=2.0, jump=0.03, jump_speed=2.0).view(np.recarray)
+    given = hands.intake.parameters.view(np.recarray)
     compiled, plain = copied(hands.state), copied(hands.state)
     for _ in range(200):
         jumped, at = bool(random.random() < 0.4), random.choice([0.0, 0.01, 0.3]) * np.ones(3)
         ticks, answers = int(random.integers(0, 12)), []
         for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
             state["tick"] += ticks
-            way(step.note)(state.base.view(np.recarray), 0, jumped, 0.1, 0.002)
+            way(step.note)(state.base.view(np.recarray), given, 0, jumped, 0.1)
             answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), given, 0, at))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)
