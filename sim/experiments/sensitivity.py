@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -38,10 +37,9 @@ from sim.scene import Scene
 from sim.script import HandScript
 
 Figures: TypeAlias = dict[str, float]
-Session: TypeAlias = Callable[[Tuning, int], Figures]
 
-STREAMS = EXPERIMENTS["sensitivity"].seeds.tuning
-SEEDS = len(STREAMS["people"].numbers)
+TUNING_STREAMS = EXPERIMENTS["sensitivity"].seeds.tuning
+SEEDS = len(TUNING_STREAMS["people"].numbers)
 CHANGED = 2  # seeds of the sessions at other values
 FACTORS = (0.5, 2.0)
 MOTION_S = 4.0
@@ -108,7 +106,7 @@ def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
 
 
 def _person(seed: int) -> list[Moving]:
-    people = moving_hands.modelled(_middle(), numbers=[STREAMS["people"].numbers[seed]], seconds=MOTION_S)
+    people = moving_hands.modelled(_middle(), numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S)
     return [one for one in people if one.group in motion.FLOOR_GROUPS]
 
 
@@ -120,7 +118,7 @@ def moving(tuning: Tuning, seed: int) -> Figures:
 
 def stops(tuning: Tuning, seed: int) -> Figures:
     """Overshoot of sudden stops, as in `motion`, by the rate of the tracker."""
-    stop = functools.partial(moving_hands.stops, _middle(), numbers=[STREAMS["stops"].numbers[seed]])
+    stop = functools.partial(moving_hands.stops, _middle(), numbers=[TUNING_STREAMS["stops"].numbers[seed]])
     hands = [stop(rate_hz=rate_hz, noise=noise)[0] for rate_hz, noise in STOP_RATES_HZ.items()]
     overshoots_mm = [row.overshoot_mm for row in _followed(hands, tuning)]
     return {f"overshoot_{rate_hz}_hz_mm": mm for rate_hz, mm in zip(STOP_RATES_HZ, overshoots_mm, strict=True)}
@@ -129,7 +127,7 @@ def stops(tuning: Tuning, seed: int) -> Figures:
 def disturbed(tuning: Tuning, seed: int) -> Figures:
     """A hand out of sight, with late samples; two sources for a while; bursts of outliers."""
     hands = _person(seed)[0]
-    random = np.random.default_rng([STREAMS["disturbed"].seed, seed])
+    random = np.random.default_rng([TUNING_STREAMS["disturbed"].seed, seed])
     late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
     late[(hands.stamps > UNSEEN_S[0]) & (hands.stamps < UNSEEN_S[1]), seed % 2] = math.inf
 
@@ -148,7 +146,8 @@ def disturbed(tuning: Tuning, seed: int) -> Figures:
 
 def beside_a_box(tuning: Tuning, seed: int) -> Figures:
     """The nominal scene on the bench, with a box on the way to the handover."""
-    script = HandScript(Scene(), seed=STREAMS["hands"].numbers[seed], tremor_rms=TREMOR_M, noise_std=NOISE_M)
+    hands_seed = TUNING_STREAMS["hands"].numbers[seed]
+    script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=NOISE_M)
     settings = msgspec.structs.replace(Settings(), obstacles=Obstacles(boxes=(BOX,)))
     skill_for = reached.ours(Scene())
     one = rehearse(script, skill_for, rate_hz=100, settings=settings, tuning=tuning, keep=True)
@@ -168,7 +167,7 @@ def implausible(tuning: Tuning, seed: int) -> Figures:
     skill = reached.taught(shipped_skill(), Scene().via_points())
     settings = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="state"))
     controller = Controller(settings, skill, urdf=robot_description(settings), tuning=tuning)
-    random = np.random.default_rng([STREAMS["implausible"].seed, seed])
+    random = np.random.default_rng([TUNING_STREAMS["implausible"].seed, seed])
     joints = np.array(settings.arm.posture)
     via_point = skill.via_points[2 - seed % 3]
     clock_drift = random.uniform(0.0, 0.04)
@@ -195,7 +194,7 @@ def implausible(tuning: Tuning, seed: int) -> Figures:
     return counts | {"ready_s": settings.period_s * np.argmax(following), "following": float(np.mean(following))}
 
 
-SESSIONS: tuple[Session, ...] = (moving, stops, disturbed, beside_a_box, implausible)
+SESSIONS = (moving, stops, disturbed, beside_a_box, implausible)
 
 
 def measured(task: tuple[str, float, int]) -> Figures | str:
