@@ -8,6 +8,7 @@ standard deviation over all seeds at the tuned value.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
@@ -30,7 +31,7 @@ from sim.experiments.open_loop import targets
 from sim.experiments.people import moving_hands
 from sim.experiments.people.moving_hands import Moving
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, rehearse
-from sim.experiments.results import Array, Options, Results
+from sim.experiments.results import Array, Options, Results, brief
 from sim.experiments.rivals.followers import ours
 from sim.experiments.workers import shared_out
 from sim.scene import Scene
@@ -239,12 +240,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     known = list(numbers().values())[:: round(1 / options.share)]
     tasks = [("", 1.0, seed) for seed in range(SEEDS)]
     tasks += [(number.key, factor, seed) for number in known for factor in FACTORS for seed in range(CHANGED)]
-    outcomes = list(shared_out(measured, tasks, options.workers))
-    tuned = [row for row in outcomes[:SEEDS] if isinstance(row, dict)]
-    groups = iter(outcomes[SEEDS:][k : k + CHANGED] for k in range(0, len(tasks) - SEEDS, CHANGED))
+    outcomes = shared_out(measured, tasks, options.workers)
+    tuned = [row for row in itertools.islice(outcomes, SEEDS) if isinstance(row, dict)]
     out: dict[str, Any] = {}
     for number in known:
-        effects = {f"{factor:g}": effect(next(groups), tuned) for factor in FACTORS}
+        rows = {f"{factor:g}": list(itertools.islice(outcomes, CHANGED)) for factor in FACTORS}
+        effects = {factor: effect(changed, tuned) for factor, changed in rows.items()}
         out[number.key] = {"value": number.value, "effects": effects}
-        results.say(f"{number.key}: {effects}")
+        results.say(f"{number.key}: {brief(effects)}")
     return {"numbers": out}

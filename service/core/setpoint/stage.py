@@ -63,11 +63,8 @@ class SetpointGenerator:
             longest_stop=longest_stop,
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
             span_ticks=max(1, round(numbers.hull_time_s / (HULL_SPANS - 1) / settings.period_s)),
-            hand_brake_mps2=numbers.hand_brake_mps2,
-            deceleration_lookahead_s=numbers.deceleration_lookahead_s,
-            gap_slow_m=numbers.gap_slow_m,
+            **numbers._asdict(),
             gap_free_m=numbers.gap_free_m,
-            hull_margin_m=numbers.hull_margin_m,
             # A planned stop uses at most the tracker's jerk for this error, or it oscillates.
             stop_jerk_error_m=numbers.hull_margin_m,
             # The setpoint may stop this far beyond the hands' stop: noise moves resting targets.
