@@ -244,8 +244,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     tuned = [row for row in itertools.islice(outcomes, SEEDS) if isinstance(row, dict)]
     out: dict[str, Any] = {}
     for number in known:
-        rows = {f"{factor:g}": list(itertools.islice(outcomes, CHANGED)) for factor in FACTORS}
-        effects = {factor: effect(changed, tuned) for factor, changed in rows.items()}
+        effects = {f"{factor:g}": effect(list(itertools.islice(outcomes, CHANGED)), tuned) for factor in FACTORS}
         out[number.key] = {"value": number.value, "effects": effects}
         results.say(f"{number.key}: {brief(effects)}")
     return {"numbers": out}
