@@ -31,7 +31,7 @@ from sim.experiments.open_loop import targets
 from sim.experiments.people import moving_hands
 from sim.experiments.people.moving_hands import Moving
 from sim.experiments.rehearsal import NOISE_M, TREMOR_M, rehearse
-from sim.experiments.results import Array, Options, Results, brief
+from sim.experiments.results import Options, Results, brief
 from sim.experiments.rivals.followers import ours
 from sim.experiments.workers import shared_out
 from sim.scene import Scene
@@ -96,10 +96,6 @@ def _skill() -> Skill:
     return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
 
 
-def _middle() -> Array:
-    return np.asarray(_skill().hands.mean(axis=0))
-
-
 def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
     """Figures of sequences of hands that the core alone follows."""
     follow = ours(_skill(), Settings(), tuning)
@@ -107,7 +103,8 @@ def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
 
 
 def _person(seed: int) -> list[Moving]:
-    people = moving_hands.modelled(_middle(), numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S)
+    middle = _skill().hands.mean(axis=0)
+    people = moving_hands.modelled(middle, numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S)
     return [one for one in people if one.group in motion.FLOOR_GROUPS]
 
 
@@ -119,7 +116,8 @@ def moving(tuning: Tuning, seed: int) -> Figures:
 
 def stops(tuning: Tuning, seed: int) -> Figures:
     """Overshoot of sudden stops, as in `motion`, by the rate of the tracker."""
-    stop = functools.partial(moving_hands.stops, _middle(), numbers=[TUNING_STREAMS["stops"].numbers[seed]])
+    middle = _skill().hands.mean(axis=0)
+    stop = functools.partial(moving_hands.stops, middle, numbers=[TUNING_STREAMS["stops"].numbers[seed]])
     hands = [stop(rate_hz=rate_hz, noise=noise)[0] for rate_hz, noise in STOP_RATES_HZ.items()]
     overshoots_mm = [row.overshoot_mm for row in _followed(hands, tuning)]
     return {f"overshoot_{rate_hz}_hz_mm": mm for rate_hz, mm in zip(STOP_RATES_HZ, overshoots_mm, strict=True)}
@@ -236,15 +234,17 @@ def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """Effect of each number, by its key and the factor; a share of the numbers for a quick look."""
-    known = list(numbers().values())[:: round(1 / options.share)]
-    tasks = [("", 1.0, seed) for seed in range(SEEDS)]
-    tasks += [(number.key, factor, seed) for number in known for factor in FACTORS for seed in range(CHANGED)]
+    """Effect of each number, by its key and the factor; with fewer seeds for a quick look."""
+    known = numbers().values()
+    seeds, noise_seeds = range(math.ceil(options.share * CHANGED)), range(max(3, round(options.share * SEEDS)))
+    tasks = [("", 1.0, seed) for seed in noise_seeds]
+    tasks += [(number.key, factor, seed) for number in known for factor in FACTORS for seed in seeds]
     outcomes = shared_out(measured, tasks, options.workers)
-    tuned = [row for row in itertools.islice(outcomes, SEEDS) if isinstance(row, dict)]
+    tuned = [row for row in itertools.islice(outcomes, len(noise_seeds)) if isinstance(row, dict)]
     out: dict[str, Any] = {}
     for number in known:
-        effects = {f"{factor:g}": effect(list(itertools.islice(outcomes, CHANGED)), tuned) for factor in FACTORS}
+        effects = {f"{factor:g}": effect(list(itertools.islice(outcomes, len(seeds))), tuned) for factor in FACTORS}
         out[number.key] = {"value": number.value, "effects": effects}
         results.say(f"{number.key}: {brief(effects)}")
+        results.numbers({"numbers": out})
     return {"numbers": out}
