@@ -62,7 +62,7 @@ def numbers_of(stage: str) -> Iterator[Number]:
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and (record := RECORD.fullmatch(lines[node.lineno - 2])):
             name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
             low, high, more, less = record.groups()
-            meaning = lines[node.lineno - 1].partition("  # ")[2]
+            meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2]
             yield Number(name, values[name], meaning, float(low), float(high), more, less)
 
 
@@ -70,7 +70,7 @@ def page() -> str:
     """The text of the page."""
     result = result_of(RESULTS, "sensitivity") or {"numbers": {}}
     why = staleness("sensitivity", result, tree())
-    state = f"\n*Measured with an earlier version: {why}.*\n" if why else ""
+    state = f"\n*The result is not that of this version at full size: {why}.*\n" if why else ""
     tables = {stage: list(numbers_of(stage)) for stage in STAGES}
     head = HEAD.format(count=sum(map(len, tables.values())), state=state)
     return head + "".join(
@@ -94,7 +94,7 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
             number.less,
             _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["moving_percent"])),
             _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["stops_mm"])),
-            _both(effects, lambda effect: f"{effect['largest']}, {effect['noises']:.1f} times the noise"),
+            _both(effects, _largest),
         )
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells[: len(titles)])} |\n"
 
@@ -102,6 +102,13 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
 def _both(effects: Mapping[str, Any], text: Any) -> str:
     """The texts of the effects of half and twice a number."""
     return "; ".join(f"×{factor}: {effect.get('fails') or text(effect)}" for factor, effect in effects.items())
+
+
+def _largest(effect: Mapping[str, Any]) -> str:
+    """The largest change of another figure than those of motion and stops."""
+    if not effect["noises"]:
+        return "nothing changes"
+    return f"{effect['largest']}, {effect['noises']:.1f} times the noise"
 
 
 def _value(value: Any) -> str:

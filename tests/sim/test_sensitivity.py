@@ -17,11 +17,7 @@ from sim.experiments.catalogue import EXPERIMENTS
 from support.paths import ROOT
 
 # Values that another limit of the shipped cell keeps from having an effect.
-BOUND_BY_SETTINGS = {
-    "setpoint.tracker_rate_share 2",
-    "arm.position_gain_rate_share 2",
-    "separation.planned_brake_limits 2",
-}
+BOUND_BY_SETTINGS = {"arm.position_gain_rate_share 2", "separation.planned_brake_limits 2"}
 CELL, SKILL = Settings(), shipped_skill()
 URDF = robot_description(CELL)
 
@@ -43,7 +39,7 @@ def test_each_tuned_number_reaches_the_constants_of_a_stage() -> None:
 
 
 def test_each_tuned_number_is_read_by_the_core() -> None:
-    """The records of intake and decision hold all their numbers, used or not."""
+    """The records of intake, decision and setpoint hold all their numbers, read or not."""
     sources = [path for path in (ROOT / "service" / "core").rglob("*.py") if path.name != "tuning.py"]
     read = set(re.findall(r"\.(\w+)", "".join(path.read_text(encoding="utf-8") for path in sources)))
     derived = (ROOT / "service" / "core" / "intake" / "tuning.py").read_text(encoding="utf-8")
