@@ -40,9 +40,7 @@ class IntakeTuning(NamedTuple):
     # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
     tremor_stds_m: Modes = (5e-4, 3e-4, 0.0)  # standard deviation on each axis; larger tremor has the same frequency
     # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
-    tremor_rate_per_s: float = (
-        2.0 * math.pi * 10.0
-    )  # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
+    tremor_rate_per_s: float = 20.0 * math.pi  # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
     # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
     tremor_damping: float = 0.1  # damping ratio of the tremor's oscillator
     # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
@@ -80,9 +78,7 @@ class IntakeTuning(NamedTuple):
 
     # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
     # 0.05 to 1. More: jumps of the arm pass. Less: coarse joint states are rejected.
-    joint_jump_rad: float = (
-        0.2  # a joint may differ from its newest sample by joint_jump_rad + jump speed * elapsed time
-    )
+    joint_jump_rad: float = 0.2  # a joint may differ from its newest sample by this + jump speed * elapsed time
     # 1 to 20. More: jumps of the arm pass. Less: an arm moved by hand is rejected.
     joint_jump_radps: float = 5.0  # least jump speed, as an arm can be moved by hand; else the fastest joint's limit
     # 2e-3 to 0.1. More: a moving arm counts as still. Less: a noisy arm never starts.

@@ -26,9 +26,7 @@ class SeparationTuning(NamedTuple):
     # 1 to 20. More: the arm returns faster. Less: the arm returns softly.
     clearance_gain_per_s: float = 5.0  # [1/s] planned speed / distance left to the clearance; negative inside
     # 2e-3 to 0.05. More: the rule is exceeded more. Less: the arm stops for rounding.
-    slip_speed_mps: float = (
-        0.01  # excess that is tolerated, as joints do not all reach their velocities at the same time
-    )
+    slip_speed_mps: float = 0.01  # tolerated excess, as joints do not all reach their velocities at the same time
 
     # Hands: what may happen until the arm reacts.
     # 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
@@ -36,6 +34,4 @@ class SeparationTuning(NamedTuple):
     # 1 to 20. More: the arm retreats sooner. Less: hands may appear closer than planned.
     unseen_acceleration_mps2: float = 5.0  # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
     # 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
-    contact_margin_m: float = (
-        0.02  # a hand may be touched up to this distance beyond a via-point's radius, on each axis
-    )
+    contact_margin_m: float = 0.02  # a hand may be touched this far beyond a via-point's radius, on each axis

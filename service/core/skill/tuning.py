@@ -73,9 +73,7 @@ PULL_SHARPNESS_PER_M2 = 0.5 / SEGMENT_MIDDLE_M**2
 # Memory of the hands.
 # 0.2 to 1. More: older motion counts. Less: recent motion counts.
 MEMORY_LAG_S = 0.5  # time constant of each filter; half or twice as much predicts recorded partners no better
-MEMORY_LONGEST_STEP_S = (
-    TUNING.intake.max_late_s
-)  # upper limit of a step: a hand that is not seen does not fade from memory
+MEMORY_LONGEST_STEP_S = TUNING.intake.max_late_s  # a hand that is not seen does not fade from memory in longer steps
 # 0.01 to 0.1. More: orientations are smoother. Less: orientations follow faster.
 TURN_LAG_S = 0.03  # time constant of the filters of a hand's turn; trackers have noise of some 0.01 rad
 # 0.03 to 0.3. More: orientations weigh more. Less: positions weigh more.
