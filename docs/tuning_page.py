@@ -6,17 +6,18 @@ from __future__ import annotations
 
 import ast
 import re
-import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from service.core.skill import tuning as skill_tuning
+from service.core.tuning import TUNING
 from sim.experiments.evidence import RESULTS, result_of, staleness, tree
-from sim.experiments.sensitivity import STAGES, Number, effects, tuning
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"
-RECORD = re.compile(r"# (\S+) to (\S+)\. More: (.+)\. Less: (.+)\.")
+STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision")  # the limiter has no tuned number
+RECORD = re.compile(r"\s*# (\S+) to (\S+)\. More: (.+)\. Less: (.+)\.")
 HEAD = """# Tuned numbers
 
 <!-- Written by `python docs/tuning_page.py` from service/core/*/tuning.py: change it there. -->
@@ -24,25 +25,28 @@ HEAD = """# Tuned numbers
 The core has {count} tuned numbers, in the file `tuning.py` of each stage. Numbers that follow from
 the settings, from the arm or from other numbers are not among them.
 
-The range and the effects of more and less are what we expect. The last column is measured:
-`python -m sim.experiments sensitivity` halves and doubles each number, a count as well, and
-compares short sessions with those at the tuned value. The column names the figure that changes most
-in relation to its noise, which is the standard deviation of the figure over other seeds. A change
-below the noise says little. The change of a figure that is the same for all seeds counts as one
-noise.
+The range and the effects of more and less are what we expect. The last three columns are measured,
+at half and at twice the number: `python -m sim.experiments sensitivity` compares short sessions
+with those at the tuned value.
 
+* *Motion*: change of the error and of the jerk of a tool that follows moving hands [%].
+* *Stops*: change of the overshoot of sudden stops [mm], seen by trackers of 100, 30 and 15 Hz.
+* *Largest other*: the figure of another session that changes most in relation to its noise, which
+  is its standard deviation over other seeds. A change below the noise says little. The change of a
+  figure that is the same for all seeds counts as one noise.
+
+The numbers of the skill are constants, because skills are learned with them. They are not measured.
 {state}
-
-The sessions are short, so that all numbers can be measured in some hours. A number that does not
-matter there may still matter in a rare situation: look for tests of it before you remove it.
+The sessions are short. A number that does not matter there may still matter in a rare situation:
+look for tests of it before you remove it.
 """
 
-UNREAD, UNCHANGED = "no session reads it", "nothing changes"
 
+class Number(NamedTuple):
+    """A tuned number with its comments: what it is, its range, and what more and less of it do."""
 
-class NumberText(NamedTuple):
-    """The comments of a number: what it is, its range, and what more and less of it do."""
-
+    name: str
+    value: Any
     meaning: str
     low: float
     high: float
@@ -50,77 +54,65 @@ class NumberText(NamedTuple):
     less: str
 
 
-def texts_of(stage: str) -> dict[str, NumberText]:
-    """The comments of a stage's numbers. Raises ValueError for a number without them."""
-    path = ROOT / "service" / "core" / stage / "tuning.py"
-    lines = path.read_text(encoding="utf-8").splitlines()
-    out: dict[str, NumberText] = {}
-    for node in ast.parse("\n".join(lines)).body:
-        if isinstance(node, ast.Assign):
-            record = RECORD.fullmatch(lines[node.lineno - 2])
-            _, _, meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")
-            if record is not None:
-                low, high, more, less = record.groups()
-                out[ast.unparse(node.targets[0])] = NumberText(meaning, float(low), float(high), more, less)
-    return out
+def numbers_of(stage: str) -> Iterator[Number]:
+    """The tuned numbers of a stage, which are those with a range in the line above."""
+    values = vars(skill_tuning) if stage == "skill" else getattr(TUNING, stage)._asdict()
+    lines = (ROOT / "service" / "core" / stage / "tuning.py").read_text(encoding="utf-8").splitlines()
+    for node in ast.walk(ast.parse("\n".join(lines))):
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and (record := RECORD.fullmatch(lines[node.lineno - 2])):
+            name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
+            low, high, more, less = record.groups()
+            meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2]
+            yield Number(name, values[name], meaning, float(low), float(high), more, less)
 
 
 def page() -> str:
     """The text of the page."""
-    result = result_of(RESULTS, "sensitivity") or {"tuned": {}, "numbers": {}}
-    known, rows = tuning().numbers, result["numbers"]
-    measured = {key: rows[key] for key in known if key in rows}
-    found = [_measured(row, result["tuned"]) for row in measured.values()]
-    why = staleness("sensitivity", result, tree()) if measured else ""
-    state = (
-        f"{len(measured)} of {len(known)} numbers have been measured. {found.count(UNREAD)} of these are read in no "
-        f"session, and {found.count(UNCHANGED)} change no figure: they matter in rarer situations, or beyond twice or "
-        "half of their value."
-    )
-    if why:
-        state += f" *Measured with an earlier version: {why}.*"
-    state = textwrap.fill(state, 100, break_long_words=False)
-    head = HEAD.format(count=len(known), state=state if measured else "None has been measured yet.")
+    result = result_of(RESULTS, "sensitivity") or {"numbers": {}}
+    why = staleness("sensitivity", result, tree())
+    state = f"\n*The result is not that of this version at full size: {why}.*\n" if why else ""
+    tables = {stage: list(numbers_of(stage)) for stage in STAGES}
+    head = HEAD.format(count=sum(map(len, tables.values())), state=state)
     return head + "".join(
-        part
-        for stage in STAGES
-        for part in _section(stage, [one for one in known.values() if one.stage == stage], measured, result["tuned"])
+        line for stage, numbers in tables.items() for line in _section(stage, numbers, result["numbers"])
     )
 
 
-def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any], tuned: Mapping[str, Any]) -> Iterator[str]:
+def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> Iterator[str]:
     """The heading and the table of a stage."""
-    yield f"\n## {stage.capitalize()}\n\n| number | value | range | meaning | more | less | measured |\n"
-    yield "|---|---|---|---|---|---|---|\n"
-    comments = texts_of(stage)
-    for one in numbers:
-        words = comments[one.name]
-        found = _measured(measured[one.key], tuned) if one.key in measured else "not yet"
+    titles = ("number", "value", "range", "meaning", "more", "less")
+    titles += () if stage == "skill" else ("motion", "stops", "largest other")
+    yield f"\n## {stage.capitalize()}\n\n| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n"
+    for number in numbers:
+        effects = measured.get(f"{stage}.{number.name}", {"effects": {}})["effects"]
         cells = (
-            f"`{one.name}`",
-            _value(one.value),
-            f"{words.low:g} to {words.high:g}",
-            words.meaning,
-            words.more,
-            words.less,
-            found,
+            f"`{number.name}`",
+            _value(number.value),
+            f"{number.low:g} to {number.high:g}",
+            number.meaning,
+            number.more,
+            number.less,
+            _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["moving_percent"])),
+            _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["stops_mm"])),
+            _both(effects, _largest),
         )
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells[: len(titles)])} |\n"
+
+
+def _both(effects: Mapping[str, Any], text: Any) -> str:
+    """The texts of the effects of half and twice a number."""
+    return "; ".join(f"×{factor}: {effect.get('fails') or text(effect)}" for factor, effect in effects.items())
+
+
+def _largest(effect: Mapping[str, Any]) -> str:
+    """The largest change of another figure than those of motion and stops."""
+    if not effect["noises"]:
+        return "nothing changes"
+    return f"{effect['largest']}, {effect['noises']:.1f} times the noise"
 
 
 def _value(value: Any) -> str:
     return f"{value:.6g}" if not hasattr(value, "__len__") else ", ".join(f"{one:.6g}" for one in value)
-
-
-def _measured(row: Mapping[str, Any], tuned: Mapping[str, Any]) -> str:
-    """The largest change by a number, in words."""
-    most = max(effects(row, tuned), default=None)
-    if most is None:
-        return UNREAD
-    times, factor, figure, change = most
-    if change == 0:
-        return UNCHANGED
-    return f"×{factor}: {figure} {change:+.3g}, {times:.1f} times the noise"
 
 
 if __name__ == "__main__":

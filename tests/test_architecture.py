@@ -282,11 +282,11 @@ def test_constraints_name_versions_and_no_places() -> None:
 
 
 def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
-    """Numbers in tuning.py, compiled functions in step.py, the class in stage.py; no stage imports
-    another one's step.
+    """Tuned numbers in tuning.py, compiled functions in step.py, the class in stage.py; no stage
+    imports another one's step.
     """
     core = ROOT / "service" / "core"
-    stages = sorted(path.parent for path in core.glob("*/tuning.py"))
+    stages = sorted(path.parent for path in core.glob("*/stage.py"))
     assert len(stages) == 7
     for stage in stages:
         assert {"step.py", "stage.py"} <= {path.name for path in stage.glob("*.py")}

@@ -20,6 +20,7 @@ import pytest
 import kmp
 from service import client
 from service.cli.main import GROUPS
+from sim.experiments import sensitivity
 from sim.experiments.catalogue import EXPERIMENTS
 from sim.experiments.people.moving_hands import SMALL_KINDS
 from support.paths import ROOT
@@ -60,12 +61,19 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 
 def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
     page = program("tuning_page")
-    comments = {stage: page.texts_of(stage) for stage in page.STAGES}
-    for one in page.tuning().numbers.values():
-        words = comments[one.stage][one.name]
-        assert words.meaning, one.key
-        assert words.low <= np.min(one.value) <= np.max(one.value) <= words.high, one.key
-        assert one.name.endswith(UNITS) or one.name in DIMENSIONLESS, one.key
+    numbers = [number for stage in page.STAGES for number in page.numbers_of(stage)]
+    assert len(numbers) > 70
+    for number in numbers:
+        assert number.meaning, number.name
+        assert number.low <= np.min(number.value) <= np.max(number.value) <= number.high, number.name
+        name = number.name.upper()
+        assert name.endswith(UNITS) or name in DIMENSIONLESS, name
+
+
+def test_the_page_lists_each_tuned_number_that_is_data() -> None:
+    page = program("tuning_page")
+    listed = {f"{stage}.{number.name}" for stage in page.STAGES for number in page.numbers_of(stage)}
+    assert set(sensitivity.numbers()) <= listed
 
 
 def test_the_page_on_the_command_line_has_every_command_and_option() -> None:

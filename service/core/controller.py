@@ -51,12 +51,12 @@ from service.core.intake.stage import Intake
 from service.core.kinematics import Kinematics
 from service.core.limiter.stage import LimiterStage
 from service.core.separation.stage import Separation
-from service.core.separation.tuning import CAPSULE_EXCESS_M
 from service.core.setpoint.stage import SetpointStage
 from service.core.skill.model import Wanted
 from service.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
 from service.core.skill.skill import NEVER, Skill
 from service.core.skill.stage import SkillStage
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings
 
 # Plain integers, because combining the members of an enumeration takes a microsecond.
@@ -72,10 +72,10 @@ def no_lap(stage: str) -> None:
     """Ignore the end of a stage; the daemon passes a function that measures durations instead."""
 
 
-def start_state(settings: Settings, skill: Skill) -> Record:
+def start_state(settings: Settings, skill: Skill, tuning: Tuning = TUNING) -> Record:
     """State before the first tick."""
     state = blank(state_layout(len(settings.joints.names)))
-    Intake(settings).begin(state)
+    Intake(settings, tuning=tuning).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
     state["orientation"], state["closure"], state["gripper_wish"] = skill.orientation, NO_GRIPPER, NO_GRIPPER
@@ -87,21 +87,25 @@ class Controller:
     """Sequence of seven stages: intake, skill, decision, separation, setpoint, arm, limiter.
 
     `Controller(settings, skill, state)` continues bit for bit from the `state` of another
-    controller. `urdf` is the text of the arm's description.
+    controller. `urdf` is the text of the arm's description. Tests and experiments vary the tuned
+    numbers by `tuning`.
     """
 
-    def __init__(self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str) -> None:
-        self._state = copied(start_state(settings, skill) if state is None else state)
+    def __init__(
+        self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str, tuning: Tuning = TUNING
+    ) -> None:
+        self._state = copied(start_state(settings, skill, tuning) if state is None else state)
         self._memory = as_array(self._state)  # reads a number in a third of the time
         self._bytes, self._layout = self._memory.view(np.uint8), frame_layout(len(settings.joints.names))
-        self.intake = Intake(settings)
-        self._skill = SkillStage(settings, skill)
-        self.decision = Decision(settings)
-        self._separation = Separation(settings, urdf)
+        self.intake = Intake(settings, tuning=tuning)
+        self._skill = SkillStage(settings, skill, tuning=tuning)
+        self.decision = Decision(settings, tuning=tuning)
+        self._separation = Separation(settings, urdf, tuning=tuning)
         self._separation.set_contacts(skill.via_points)
-        self._arm = Arm(settings, urdf)
-        self._setpoint = SetpointStage(settings, self._arm)
-        self._limiter = LimiterStage(settings, self._arm)
+        self._arm = Arm(settings, urdf, tuning=tuning)
+        self._setpoint = SetpointStage(settings, self._arm, tuning=tuning)
+        self._limiter = LimiterStage(settings, self._arm, tuning=tuning)
+        self._capsule_excess_m = tuning.separation.planned_margin_m
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
         stages = (self.intake, self._skill, self.decision, self._separation, self._setpoint, self._arm, self._limiter)
         self.constants = dict(zip(STAGES, map(_digest, stages), strict=True))
@@ -201,7 +205,7 @@ class Controller:
         state, here, threshold = self._state, self._at(), self.skill.threshold
         if self._memory["arm_ready"][0] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            conditions |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > CAPSULE_EXCESS_M)
+            conditions |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > self._capsule_excess_m)
         starts = self.decision.step(state, frame, here.record, conditions, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])

@@ -46,9 +46,20 @@ NumPy copies them field by field, which takes ten times as long.
 """
 
 
+_LAYOUTS: dict[DType, DType] = {}
+
+
+def shared_dtype(fields: Any) -> DType:
+    """NumPy type with these fields, one object for all equal ones: at each call, Numba recognises
+    the same object at once, but compares an equal one field by field, in microseconds.
+    """
+    layout = np.dtype(fields)
+    return _LAYOUTS.setdefault(layout, layout)
+
+
 def structured(count: int, fields: Any) -> Records:
     """Records of zeros (`count`,), whose fields compiled functions read as attributes."""
-    layout = np.dtype(fields)
+    layout = shared_dtype(fields)
     records: Records = RECORDS(count, layout, bytearray(count * layout.itemsize))
     return records
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from service.contract.records import Flag, Mode
 from service.contract.requests import ALONG_TASK, ANY_DIRECTION, ToolLimits
 from service.core.arm.stage import Arm
-from service.core.arm.tuning import PLANNED_LIMIT_SHARES
 from service.core.frame import Records, Vector
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
 from service.settings.config import Settings
 
 PATH_STEP_S, PATH_SPEED_SHARE = 0.02, 0.3  # duration of a step along a path, and its speed / max_speed
@@ -107,7 +107,7 @@ def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[
     acceleration of a joint, or of the tool's setpoint. It has to be more than what a setpoint plans
     with, the planned share of the tool's acceleration, of which the joints get that share again.
     """
-    least = float(PLANNED_LIMIT_SHARES[1]) ** 2
+    least = TUNING.arm.planned_limit_shares[1] ** 2
     joints, tool = settings.joints, settings.tool
     engages = frames["flags"] & int(Flag.ENGAGING) > 0
     speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)

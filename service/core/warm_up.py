@@ -28,6 +28,7 @@ from service.core.skill.memory import delayed, moving_features, turning
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import LearnedGripper, LearnedOrientation
 from service.core.skill.skill import UNTOLD, Skill
+from service.core.skill.stage import SkillStage
 from service.core.skill.stages import MOST_STAGES
 from service.core.skill.support import error_table, local_scatter
 from service.core.skill.unseen import deviation_m
@@ -94,7 +95,7 @@ def rehearse_motion(settings: Settings, urdf: str) -> None:
     workspace = np.zeros((2, 3))
     workspace.setflags(write=False)
     setpoint.step(state, frame, wanted, here, workspace, 1.0)
-    waiting(target, state["setpoint"], here.position)
+    waiting(target, state["setpoint"], here.position, (0.1, 0.2))
     limiter.step(state, frame, solution.velocity, solution.acceleration, separation)
     separation.step(state, frame, here.record)
     separation.share(still)
@@ -127,7 +128,7 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         adopted = [Event("skill", b"", other)] if index == change else []
         controller.step(Tick(index, (*adopted, *hands, measured)))
-    deviation_m(as_array(controller.state), 0, settings.period_s)  # runs only for a hand out of sight
+    deviation_m(as_array(controller.state), SkillStage(settings, skill).rules, 0)  # runs only for a hand out of sight
     controller.step(Tick(count, (order("hold"),)))
 
 

@@ -24,7 +24,7 @@ from service.core.intake import KEPT
 from service.core.intake.far_away import too_far
 from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
-from service.core.intake.tuning import MAX_JOINT_RADPS, MAX_OUTSIDE_RAD
+from service.core.tuning import TUNING
 from service.daemon.cell_streams import Arrivals, heard
 from service.settings.config import JointSettings, Settings
 
@@ -228,8 +228,8 @@ def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple
     """Measured values outside the accepted ranges."""
     of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
     for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
-        low, high = lower - MAX_OUTSIDE_RAD * per_rad, upper + MAX_OUTSIDE_RAD * per_rad
+        low, high = lower - TUNING.intake.max_outside_rad * per_rad, upper + TUNING.intake.max_outside_rad * per_rad
         if not low <= at <= high:
             yield Outside(name, at, low, high, unit)
-        if not abs(speed) <= (fastest := MAX_JOINT_RADPS * per_rad):
+        if not abs(speed) <= (fastest := TUNING.intake.max_joint_radps * per_rad):
             yield Outside(name, speed, -fastest, fastest, f"{unit}/s")

@@ -17,7 +17,6 @@ from service.core.codes import READY, RETURNING
 from service.core.controller import Controller
 from service.core.frame import Frame, Record
 from service.core.geometry import off_target
-from service.core.intake.tuning import CONTESTED_OFF_SHARE, SCATTER_ON_M
 from service.core.separation.clearance import NEAR_ITSELF
 from service.core.separation.stage import Separation
 from service.core.skill.model import standard_deviations
@@ -25,6 +24,7 @@ from service.core.skill.pose import CLOSED, OPEN
 from service.core.skill.skill import Skill
 from service.core.skill.task_clock import CLOCK_S
 from service.core.tool_limits import binding
+from service.core.tuning import TUNING
 from service.daemon.input_monitor import KEY_OF_SOURCE
 from service.learning.corrections import offer_of
 from service.settings.config import Settings
@@ -129,8 +129,8 @@ class CellStatus(NamedTuple):
         return Evidence(
             sources={name: source for name, source in self.sources.items() if not self._is_unneeded(name, source)},
             settings=settings,
-            contested=CONTESTED_OFF_SHARE,
-            scatter_mm=1e3 * SCATTER_ON_M,
+            contested=TUNING.intake.contested_off_share,
+            scatter_mm=1e3 * TUNING.intake.scatter_on_m,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
             measure=skill.model.measure,
             outside=self._outside(),

@@ -19,7 +19,7 @@ from service.core.frame import Vector
 from service.core.geometry import rotation
 from service.core.intake.far_away import too_far
 from service.core.intake.stage import UNIT_M, base_from
-from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+from service.core.tuning import TUNING
 from service.files.hands_and_tool import chosen
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing
 from service.files.mcap_reader import Messages, full_name, next_whole
@@ -216,7 +216,7 @@ def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settin
     Raises RecordingError if all poses are too far away.
     """
     with np.errstate(all="ignore"):
-        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > MAX_HAND_DISTANCE_M
+        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > TUNING.intake.max_hand_distance_m
     if len(is_far) and is_far.all():
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings)
         if recorded.is_captured:
@@ -232,13 +232,10 @@ def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settin
 
 def _invalid_in(tracks: Sequence[Track]) -> list[str]:
     """A remark on the number of poses of the tracks that are NaN; empty if none is."""
+    most_m = TUNING.intake.max_hand_distance_m
     none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
     count = sum(len(track.poses) for track in tracks)
-    return (
-        [f"{none} of {count} poses are invalid or farther than {MAX_HAND_DISTANCE_M:g} m, and are left out"]
-        if none
-        else []
-    )
+    return [f"{none} of {count} poses are invalid or farther than {most_m:g} m, and are left out"] if none else []
 
 
 def _in_order(path: str | Path, track: Track) -> Track:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.frame import Vector
-from service.core.intake.tuning import MAX_LATE_S
+from service.core.tuning import TUNING
 
 WINDOW = 3  # a restart of a clock is found by comparing three stamps with the three before
 
@@ -43,6 +43,6 @@ def clock_parts(stamps: Stamps) -> list[Rows]:
         return [np.arange(len(stamps))]
     windows = np.lib.stride_tricks.sliding_window_view(stamps, WINDOW)
     before, behind = np.median(windows[:-WINDOW], axis=1), windows[WINDOW:].max(axis=1)
-    is_anew = behind < before - 1e9 * MAX_LATE_S
+    is_anew = behind < before - 1e9 * TUNING.intake.max_late_s
     is_anew[1:] &= ~is_anew[:-1]
     return np.split(np.arange(len(stamps)), np.flatnonzero(is_anew) + WINDOW)

@@ -32,7 +32,7 @@ from service.contract.records import Cause, Reason
 from service.core.frame import Vector, as_array, blank, state_layout
 from service.core.intake.stage import Intake
 from service.core.intake.step import is_contested
-from service.core.intake.tuning import CONTESTED_OFF_SHARE, JUMP_M, JUMP_SPEED_MPS, SCATTER_OFF_M, TRACKER_MEMORY_S
+from service.core.tuning import TUNING
 from service.files.track import Track
 from service.files.track_offsets import STEP_M, displaced
 from service.settings.config import HandSettings, Settings
@@ -186,13 +186,18 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
             out[side].why[i] = Distrust.__members__.get(Cause(causes[0]).name, Distrust.UNSEEN)
         else:
             out[side].restarts[i] = bool(state["kept_restarts"][side, state["kept_newest"][side]])
-        is_disputed = bool(is_contested(as_array(state), bool(state["reason"] == Reason.TWO_SOURCES)))
+        is_disputed = bool(
+            is_contested(as_array(state), intake.parameters, bool(state["reason"] == Reason.TWO_SOURCES))
+        )
         state["reason"] = Reason.TWO_SOURCES if is_disputed else Reason.NONE
         for one in range(len(tracks)) if is_disputed else ():
-            if state["contested"][one] > CONTESTED_OFF_SHARE or state["noise_variance"][one] > SCATTER_OFF_M**2:
+            if (
+                state["contested"][one] > TUNING.intake.contested_off_share
+                or state["noise_variance"][one] > TUNING.intake.scatter_off_m**2
+            ):
                 disputed_ns[one].append(stamp_ns + start_ns)
     for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
-        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TRACKER_MEMORY_S))
+        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TUNING.intake.tracker_memory_s))
         for i in np.flatnonzero(mask).tolist():
             verdict.why[i] = Distrust.CONTESTED
     return out
@@ -258,7 +263,7 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     total, before = own.copy(), [(-1, 0, 0)] * len(begins)
     for run in range(1, len(begins)):
         off = np.linalg.norm(at[begins[run]] - at[ends[:run]], axis=1)
-        possible = off <= JUMP_M + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
+        possible = off <= TUNING.intake.jump_m + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
         possible[-1] &= not is_leap[ends[run - 1]]
         links = {(int(i), 0, 0): total[i] for i in np.flatnonzero(possible)}
         if not possible[-1]:
@@ -286,7 +291,7 @@ def _continues(at: Vector, seconds: Vector, last: int, first: int) -> bool:
     """True if the track comes within a jump of `first`, as it moves at index `last`."""
     velocity = (at[last] - at[last - 1]) / (seconds[last] - seconds[last - 1])
     expected = at[last] + velocity * (seconds[first] - seconds[last])
-    return bool(np.linalg.norm(at[first] - expected) <= JUMP_M)
+    return bool(np.linalg.norm(at[first] - expected) <= TUNING.intake.jump_m)
 
 
 def _leaps(at: Vector, pauses: Vector) -> Mask:
@@ -298,7 +303,9 @@ def _leaps(at: Vector, pauses: Vector) -> Mask:
     off = np.linalg.norm(steps, axis=1)
     turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
     acceleration = np.minimum(np.concatenate([[np.inf], turns]), np.concatenate([turns, [np.inf]]))
-    is_leap: Mask = (off > JUMP_M + JUMP_SPEED_MPS * pauses) & (acceleration > MAX_HAND_MPS2)
+    is_leap: Mask = (off > TUNING.intake.jump_m + TUNING.intake.jump_speed_mps * pauses) & (
+        acceleration > MAX_HAND_MPS2
+    )
     return is_leap
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.core.intake.tuning import TRACKER_MEMORY_S
+from service.core.tuning import TUNING
 from service.files.track import Track, clock_parts
 
 LARGEST_DELAY_S = 0.2  # the delays from stamp to recording of streams with one clock may differ by this
@@ -67,7 +67,7 @@ def _is_steady(track: Track) -> bool:
     if not np.ptp(track.logged_ns):
         return True
     ahead_s = (track.stamps_ns - track.logged_ns) / 1e9
-    second = ((track.logged_ns - track.logged_ns.min()) / (1e9 * TRACKER_MEMORY_S)).astype(np.int64)
+    second = ((track.logged_ns - track.logged_ns.min()) / (1e9 * TUNING.intake.tracker_memory_s)).astype(np.int64)
     fastest = np.full(int(second.max()) + 1, -np.inf)
     np.maximum.at(fastest, second, ahead_s)
     return bool(np.ptp(fastest[np.isfinite(fastest)]) <= LARGEST_DELAY_S)

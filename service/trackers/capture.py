@@ -23,7 +23,7 @@ from service.contract.requests import Hands, ViaPoint, encode_json
 from service.core.frame import Vector
 from service.core.intake.arm_samples import in_turn
 from service.core.intake.stage import UNIT_M
-from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+from service.core.tuning import TUNING
 from service.files.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from service.files.dwells import REST_M
 from service.files.mcap_file import machine, whole_file
@@ -163,7 +163,7 @@ class Capture:
                     raise CaptureError(f"{problem}. Nothing was recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
                     at = from_tracker(at, hands)
-                if np.linalg.norm(at) > MAX_HAND_DISTANCE_M:
+                if np.linalg.norm(at) > TUNING.intake.max_hand_distance_m:
                     why = far_away(key, pose.frame_id, pose.position, self.settings)
                     raise CaptureError(f"{key} is {why}. Nothing was recorded")
 

@@ -67,8 +67,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     p.add_argument("--arm", default="wam", help=arm)
-    numbers = "of `sensitivity`: stages of the core or numbers, to be measured anew"
-    p.add_argument("--numbers", metavar="NAME,...", default="", help=numbers)
     again = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
     p.add_argument("--redraw", action="store_true", help=again)
     p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
@@ -121,7 +119,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
     if args.name != "stale" and args.output is None:
         p.error("--output DIR is missing: the folder for the results")
-    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm, args.numbers)
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
     wanted = jobs(args.name, options)
     try:
         if args.name == "stale":

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from service.core.controller import Controller
 from service.core.frame import Tick
 from service.core.skill.skill import Skill, clamp
+from service.core.tuning import TUNING, Tuning
 from service.files.recorded_hands import frames_of, with_ideal_arm
 from service.settings.config import Settings, robot_description
 from sim.experiments.results import Array
@@ -17,14 +18,14 @@ from sim.experiments.results import Array
 USUAL = Settings()
 
 
-def controller(skill: Skill, settings: Settings) -> Controller:
+def controller(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Controller:
     """The service's core with an arm that is where it is commanded."""
-    return Controller(with_ideal_arm(settings), skill, urdf=robot_description(settings))
+    return Controller(with_ideal_arm(settings), skill, urdf=robot_description(settings), tuning=tuning)
 
 
-def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> NDArray[np.void]:
+def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING) -> NDArray[np.void]:
     """The service's frames (T,) of ticks."""
-    return frames_of(controller(skill, settings), ticks)
+    return frames_of(controller(skill, settings, tuning), ticks)
 
 
 def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:

@@ -16,6 +16,7 @@ from service.contract.records import Mode
 from service.core.controller import Controller, run
 from service.core.frame import Frame, Tick
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING, Tuning
 from service.learning.demonstration import Demonstration
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench, TaskEvents
@@ -55,6 +56,7 @@ def rehearse(
     rate_hz: int | None = None,
     settings: Settings | None = None,
     world: type[World] | None = None,
+    tuning: Tuning = TUNING,
     keep: bool = False,
     look: Callable[[Bench], None] = lambda bench: None,
 ) -> Rehearsed:
@@ -83,7 +85,8 @@ def rehearse(
             look(bench)
 
         loop = ClosedLoop(bench)
-        run(Controller(settings, skill_for(bench), urdf=robot_description(settings)), loop.ticks(), [loop.follow, tap])
+        controller = Controller(settings, skill_for(bench), urdf=robot_description(settings), tuning=tuning)
+        run(controller, loop.ticks(), [loop.follow, tap])
         arrays = [np.array(column) for column in zip(*rows, strict=True)] or [np.empty(0)] * 6
         return Rehearsed(bench.events(), held * settings.period_s, *arrays)
 

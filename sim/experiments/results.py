@@ -52,7 +52,6 @@ class Options:
     workers: str = "1"  # as `service.process.parallel.spread` takes them
     share: float = 1.0  # share of the full size; less for a quick look
     arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
-    numbers: str = ""  # for `sensitivity`: stages of the core or numbers, with commas; empty: those without a result
 
 
 @dataclass

@@ -22,7 +22,7 @@ from service.core.geometry import between_segments, place
 from service.core.separation.body import Body, body_of
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
-from service.core.separation.tuning import SLIP_SPEED_MPS, UNKNOWN_SPEED_MPS
+from service.core.tuning import TUNING
 from service.settings.config import Settings, robot_description
 from sim.bench import Bench
 from sim.experiments.catalogue import EXPERIMENTS
@@ -130,7 +130,7 @@ class Outcome(NamedTuple):
     excess_at_once: float  # [m/s] largest excess over the rule
     excess_after_reaction: float  # [m/s] over the largest allowed speed within the reaction time
     excess_hurried: float  # the same for hands that were faster than the rule had assumed
-    excess_lasts_s: float  # longest time of an excess above SLIP_SPEED_MPS
+    excess_lasts_s: float  # longest time of an excess above slip_speed_mps
     fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
     limited_s: float  # time in which separation limited the arm
     self_mm: float  # least distance of links that are kept apart
@@ -174,7 +174,7 @@ def _judged(
     allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
     half = round(0.5 * reaction_s / dt)
     lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
-    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, UNKNOWN_SPEED_MPS)
+    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, TUNING.separation.unknown_speed_mps)
     over = speed - lately
     began = np.flatnonzero(done.time_s > 0)
     pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
@@ -194,7 +194,7 @@ def _judged(
         float((speed - allowed)[began].max()),
         float(np.where(assumed, over, -1.0)[began].max()),
         float(np.where(assumed, -1.0, over)[began].max()),
-        dt * _longest(((speed - allowed > SLIP_SPEED_MPS) & assumed)[began]),
+        dt * _longest(((speed - allowed > TUNING.separation.slip_speed_mps) & assumed)[began]),
         float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
         1000 * float(own.min()),
@@ -291,7 +291,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     numbers = {
         "scenes": len(scenes),
         "rate_hz": RATE_HZ,
-        "slip_m_per_s": SLIP_SPEED_MPS,
+        "slip_m_per_s": TUNING.separation.slip_speed_mps,
         **{kind: _summary(rows) for kind, rows in found.items()},
         "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
         "later_for_a_thrust_s": _later_for(found["thrust"], found["random"]),
@@ -322,7 +322,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "successes": sum(one.success for one in rows),
         "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
         "overlaps": int((closest < 0).sum()),
-        "above_after_reaction": sum(one.excess_after_reaction > SLIP_SPEED_MPS for one in rows),
+        "above_after_reaction": sum(one.excess_after_reaction > TUNING.separation.slip_speed_mps for one in rows),
         "limited_s": float(np.mean([one.limited_s for one in rows])),
         **{name: max(getattr(one, name) for one in rows) for name in GREATEST},
         **{name: min(getattr(one, name) for one in rows) for name in ("self_mm", "table_mm")},

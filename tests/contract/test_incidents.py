@@ -16,10 +16,14 @@ from service.contract.evidence import Evidence, explained
 from service.contract.incidents import BY_WORD, INCIDENTS, Condition, in_full, what_happened, what_to_do, word
 from service.contract.records import GONE_S, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
-from service.core.decision.tuning import STUCK_S, TOO_FAST_S
-from service.core.intake import tuning as intake
+from service.core.intake import CONFIRMED_SAMPLES
+from service.core.tuning import TUNING
 from service.settings.config import ArmSettings, HandSettings, Settings, ToolSettings
 from support.paths import ROOT
+
+STUCK_S = TUNING.decision.stuck_s
+TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s
+
 
 MEMBERS = [member for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind if member is not Reason.NONE]
 
@@ -89,16 +93,16 @@ def test_what_happened_names_the_settings_of_the_cell() -> None:
 def test_numbers_in_the_table_are_those_that_decide() -> None:
     for member, words in (
         (Reason.STALE_HAND, f"only {GONE_S:g} s"),
-        (Reason.TWO_SOURCES, f"more than {1e3 * intake.SCATTER_ON_M:g} mm"),
+        (Reason.TWO_SOURCES, f"more than {1e3 * TUNING.intake.scatter_on_m:g} mm"),
         (Reason.TOOL_SPEED, f"for {1e3 * TOO_FAST_S:g} ms"),
         (Flag.STUCK, f"for {STUCK_S:g} s"),
-        (Cause.OLDER, f"more than {intake.MAX_LATE_S:g} s"),
-        (Cause.JUMPED, f"three samples over {1e3 * intake.CONFIRMED_S:g} ms"),
-        (Cause.SWAPPED, f"after {intake.SWAPPED_S:g} s"),
-        (Condition.ARM_UNSETTLED, f"for {intake.ARM_STILL_S:g} s"),
+        (Cause.OLDER, f"more than {TUNING.intake.max_late_s:g} s"),
+        (Cause.JUMPED, f"three samples over {1e3 * TUNING.intake.confirmed_s:g} ms"),
+        (Cause.SWAPPED, f"after {TUNING.intake.swapped_s:g} s"),
+        (Condition.ARM_UNSETTLED, f"for {TUNING.intake.max_late_s:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
-    assert (intake.CONTESTED_ON_SHARE, intake.CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
+    assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
 
 
 def test_without_figures_the_sentence_is_the_general_one_and_with_them_theirs() -> None:

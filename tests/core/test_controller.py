@@ -49,6 +49,24 @@ def modes(seen: np.ndarray) -> list[tuple[str, str]]:
     return [pair for i, pair in enumerate(pairs) if i == 0 or pair != pairs[i - 1]]
 
 
+def record_types(part: object) -> list[np.dtype[np.void]]:
+    """Types of all records of a part of the core and of its parts."""
+    found = []
+    for value in vars(part).values():
+        if isinstance(value, np.ndarray) and value.dtype.names:
+            found.append(value.dtype)
+        elif type(value).__module__.startswith("service.core.") and hasattr(value, "__dict__"):
+            found += record_types(value)
+    return found
+
+
+def test_two_controllers_share_the_types_of_their_records(taught: Skill) -> None:
+    """Compiled functions recognise the same type at once, and compare equal ones by field."""
+    first, second = (record_types(Controller(ASSUMED, taught, urdf=URDF)) for _ in range(2))
+    assert len(first) > 10
+    assert [before.names for before, after in zip(first, second, strict=True) if before is not after] == []
+
+
 def test_the_arm_follows_the_soldering_task_through_all_three_places(taught: Skill) -> None:
     script = HandScript(Scene(), seed=5)
     seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))

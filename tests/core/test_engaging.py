@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 
 from service.contract.records import Flag, Mode
 from service.core.controller import Controller
-from service.core.decision.tuning import BRIEF_HOLD_S
 from service.core.frame import Event, Tick, Vector, order
-from service.core.setpoint.tuning import ENGAGED_GAP_M
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
 from service.settings.config import Settings, SettingsError, ToolSettings, parse, robot_description
 from sim.scene import Scene
 from sim.script import HandScript
@@ -25,6 +24,10 @@ from support.arm_geometry import ArmGeometry
 from support.in_process import ASSUMED, Loop, assert_limits_hold, clutch, frames, led, ticks_of
 from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
 from support.wam import URDF
+
+BRIEF_HOLD_S = TUNING.intake.tracker_memory_s
+ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
+
 
 E = 0.15  # [m/s]
 LOOP_HZ = (100, 250, 500, 1000)

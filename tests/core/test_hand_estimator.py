@@ -11,8 +11,12 @@ from service.core.frame import Vector, parameters
 from service.core.intake import MODES, STATES, mode_filter
 from service.core.intake.hand_estimator import stillness_of
 from service.core.intake.motion_model import REST, model
-from service.core.intake.tuning import LEAST_NOISE_M, NOISE_STD_M
+from service.core.intake.stage import Intake
+from service.core.tuning import TUNING
+from service.settings.config import Settings
 from support.tracked import LEFT, PERIOD_S, Hands, follow
+
+LEAST_NOISE_M = TUNING.intake.least_noise_m
 
 
 def reach(t: float) -> Vector:
@@ -63,7 +67,7 @@ def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
 def test_the_noise_at_the_start_makes_no_difference_after_a_second_and_a_half() -> None:
     noise = np.random.default_rng(2).normal(0.0, 0.002, (400, 3))
     told = []
-    for std_m in (0.0002, NOISE_STD_M, 0.01):
+    for std_m in (0.0002, TUNING.intake.noise_std_m, 0.01):
         hands = Hands()
         hands.state["noise_variance"] = std_m**2
         told.append(follow(hands, reach, until_s=3.0, noise=noise))
@@ -267,13 +271,14 @@ def test_compiled_and_plain_functions_agree(change_m: float) -> None:
         if mode != REST:
             means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
     modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
+    intake = Intake(Settings()).parameters
     overs, tremor = parameters(**model(0.002)), np.array([40.0, 2e-7, 1e-7, change_m**2])
     results = []
     for plain in (False, True):
         parts = [means.copy(), covariances.copy(), modes.copy()]
         for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
             function = getattr(mode_filter, name)
-            arrays = parts[:2] if name == "advance" else parts
+            arrays = parts[:2] if name == "advance" else [intake.view(np.recarray), *parts]
             (function.py_func if plain else function)(*arrays, *more)
         results.append(parts)
     for compiled, plain in zip(*results, strict=True):

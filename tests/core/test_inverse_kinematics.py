@@ -9,14 +9,18 @@ from scipy.optimize import lsq_linear, minimize
 from service.core.arm.least_squares import keep_under, least_squares
 from service.core.arm.stage import Arm
 from service.core.arm.step import describe
-from service.core.arm.tuning import DAMPING_M2, TURN_LEVER_M
 from service.core.decision.step import measured_error
 from service.core.frame import Vector, parameters
 from service.core.kinematics import tool_speed_after, tool_speeds
 from service.core.setpoint.step import slow_down
-from service.core.setpoint.tuning import GAP_FREE_M, GAP_SLOW_M
+from service.core.tuning import TUNING
 from service.files.shipped import cell_of
 from service.settings.config import robot_description
+
+DAMPING_M2 = TUNING.arm.damping_m2
+TURN_LEVER_M = TUNING.arm.turn_lever_m
+GAP_FREE_M = TUNING.setpoint.gap_free_m
+GAP_SLOW_M = TUNING.setpoint.gap_slow_m
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -81,11 +85,12 @@ def test_the_tool_s_speed_after_a_way_of_the_joints_is_that_of_pinocchio(name: s
 
 def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
     setpoint, tool = np.zeros((3, 3)), np.zeros(3)
+    limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)
     setpoint[0, 0], setpoint[1, 0] = GAP_FREE_M + GAP_SLOW_M, 0.2
-    assert slow_down(setpoint, tool, 1.0, 0.8) == pytest.approx(0.5)
-    assert slow_down(setpoint, tool, 0.4, 0.8) == pytest.approx(0.1)  # of 0.8 m/s, where 0.08 are allowed
+    assert slow_down(setpoint, tool, 1.0, limits) == pytest.approx(0.5)
+    assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(0.1)  # of 0.8 m/s, where 0.08 are allowed
     setpoint[1, 0] = -0.2  # it comes back
-    assert slow_down(setpoint, tool, 1.0, 0.8) == 1.0
+    assert slow_down(setpoint, tool, 1.0, limits) == 1.0
 
 
 # --- least squares under inequalities ---

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from service.contract.messages import PoseStamped
 from service.contract.records import Cause, Mode, Reason
 from service.core.controller import Controller
-from service.core.frame import Tick, Vector, copied, parameters
+from service.core.frame import Tick, Vector, copied
 from service.core.intake import plausibility, step
-from service.core.intake.tuning import SWAPPED_S
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
 from sim.people import person
 from sim.sessions import session
 from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, frames, led
@@ -68,7 +68,7 @@ def test_a_swap_is_doubted_for_two_seconds() -> None:
     while float(hands.hand(10**9 + tick, ELSEWHERE)[1]) < 0.2:
         hands.advance()
         tick += 1
-    assert tick * 0.002 == pytest.approx(SWAPPED_S + 0.2, abs=0.02)
+    assert tick * 0.002 == pytest.approx(TUNING.intake.swapped_s + 0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -370,14 +370,14 @@ def test_stamps_are_judged_as_the_plain_rule_says(stamp: int, newest: int, fresh
 
 def test_compiled_and_plain_memory_agree() -> None:
     hands, random = Hands(), np.random.default_rng(7)
-    given = parameters(period_s=0.002, stale_ticks=50, swapped_s=2.0, jump=0.03, jump_speed=2.0).view(np.recarray)
+    given = hands.intake.parameters.view(np.recarray)
     compiled, plain = copied(hands.state), copied(hands.state)
     for _ in range(200):
         jumped, at = bool(random.random() < 0.4), random.choice([0.0, 0.01, 0.3]) * np.ones(3)
         ticks, answers = int(random.integers(0, 12)), []
         for state, way in ((compiled, lambda f: f), (plain, lambda f: f.py_func)):
             state["tick"] += ticks
-            way(step.note)(state.base.view(np.recarray), 0, jumped, 0.1, 0.002)
+            way(step.note)(state.base.view(np.recarray), given, 0, jumped, 0.1)
             answers.append(way(plausibility.is_confirmed)(state.base.view(np.recarray), given, 0, at))
         assert answers[0] == answers[1]
         np.testing.assert_allclose(compiled["contested"], plain["contested"], rtol=1e-12)

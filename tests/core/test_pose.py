@@ -19,16 +19,19 @@ from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.stage import Limiter
 from service.core.setpoint.orientation import OrientationSetpoint
-from service.core.setpoint.tuning import PLANNED_SPEED_SHARE
 from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
 from service.core.skill.skill import Skill
 from service.core.skill.tuning import GRIPPER_MOVES_S
+from service.core.tuning import TUNING
 from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
 from support.in_process import ASSUMED, frames, ticks_of
 from support.wam import FRAME, URDF
+
+PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
+
 
 PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
 

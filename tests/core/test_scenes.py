@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, start_state
 from service.core.frame import Tick, Vector, order
-from service.core.setpoint.tuning import HAND_BRAKE_MPS2
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
 from service.files.shipped import cell_of as shipped
 from service.learning.learn import learn
 from service.learning.skill_file import decoded
@@ -48,6 +48,9 @@ from support.in_process import (
 )
 from support.paths import RECORDINGS
 from support.starts import free_postures
+
+HAND_BRAKE_MPS2 = TUNING.setpoint.hand_brake_mps2
+
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "0"))
 RISE, RISE_MPS = 1.01, 0.01  # docs/bounds.md: speed of the tool in a stop

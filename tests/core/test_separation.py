@@ -26,8 +26,8 @@ from service.core.separation.body import Body, body_of
 from service.core.separation.clearance import NEAR_ITSELF, NOBODY
 from service.core.separation.stage import Separation
 from service.core.separation.step import allowed_speed
-from service.core.separation.tuning import RETREAT_SPEED_MPS, SLIP_SPEED_MPS
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
 from service.files.shipped import shipped_skill
 from service.settings.config import Box, Obstacles, Settings, TableTop, robot_description
 from sim.experiments.separation import nearest as measured
@@ -36,6 +36,10 @@ from sim.script import HandScript
 from support.arms import MODELS, cell_of
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, seen
 from support.wam import STATE, URDF
+
+SLIP_SPEED_MPS = TUNING.separation.slip_speed_mps
+RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS
+
 
 ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
 LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)

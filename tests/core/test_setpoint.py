@@ -17,13 +17,19 @@ from service.core.setpoint.bounds import speed_to_come, stop_distance
 from service.core.setpoint.stage import SetpointGenerator, SetpointStage
 from service.core.setpoint.step import slow_down
 from service.core.setpoint.tracker import waiting
-from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, JERK_WEIGHT, RETURN_SHARE
 from service.core.skill.model import Target, Wanted
 from service.core.stops import fastest_stop
+from service.core.tuning import TUNING
 from service.settings.config import FOLLOWING, Settings, ToolSettings
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE, URDF
+
+HULL_MARGIN_M = TUNING.setpoint.hull_margin_m
+HULL_TIME_S = TUNING.setpoint.hull_time_s
+JERK_WEIGHT = TUNING.setpoint.jerk_weight
+RETURN_SHARE = 0.75 * TUNING.decision.progress_share
+
 
 WAY_TICKS = round(2.0 / PERIOD_S)  # to come from anywhere to where the targets have gone
 properties = example_settings(max_examples=60, deadline=None, derandomize=True)
@@ -151,9 +157,10 @@ def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:
     generator, state = Explained(Settings(tool=TOOL)), blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
+    gaps_m = TUNING.setpoint.gap_waiting_m, TUNING.setpoint.gap_stopped_m
     for _ in range(5000):
-        slow = slow_down(state["setpoint"], MIDDLE, 1.0, TOOL.max_speed)
-        generator.step(state, waiting(target, state["setpoint"], MIDDLE), BOX, FREE, slow)
+        slow = slow_down(state["setpoint"], MIDDLE, 1.0, generator.limits(state))
+        generator.step(state, waiting(target, state["setpoint"], MIDDLE, gaps_m), BOX, FREE, slow)
     assert not state["setpoint"][1].round(4).any()
     assert 0.15 < state["setpoint"][0, 0] - MIDDLE[0] <= 0.201
 

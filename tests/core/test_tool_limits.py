@@ -9,12 +9,14 @@ import pytest
 from service.contract.records import Flag, Mode
 from service.contract.requests import ALONG_TASK, ANY_DIRECTION
 from service.core.arm.stage import Arm
-from service.core.arm.tuning import PLANNED_LIMIT_SHARES
 from service.core.frame import blank, frame_layout
 from service.core.skill.skill import Skill
 from service.core.tool_limits import binding, limits_of_task, path_of, tool_limits
+from service.core.tuning import TUNING
 from service.files.shipped import ARMS, cell_of
 from service.settings.config import Settings, robot_description
+
+PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -4,6 +4,7 @@ and with any number of BLAS threads.
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import subprocess
@@ -16,8 +17,9 @@ import pytest
 from service.contract.records import Mode, Reason
 from service.core.controller import Controller, run
 from service.core.frame import STAGES, Event, Frame, Tick
-from service.core.setpoint import tracker
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING
+from service.files import replay as replay_module
 from service.files.mcap_file import RecordingError
 from service.files.recording import DECISIONS, Recorder, Recording
 from service.files.replay import replay, ticks
@@ -52,7 +54,8 @@ def test_a_replay_names_the_stages_whose_constants_are_others(tmp_path: Path, mo
     recording = Recording.open(GOLDEN)
     names = {f"constants of {stage}" for stage in STAGES}
     assert names | {"features", "libc", "kernel"} <= recording.metadata.keys()
-    monkeypatch.setattr(tracker, "JERK_WEIGHT", 3e-9)
+    tuning = TUNING._replace(setpoint=TUNING.setpoint._replace(jerk_weight=3e-9))
+    monkeypatch.setattr(replay_module, "Controller", functools.partial(Controller, tuning=tuning))
     result = replay(GOLDEN)
     assert not result.exact
     assert result.differing == {"setpoint"}

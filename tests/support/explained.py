@@ -12,10 +12,14 @@ from service.core.frame import Record, Vector
 from service.core.setpoint import HULL_SPANS
 from service.core.setpoint.bounds import farthest, speed_to_come
 from service.core.setpoint.stage import SetpointGenerator
-from service.core.setpoint.tuning import HULL_MARGIN_M, HULL_TIME_S, RETURN_SHARE
 from service.core.skill.model import Target
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings, ToolSettings
+
+HULL_MARGIN_M = TUNING.setpoint.hull_margin_m
+HULL_TIME_S = TUNING.setpoint.hull_time_s
+RETURN_SHARE = 0.75 * TUNING.decision.progress_share
 
 
 def margin(tool: ToolSettings) -> float:
@@ -33,8 +37,8 @@ class Explained(SetpointGenerator):
     those before, each as much less as there was time to come back from it; plus `margin`.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        super().__init__(settings)
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        super().__init__(settings, tuning=tuning)
         self._tool, self._period = settings.tool, settings.period_s
         self._margin = margin(settings.tool)
         self._last = np.empty((HULL_SPANS * max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)), 2, 3))

@@ -69,7 +69,7 @@ class Hands:
         return bool(self.intake.step(copied(self.state), blank(FRAME), 0, []) & ARM_HEARD)
 
     def contested(self, *, already: bool = False) -> bool:
-        return bool(is_contested(as_array(self.state), already))
+        return bool(is_contested(as_array(self.state), self.intake.parameters, already))
 
     def rejected(self) -> dict[Cause, int]:
         return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}

@@ -10,28 +10,13 @@ import pinocchio as pin
 
 from kmp.elementary import exp, log
 from service.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step, stand
-from service.core.arm.tuning import (
-    CLOSING_BRAKE_SHARE,
-    CLOSING_SPEED_MPS,
-    CONSTRAINED_SPEED_MPS,
-    DAMPING_M2,
-    FAR_DAMPING_S2,
-    PLANNED_LIMIT_SHARES,
-    POSITION_GAIN_PER_S,
-    POSITION_GAIN_RATE_SHARE,
-    SINGULAR_DAMPING_M2,
-    SPARING_POWER,
-    TOOL_SPEED_SHARE,
-    TURN_GAIN_SHARE,
-    TURN_HORIZON_S,
-    TURN_LEVER_M,
-)
-from service.core.frame import RECORDS, Record, Vector, as_array, parameters
+from service.core.frame import RECORDS, Record, Vector, as_array, parameters, shared_dtype
 from service.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from service.core.kinematics import Kinematics, joint_costs
 from service.core.kinematics import tool_speeds as _tool_speeds
 from service.core.numerics import ROTATION_DECIMALS
 from service.core.separation.stage import Separation
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Reach, Settings
 from service.settings.urdf import Urdf
 
@@ -71,7 +56,10 @@ class Arm:
     settings; all other joints of the description stay at 0.
     """
 
-    def __init__(self, settings: Settings, urdf: str, closing: Closing | None = None) -> None:
+    def __init__(
+        self, settings: Settings, urdf: str, closing: Closing | None = None, *, tuning: Tuning = TUNING
+    ) -> None:
+        numbers = tuning.arm
         self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
         plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
         x, y, z, *quaternion = settings.tool.plate_from_tool
@@ -85,32 +73,38 @@ class Arm:
         self._data = self._model.createData()
         top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / Reach().outer
         closing = closing or Closing(
-            CLOSING_BRAKE_SHARE * settings.tool.stop_acceleration, min(top, CLOSING_SPEED_MPS), FAR_DAMPING_S2
+            numbers.closing_brake_share * settings.tool.stop_acceleration,
+            min(top, numbers.closing_speed_mps),
+            numbers.far_damping_s2,
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
-        scale = acceleration**SPARING_POWER
+        scale = acceleration**numbers.sparing_power
         scale /= exp(sum(log(float(one)) for one in scale) / len(scale))
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
         spared /= spared.mean(axis=1, keepdims=True)
-        gain = min(POSITION_GAIN_PER_S, POSITION_GAIN_RATE_SHARE * acceleration_rate(limits))
+        gain = min(numbers.position_gain_per_s, numbers.position_gain_rate_share * acceleration_rate(limits))
         self.parameters = parameters(
             period_s=settings.period_s,
             closing_braking=closing.braking,
             closing_speed=float(closing.speed),
             far_damping=closing.far_damping,
             far_speed=0.5 * closing.speed,
-            constrained_speed=CONSTRAINED_SPEED_MPS,
-            max_tool_speed=TOOL_SPEED_SHARE * top,
+            constrained_speed=2.0 * tuning.separation.slip_speed_mps,
+            max_tool_speed=numbers.tool_speed_share * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
             position_gain=gain,
-            turn_gain=TURN_GAIN_SHARE * gain,
-            turn_lever=TURN_LEVER_M * size,
-            damping=DAMPING_M2 * size**2,
-            singular_damping=SINGULAR_DAMPING_M2 * size**2,
-            singular_volume=math.sqrt(SINGULAR_DAMPING_M2) * size * settings.reach.outer**2,
+            turn_gain=numbers.turn_gain_share * gain,
+            turn_lever=numbers.turn_lever_m * size,
+            damping=numbers.damping_m2 * size**2,
+            singular_damping=numbers.singular_damping_m2 * size**2,
+            singular_volume=math.sqrt(numbers.singular_damping_m2) * size * settings.reach.outer**2,
             near_limit_rad=float(settings.arm.fault_error_rad),
-            horizon_s=TURN_HORIZON_S,
+            horizon_s=numbers.turn_horizon_s,
+            posture_gain=numbers.turn_gain_share * numbers.position_gain_per_s / 10.0,
+            posture_speed=numbers.closing_speed_mps,  # [rad/s] on a lever of 1 m
+            # Idle motion may end faster than the tool closes in: the tool does not show it.
+            idle_brake_share=2.5 * numbers.closing_brake_share,
             lower=np.array(limits.lower) + LIMIT_MARGIN_RAD,
             upper=np.array(limits.upper) - LIMIT_MARGIN_RAD,
             approach_gain=approach_gain(limits),
@@ -121,14 +115,14 @@ class Arm:
             per_rad=np.array(limits.per_rad),
             scale=scale,
             spared=spared,
-            planned_limits=PLANNED_LIMIT_SHARES[:, None]
+            planned_limits=np.array(numbers.planned_limit_shares)[:, None]
             * np.array([limits.velocity, limits.acceleration, limits.jerk])
             / spared,
         )
         self._engaging = self.parameters.copy()
-        self._engaging["max_tool_speed"] = TOOL_SPEED_SHARE * settings.tool.engaging_speed
+        self._engaging["max_tool_speed"] = numbers.tool_speed_share * settings.tool.engaging_speed
         tasks = 6 if settings.tool.orientation == "full" else 5
-        self._kinematics = np.dtype(
+        self._kinematics = shared_dtype(
             [
                 ("joints", np.float64, (joints,)),
                 ("configuration", np.float64, (self._model.nq,)),
@@ -213,7 +207,7 @@ class Arm:
         goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation
         goal["turning"], goal["acceleration"] = 0.0 if turning is None else turning, 0.0
         goal["moving"] = 0.0 if moving is None else moving
-        goal["horizon_s"] = math.inf if moving is None else TURN_HORIZON_S
+        goal["horizon_s"] = math.inf if moving is None else self.parameters["horizon_s"][0]
         constraints, count = (
             (self._unseparated, 0) if separation is None else (separation.constraints, separation.count)
         )

@@ -15,11 +15,6 @@ from numpy.typing import NDArray
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from service.core.arm.least_squares import solve
-from service.core.arm.tuning import (
-    IDLE_BRAKE_SHARE,
-    POSTURE_GAIN_PER_S,
-    POSTURE_SPEED_RADPS,
-)
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
 from service.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
@@ -136,7 +131,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
         v (3,)      target velocity of the tool [m/s], see below
         w (3,)      target angular velocity of the tool [rad/s], from `_turn`
         l, R        turn lever [m] and rotation (3, 3) of the tool
-        h (J,)      velocities toward the configured posture, at most POSTURE_SPEED_RADPS each
+        h (J,)      velocities toward the configured posture, at most posture_speed each
         damping     of `describe`, plus far_damping max(rate |e| - far_speed, 0)²
 
     With u the goal's velocity, e = goal position - position - period u, g the position gain and B
@@ -148,7 +143,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
 
     If a row changed the solution, the programme is solved again with more damping, by
     singular_damping m / (m + constrained_speed²), where m = |v - T x|² in the first three rows of
-    T.
+    T: where few directions are left free, the least motion would change the solution much.
 
     If no row changed it, and the joints cannot reach it soon (`_can_have`), `_turn_less` moves it
     toward the solution of the first three rows alone, in which idle joints brake.
@@ -187,10 +182,10 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
             flags |= NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
-        off, most = arm.posture[j] - here.joints[j], POSTURE_SPEED_RADPS * arm.per_rad[j]
+        off, most = arm.posture[j] - here.joints[j], arm.posture_speed * arm.per_rad[j]
         if arm.is_continuous[j]:  # any number of turns away; 0 at half a turn, where no direction is shorter
             off, _ = sin_cos(off)
-        home[j] = min(max(POSTURE_GAIN_PER_S * off, -most), most) / scale[j]
+        home[j] = min(max(arm.posture_gain * off, -most), most) / scale[j]
         for i in range(count_of_tasks):
             scaled[i, j] = tasks[i, j] * scale[j]
     rows, limits = np.empty((count, joints)), np.empty(count)
@@ -210,7 +205,7 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     if not near:  # the turn is reduced, so that the position is kept
         free = np.empty(joints)
         for j in range(joints):
-            brake = IDLE_BRAKE_SHARE * arm.period_s * arm.acceleration[j]
+            brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
             home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
         solve(scaled, wanted, home, damping, bounds, rows, limits, free)
         if not is_constrained:  # a mixture of two solutions need not keep the rows as well as the first one

@@ -8,8 +8,8 @@ import numpy as np
 
 from service.contract import cdr
 from service.core.codes import HELD
-from service.core.decision.tuning import WAY_NEAR_RAD, WAY_SLOW_RAD, WAY_START_RAD
 from service.core.frame import Event, Record, Vector
+from service.core.tuning import TUNING, Tuning
 from service.core.vectors import norm, times
 from service.settings.config import PRISMATIC_M, Settings
 
@@ -28,16 +28,21 @@ def speeds_of_ways(settings: Settings) -> tuple[float, float]:
 class WayOut:
     """Way out in the state: postures that the arm approaches one after the other."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        # A way that begins farther from the arm than this is not taken; nearer joints slow down.
+        self._start_rad = tuning.intake.joint_jump_rad
+        # A posture this near is reached: an arm at rest may be as far off.
+        self._near_rad = tuning.intake.arm_still_rad
         self._mps, self._radps = speeds_of_ways(settings)
         self._per_rad = np.array(settings.joints.per_rad)
 
     def take(self, state: Record, event: Event) -> None:
         """Start on a planned way out, if the tool is still stuck and the way begins within
-        WAY_START_RAD of the commanded joints.
+        start_rad of the commanded joints.
         """
         path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1]))
-        if state["stuck"] and (np.abs(path[:1] - state["joints"][0]) / self._per_rad).max(initial=0.0) < WAY_START_RAD:
+        far = (np.abs(path[:1] - state["joints"][0]) / self._per_rad).max(initial=0.0)
+        if state["stuck"] and far < self._start_rad:
             count = state["way_count"] = len(path)
             state["way"][:count] = path
             state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
@@ -49,16 +54,16 @@ class WayOut:
         With the difference d (J,) from the commanded joints, D = max |d_j| / per_rad_j and the
         tool's Jacobian J_p, the first three rows of `tasks`:
 
-            u = d radps min(1, D / WAY_SLOW_RAD) / max(D, WAY_NEAR_RAD)
+            u = d radps min(1, D / start_rad) / max(D, near_rad)
             velocity = u / max(1, |J_p u| / mps)
 
         radps [rad/s] and mps [m/s] are the largest speeds of a joint and of the tool. A posture is
-        reached when D < WAY_NEAR_RAD.
+        reached when D < near_rad.
         """
         if state["way_next"] >= state["way_count"]:
             return None
         off: Vector = state["way"][state["way_next"]] - state["joints"][0]
         far = float((np.abs(off) / self._per_rad).max())
-        velocity: Vector = off * (self._radps * min(1.0, far / WAY_SLOW_RAD) / max(far, WAY_NEAR_RAD))
-        state["way_next"] += far < WAY_NEAR_RAD
+        velocity: Vector = off * (self._radps * min(1.0, far / self._start_rad) / max(far, self._near_rad))
+        state["way_next"] += far < self._near_rad
         return velocity / max(1.0, norm(times(tasks[:3], velocity)) / self._mps)

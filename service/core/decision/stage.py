@@ -10,8 +10,8 @@ from service.contract.records import Reason
 from service.core.codes import AMBIGUOUS, BLOCKED, FAR, FAULT, HOLD, NOT_READY, RETURNING, STALE_HAND
 from service.core.decision.leave import WayOut, speeds_of_ways
 from service.core.decision.step import step
-from service.core.decision.tuning import BRIEF_HOLD_S, LONGEST_WAY_RAD, RETURN_RADPS
 from service.core.frame import Event, Record, Records, Vector, as_array, parameters
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings
 
 BY_THE_HANDS = (STALE_HAND, FAR, AMBIGUOUS)
@@ -24,7 +24,7 @@ class Decision:
     speed of the tool [m/s]; during a fault, the values that caused it.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
         limits = settings.joints
         self._lower, self._upper = np.array(limits.lower, np.float64), np.array(limits.upper, np.float64)
         self._parameters = parameters(
@@ -37,11 +37,18 @@ class Decision:
             max_speed=float(settings.tool.max_speed),
             engaging_speed=float(settings.tool.engaging_speed),
             per_rad=np.array(limits.per_rad),
-            way_timeout_s=LONGEST_WAY_RAD / speeds_of_ways(settings)[1],
+            # The time that a joint needs for 100 times the distance at which a way may begin.
+            way_timeout_s=100.0 * tuning.intake.joint_jump_rad / speeds_of_ways(settings)[1],
+            end_share=tuning.intake.end_share,
+            too_fast_s=1.5 * tuning.intake.confirmed_s,  # one late command is shorter
+            **tuning.decision._asdict(),
+            freed_share=3.0 * tuning.decision.progress_share,  # more than chance
+            another_target_m=2.0 * tuning.decision.stuck_gap_m,
         )
-        self._brief_ticks = round(BRIEF_HOLD_S / settings.period_s)
-        self._return_speed = RETURN_RADPS * np.array(limits.per_rad)
-        self._way_out = WayOut(settings)
+        self._brief_ticks = round(tuning.intake.tracker_memory_s / settings.period_s)
+        # A joint outside its limits is back within 2 s.
+        self._return_speed = 0.5 * tuning.intake.max_outside_rad * np.array(limits.per_rad)
+        self._way_out = WayOut(settings, tuning=tuning)
         self.measured = (0.0, 0.0)
 
     def step(
@@ -72,8 +79,8 @@ class Decision:
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def is_brief(self, state: Record) -> bool:
-        """True in the first BRIEF_HOLD_S of a hold that the hands have caused. The arm then resumes
-        its motion without engaging anew.
+        """True in the first tracker_memory_s of a hold that the hands have caused. The arm then
+        resumes its motion without engaging anew.
         """
         held = int(state["tick"] - state["followed_tick"])
         return int(state["reason"]) in BY_THE_HANDS and held <= self._brief_ticks

@@ -43,17 +43,7 @@ from service.core.codes import (
     UNSEEN,
     UNSEEN_HAND_NEEDED,
 )
-from service.core.decision.tuning import (
-    ANOTHER_TARGET_M,
-    FREED_SHARE,
-    PROGRESS_SHARE,
-    PROGRESS_SPEED_SHARE,
-    STUCK_GAP_M,
-    STUCK_S,
-    TOO_FAST_S,
-)
 from service.core.frame import Records, Vector
-from service.core.intake.tuning import END_SHARE
 from service.core.vectors import distance
 
 
@@ -108,7 +98,7 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
       been seen or is not seen now.
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
       follow yet.
-    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > END_SHARE
+    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share
       threshold.
     * AMBIGUOUS: the stage of the task is not known.
     """
@@ -128,7 +118,7 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
         return NO_HANDS if unseen else STALE_HAND
     if conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
         return STALE_HAND
-    ease = END_SHARE if state.reason == FAR else 1.0
+    ease = parameters[0].end_share if state.reason == FAR else 1.0
     return FAR if gate_m > ease * threshold else AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
 
 
@@ -145,10 +135,10 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
       are at rest. If it is outside its limits it is RETURNING, else READY. An arm inside of an
       obstacle starts only after the operator's confirmation (`leaves`), and is RETURNING.
     * A RETURNING arm becomes READY once it is within its limits, and either inside of no obstacle
-      or without motion for STUCK_S.
+      or without motion for stuck_s.
     * A silent arm is a fault (ARM_SILENT) if it follows or moves; at rest, it is no longer ready.
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
-    * A tool faster than `fault_speed` for more than TOO_FAST_S is a fault (TOOL_SPEED).
+    * A tool faster than `fault_speed` for more than too_fast_s is a fault (TOOL_SPEED).
     """
     state, config, heard, inside = states[0], parameters[0], conditions & ARM_HEARD, conditions & ARM_INSIDE
     if config.is_assumed:
@@ -180,14 +170,14 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
     if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
         if moving:
             state.stuck_tick = state.tick
-        if not inside or (state.tick - state.stuck_tick) * config.period_s > STUCK_S:
+        if not inside or (state.tick - state.stuck_tick) * config.period_s > config.stuck_s:
             state.arm_ready, state.leaves = READY, 0
     error, speed = measured_error(states, heres, parameters)
     if error > config.max_error_rad:
         return 0, ARM_ERROR, error, speed
     if speed <= config.fault_speed:
         state.slow_tick = state.tick
-    fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > TOO_FAST_S else NONE
+    fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > config.too_fast_s else NONE
     return 0, fault, error, speed
 
 
@@ -214,38 +204,38 @@ def _note_hold(states: Records, conditions: int) -> None:
 @compiled
 def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
     """Progress of the tool toward its target: HELD while the arm waits or moves along a way out,
-    NOTICED when the tool has come no nearer for STUCK_S, else 0.
+    NOTICED when the tool has come no nearer for stuck_s, else 0.
 
     With g = |target - tool| now and g_0 at `stuck_tick`, the tool makes progress if
 
-        g_0 - g > min(PROGRESS_SHARE g_0, PROGRESS_SPEED_SHARE max_speed STUCK_S)
+        g_0 - g > min(progress_share g_0, freed_share max_speed stuck_s)
 
-    and, once NOTICED, if g_0 - g > FREED_SHARE g_0. Then `stuck_tick`, g_0 and the target are set
-    to the present ones. This also happens if the arm does not follow, if g < STUCK_GAP_M, or if the
-    target has moved by more than STUCK_GAP_M. While the setpoint engages, engaging_speed takes the
+    and, once NOTICED, if g_0 - g > freed_share g_0. Then `stuck_tick`, g_0 and the target are set
+    to the present ones. This also happens if the arm does not follow, if g < stuck_gap_m, or if the
+    target has moved by more than stuck_gap_m. While the setpoint engages, engaging_speed takes the
     place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
     `way_timeout_s` has passed. If no way out was found, it lasts until the target has moved by
-    ANOTHER_TARGET_M.
+    another_target_m.
     """
     state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
     gap, moved = distance(frame.target, tool), distance(frame.target, state.stuck_target)
     passed_s = (state.tick - state.stuck_tick) * config.period_s
     if state.way_next < state.way_count and passed_s < config.way_timeout_s:
         return HELD
-    if state.stuck == HELD and not state.way_count and moved < ANOTHER_TARGET_M:
+    if state.stuck == HELD and not state.way_count and moved < config.another_target_m:
         return HELD
     state.way_next = state.way_count = 0
     if state.stuck == NOTICED:
-        least = FREED_SHARE * state.stuck_gap
+        least = config.freed_share * state.stuck_gap
     else:
         max_speed = config.engaging_speed if state.engaging else config.max_speed
-        least = min(PROGRESS_SHARE * state.stuck_gap, PROGRESS_SPEED_SHARE * max_speed * STUCK_S)
-    if state.mode != FOLLOW or gap < STUCK_GAP_M or state.stuck_gap - gap > least or moved > STUCK_GAP_M:
+        least = min(config.progress_share * state.stuck_gap, config.freed_share * max_speed * config.stuck_s)
+    if state.mode != FOLLOW or gap < config.stuck_gap_m or state.stuck_gap - gap > least or moved > config.stuck_gap_m:
         state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
         return 0
-    return NOTICED if passed_s >= STUCK_S else 0
+    return NOTICED if passed_s >= config.stuck_s else 0
 
 
 @compiled

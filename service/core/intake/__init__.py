@@ -9,6 +9,8 @@ STATES = 5  # states of each mode and axis: position, velocity, acceleration, tr
 TREMOR_RATES, USUAL_RATE = 10, 8  # rates of tremor that are distinguished, from slow to fast, and the usual one
 NO_TREMOR = 2  # filters without tremor in the bank of tremor filters
 BANK = NO_TREMOR + TREMOR_RATES  # filters of that bank
+CONFIRMED_SAMPLES = STATES - 2  # agreeing samples that confirm a jump: they show all states but tremor
+SETTLED_SAMPLES = CONFIRMED_SAMPLES + 1  # a sample is settled with this number of newer ones: a jump is confirmed
 KEPT = 49  # retained samples of each hand, among which late ones are inserted: 0.1 s of the fastest tracker
 STATE = (
     Field("hand_stamps_ns", "int64", (2,)),  # stamp of the newest sample

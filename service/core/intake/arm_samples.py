@@ -12,7 +12,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from service.core.frame import Records, Vector
-from service.core.intake.tuning import ARM_STILL_S, MAX_JOINT_RADPS
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import JointSettings, Settings
 
 TURN = 2.0 * math.pi
@@ -26,9 +26,9 @@ def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
     return position + np.where(is_continuous, TURN * np.rint((near - position) / TURN), 0.0)
 
 
-def still_ticks(settings: Settings) -> int:
+def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
     """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
-    return settings.ticks_in(ARM_STILL_S)
+    return settings.ticks_in(tuning.intake.max_late_s)
 
 
 @compiled
@@ -36,14 +36,14 @@ def compared(states: Records, parameters: Records, position: Vector, velocity: V
     """Check of joint positions and velocities (J,) [rad, rad/s] against plausible ranges and known
     ones.
 
-    Returns: true if every joint is within `plausible_joints` and not faster than MAX_JOINT_RADPS;
+    Returns: true if every joint is within `plausible_joints` and not faster than max_joint_radps;
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
     state, config, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
     for i in range(len(position)):
         near = near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
-        near = near and abs(velocity[i]) <= MAX_JOINT_RADPS * config.per_rad[i]
+        near = near and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
         off = max(off, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
     return near, off, moved

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from service.contract.evidence import figures
 from service.core.intake.stage import UNIT_M
-from service.core.intake.tuning import MAX_HAND_DISTANCE_M
+from service.core.tuning import TUNING
 
 PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the base plate, in the unit that was meant
 
@@ -26,4 +26,5 @@ def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
     meant.sort(key=lambda u: abs(math.log(far * UNIT_M[u])))
     like = f", which looks like {meant[0]}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
-    return f"at {figures(position)}{like}; {rule}, at most {MAX_HAND_DISTANCE_M:g} m from the base plate accepted"
+    most_m = TUNING.intake.max_hand_distance_m
+    return f"at {figures(position)}{like}; {rule}, at most {most_m:g} m from the base plate accepted"

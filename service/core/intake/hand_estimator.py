@@ -22,36 +22,24 @@ from kmp.elementary import exp
 from service.core.codes import DOUBTED, LEARNING, TRUSTED
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO
-from service.core.intake import KEPT, MODES
+from service.core.intake import KEPT, MODES, SETTLED_SAMPLES
 from service.core.intake.mode_filter import advance, start, update
 from service.core.intake.motion_model import CHANGE, model
 from service.core.intake.tremor import no_tremor, note_tremor
-from service.core.intake.tuning import (
-    DELAY_TOLERANCE_S,
-    END_SHARE,
-    HAND_STILL_MPS,
-    HAND_STILL_S,
-    LEAST_NOISE_M,
-    NOISE_OUTLIER_SHARE,
-    NOISE_SAMPLES,
-    NOISE_STD_M,
-    REAPPEARED_VARIANCE_SHARE,
-    SETTLED_SAMPLES,
-    STILLNESS_FALL_S,
-    STILLNESS_LOWPASS_S,
-    TRACKER_MEMORY_S,
-)
+from service.core.intake.tuning import IntakeTuning
 from service.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
+from service.core.tuning import TUNING
 from service.core.vectors import squared_distance
 
 STILL = np.ones(2)  # stillness of two hands that rest
 
 
-def smoothing(period_s: float) -> Vector:
+def smoothing(period_s: float, numbers: IntakeTuning = TUNING.intake) -> Vector:
     """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
     stillness: 1 - exp(-period / time constant).
     """
-    return 1.0 - np.array([exp(-period_s / time_s) for time_s in (STILLNESS_LOWPASS_S, HAND_STILL_S, STILLNESS_FALL_S)])
+    times_s = numbers.stillness_lowpass_s, numbers.hand_still_s, numbers.stillness_fall_s
+    return 1.0 - np.array([exp(-period_s / time_s) for time_s in times_s])
 
 
 @compiled
@@ -77,11 +65,11 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
 def stillness_of(velocities: Vector, period_s: float) -> Vector:
     """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
     out, stillness = np.empty((len(velocities), 2)), STILL.copy()
-    changes = smoothing(period_s)
+    changes, still_mps = smoothing(period_s), TUNING.intake.hand_still_mps
     lowpass = np.zeros((2, 3))
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
-            stillness[side] = stillness_after(velocity[side], changes, HAND_STILL_MPS, lowpass[side], stillness[side])
+            stillness[side] = stillness_after(velocity[side], changes, still_mps, lowpass[side], stillness[side])
         row[:] = stillness
     return out
 
@@ -89,9 +77,11 @@ def stillness_of(velocities: Vector, period_s: float) -> Vector:
 class HandEstimator:
     """Estimates of both hands; all that is estimated is kept in the state's arrays."""
 
-    def __init__(self, period_s: float, models: Records) -> None:
-        self._period_s = period_s
+    def __init__(self, intake: Records, models: Records, numbers: IntakeTuning) -> None:
+        self._intake = intake
         self._models = models
+        self._numbers = numbers
+        self._period_s = float(intake["period_s"][0])
         self._model = functools.lru_cache(maxsize=64)(self._model_over)
 
     def _model_over(self, ticks: int) -> Records:
@@ -100,15 +90,16 @@ class HandEstimator:
         overflow; beyond the intervals of `models` both hands are stale, and it is not used.
         """
         interval_s = ticks * self._period_s
+        changed = smoothing(interval_s, self._numbers)
         used_s = min(ticks, len(self._models)) * self._period_s
-        return parameters(**model(used_s), smoothing=smoothing(interval_s), still_speed=HAND_STILL_MPS)
+        return parameters(**model(used_s, self._numbers), smoothing=changed, still_speed=self._numbers.hand_still_mps)
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
-        state["noise_variance"] = NOISE_STD_M**2
+        state["noise_variance"] = self._numbers.noise_std_m**2
         state["hand_stillness"] = STILL
         for side in (0, 1):
-            no_tremor(as_array(state), side)
+            no_tremor(as_array(state), self._intake, side)
         state["bank_ticks"] = -len(self._models)
 
     def advance(self, state: Record, ticks: int, stale_ticks: int) -> None:
@@ -119,18 +110,18 @@ class HandEstimator:
 
 
 @compiled
-def _update_noise(states: Records, side: int, position: Vector, interval_s: float) -> None:
+def _update_noise(states: Records, parameters: Records, side: int, position: Vector, interval_s: float) -> None:
     """Update the noise variance r [m²] of one hand by a sample x_0 (3,) [m] that follows x_1, x_2,
     x_3:
 
-        d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, NOISE_SAMPLES)
-        r = r + (min(|d|² / 60, NOISE_OUTLIER_SHARE r) - r) / (n + 1)
+        d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, noise_samples)
+        r = r + (min(|d|² / 60, outlier_variances r) - r) / (n + 1)
 
-    60 = 3 axes * (1 + 9 + 9 + 1). r is at least LEAST_NOISE_M². Only evenly spaced samples are
+    60 = 3 axes * (1 + 9 + 9 + 1). r is at least least_noise_m². Only evenly spaced samples are
     used: when an interval differs by more than half from the one before, this sample and the next
     do not change r.
     """
-    state, past = states[0], states[0].past_samples[side]
+    state, config, past = states[0], parameters[0], states[0].past_samples[side]
     count, variance = state.even_samples[side], state.noise_variance[side]
     before_s = state.sample_interval_s[side]
     if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
@@ -141,11 +132,11 @@ def _update_noise(states: Records, side: int, position: Vector, interval_s: floa
         for axis in range(3):
             third = position[axis] - 3.0 * past[0, axis] + 3.0 * past[1, axis] - past[2, axis]
             square += third * third
-        seen = min(square / 60.0, NOISE_OUTLIER_SHARE * variance)
-        samples = min(state.noise_samples[side] + 1, NOISE_SAMPLES)
+        seen = min(square / 60.0, config.outlier_variances * variance)
+        samples = min(state.noise_samples[side] + 1, config.noise_samples)
         state.noise_samples[side] = samples
         variance += (seen - variance) / (samples + 1.0)
-        state.noise_variance[side] = max(variance, LEAST_NOISE_M**2)
+        state.noise_variance[side] = max(variance, config.least_noise_m**2)
     for axis in range(3):
         past[2, axis] = past[1, axis]
         past[1, axis] = past[0, axis]
@@ -202,16 +193,16 @@ def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
 
 
 @compiled
-def goes_on(states: Records, side: int, position: Vector, unseen_ticks: int) -> bool:
+def goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
     """True if a hand that is seen again at x (3,) [m] continues its filter: its newest sample is
-    less than `unseen_ticks` old, and |x - p|² < REAPPEARED_VARIANCE_SHARE (P + r).
+    less than `unseen_ticks` old, and |x - p|² < outlier_variances (P + r).
 
     p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
     """
-    state = states[0]
+    state, config = states[0], parameters[0]
     apart = squared_distance(position, state.hands[side, 0])
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(is_fresh(states, side, unseen_ticks) and apart < REAPPEARED_VARIANCE_SHARE * variance)
+    return bool(is_fresh(states, side, config.unseen_ticks) and apart < config.outlier_variances * variance)
 
 
 @compiled
@@ -269,24 +260,25 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
     """Update the minimum delays of one tracker by a sample that arrives now, and the trust in its
     clock.
 
-    Every TRACKER_MEMORY_S, the clock is trusted if the minimum delays of two consecutive windows
-    agree within DELAY_TOLERANCE_S. Learning restarts with the first sample, and with one that
-    arrives after a silence (not `fresh`) more than `max_late_s` above the minimum delay: the clock
-    was set back.
+    Every tracker_memory_s, the clock is trusted if the minimum delays of two consecutive windows
+    agree within delay_tolerance_s. Learning restarts with the first sample, and with one that
+    arrives after a silence (not `fresh`) more than `longest_late_s` above the minimum delay: the
+    clock was set back.
 
     The longest delay d above the minimum in these two windows determines from which age on the hand
-    is stale, between the settings `stale_ms` and `stale_max_ms`: d / END_SHARE.
+    is stale, between the settings `stale_ms` and `stale_max_ms`: d / end_share.
     """
-    state, period_s, max_late_s = states[0], parameters[0].period_s, parameters[0].max_late_s
+    state, config, period_s = states[0], parameters[0], parameters[0].period_s
+    longest_late_s = config.longest_late_s
     stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
     known = state.clock_tick[side] >= 0
-    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > max_late_s):
+    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s):
         stamps[:], ticks[:] = stamp_ns, state.tick
         state.clock[side], state.clock_tick[side] = LEARNING, state.tick
         state.longest_delay_ticks[side] = 0
-    elif (state.tick - state.clock_tick[side]) * period_s >= TRACKER_MEMORY_S:
+    elif (state.tick - state.clock_tick[side]) * period_s >= config.tracker_memory_s:
         apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
-        steady = abs(apart_s) <= DELAY_TOLERANCE_S and state.clock[side] != LEARNING
+        steady = abs(apart_s) <= config.delay_tolerance_s and state.clock[side] != LEARNING
         state.clock[side] = TRUSTED if steady else DOUBTED
         stamps[1], ticks[1] = stamps[0], ticks[0]
         stamps[0], ticks[0] = stamp_ns, state.tick
@@ -294,10 +286,10 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
         state.longest_delay_ticks[side, 1], state.longest_delay_ticks[side, 0] = state.longest_delay_ticks[side, 0], 0
     elif _later_s(states, side, 0, stamp_ns, period_s) < 0.0:
         stamps[0], ticks[0] = stamp_ns, state.tick
-    late = ticks_late(states, side, stamp_ns, period_s, max_late_s)
+    late = ticks_late(states, side, stamp_ns, period_s, longest_late_s)
     state.longest_delay_ticks[side, 0] = max(state.longest_delay_ticks[side, 0], late)
-    stale = math.ceil(state.longest_delay_ticks[side].max() / END_SHARE)
-    state.stale_ticks[side] = min(max(stale, parameters[0].stale_ticks), parameters[0].stale_max_ticks)
+    stale = math.ceil(state.longest_delay_ticks[side].max() / config.end_share)
+    state.stale_ticks[side] = min(max(stale, config.stale_ticks), config.stale_max_ticks)
 
 
 @compiled
@@ -334,7 +326,7 @@ def take(
     The filter starts anew if the sample `restarts` it (a confirmed jump), or if no sample is
     retained. `fresh` is false after a silence; see `note_clock`.
     """
-    state, period_s = states[0], parameters[0].period_s
+    state = states[0]
     note_clock(states, parameters, side, stamp_ns, fresh)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
@@ -343,16 +335,17 @@ def take(
     state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, state.tick
     state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
     state.kept_positions[side, at] = position
-    filter_in(states, side, at, TRACKER_MEMORY_S if ticks < 0 else ticks * period_s, restarts or ticks < 0)
-    settle(states, models, side, period_s)
+    interval_s = parameters[0].tracker_memory_s if ticks < 0 else ticks * parameters[0].period_s
+    filter_in(states, parameters, side, at, interval_s, restarts or ticks < 0)
+    settle(states, parameters, models, side)
     look_ahead(states, models, side)
 
 
 @compiled
-def settle(states: Records, models: Records, side: int, period_s: float) -> None:
+def settle(states: Records, parameters: Records, models: Records, side: int) -> None:
     """Update the tremor of one hand by its newest settled sample."""
     if states[0].kept[side] > SETTLED_SAMPLES:
-        note_tremor(states, models, side, slot(states, side, SETTLED_SAMPLES), period_s)
+        note_tremor(states, parameters, models, side, slot(states, side, SETTLED_SAMPLES))
 
 
 @compiled
@@ -364,7 +357,7 @@ def advance_hand(states: Records, side: int, overs: Records) -> None:
 
 
 @compiled
-def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool) -> None:
+def filter_in(states: Records, parameters: Records, side: int, at: int, interval_s: float, anew: bool) -> None:
     """Filter the retained sample at ring index `at`, and store the filter's state beside it.
 
     The filter must have been advanced to the sample's tick. `anew` starts it from this sample
@@ -374,12 +367,12 @@ def filter_in(states: Records, side: int, at: int, interval_s: float, anew: bool
     means, covariances = state.mode_means[side], state.mode_covariances[side]
     if anew:
         state.even_samples[side] = 0
-    _update_noise(states, side, position, interval_s)
+    _update_noise(states, parameters, side, position, interval_s)
     variance, modes = state.noise_variance[side], state.mode_probabilities[side]
     if anew:
-        start(means, covariances, modes, variance, position, state.tremors[side])
+        start(parameters, means, covariances, modes, variance, position, state.tremors[side])
     else:
-        update(means, covariances, modes, variance, position, interval_s, state.tremors[side])
+        update(parameters, means, covariances, modes, variance, position, interval_s, state.tremors[side])
     _remember(states, side, at)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.codes import TRUSTED
 from service.core.frame import Record, Records, Vector
-from service.core.intake import KEPT
+from service.core.intake import KEPT, SETTLED_SAMPLES
 from service.core.intake.hand_estimator import (
     advance_hand,
     filter_in,
@@ -30,7 +30,6 @@ from service.core.intake.hand_estimator import (
     slot,
 )
 from service.core.intake.motion_model import CHANGE
-from service.core.intake.tuning import REAPPEARED_VARIANCE_SHARE, SETTLED_SAMPLES, TRACKER_MEMORY_S
 from service.core.numerics import TICK_ROUNDING
 from service.core.vectors import squared_distance
 
@@ -83,11 +82,13 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
 
 
 @compiled
-def _fits(states: Records, models: Records, side: int, order: int, tick: int, position: Vector) -> bool:
+def _fits(
+    states: Records, parameters: Records, models: Records, side: int, order: int, tick: int, position: Vector
+) -> bool:
     """True if a sample x (3,) [m] made at a tick fits a hand's filter as it was after the retained
     sample of this `order`:
 
-        |x - p|² < REAPPEARED_VARIANCE_SHARE (P + r)
+        |x - p|² < outlier_variances (P + r)
 
     p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
     """
@@ -99,11 +100,11 @@ def _fits(states: Records, models: Records, side: int, order: int, tick: int, po
         for column in range(3):
             variance += over.transition[CHANGE, 0, row] * before[row, column] * over.transition[CHANGE, 0, column]
     variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, at, 0]
-    return bool(squared_distance(position, there) < REAPPEARED_VARIANCE_SHARE * variance)
+    return bool(squared_distance(position, there) < parameters[0].outlier_variances * variance)
 
 
 @compiled
-def wrong_samples(states: Records, models: Records, side: int, tick: int, position: Vector) -> int:
+def wrong_samples(states: Records, parameters: Records, models: Records, side: int, tick: int, position: Vector) -> int:
     """Number of the newest retained samples that a sample (3,) [m], which jumped and was made at
     `tick`, shows to be wrong; 0 if none are.
 
@@ -115,11 +116,11 @@ def wrong_samples(states: Records, models: Records, side: int, tick: int, positi
         newest = slot(states, side, order - 1)
         if state.kept_restarts[side, newest] > 0:
             return 0
-        wrong = _fits(states, models, side, order, tick, position)
+        wrong = _fits(states, parameters, models, side, order, tick, position)
         for newer in range(order):
             at = slot(states, side, newer)
             made, sample = state.kept_ticks[side, at], state.kept_positions[side, at]
-            wrong = wrong and not _fits(states, models, side, order, made, sample)
+            wrong = wrong and not _fits(states, parameters, models, side, order, made, sample)
         if wrong:
             return order
     return 0
@@ -189,10 +190,10 @@ def take_late(
         anew = first or state.kept_restarts[side, at] > 0
         if not anew:
             _advance_by(states, models, side, ticks)
-        filter_in(states, side, at, TRACKER_MEMORY_S if first else ticks * config.period_s, anew)
+        filter_in(states, parameters, side, at, config.tracker_memory_s if first else ticks * config.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
-    settle(states, models, side, config.period_s)
+    settle(states, parameters, models, side)
     look_ahead(states, models, side)
 
 

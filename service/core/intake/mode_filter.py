@@ -28,43 +28,39 @@ from kmp.elementary import exp, log
 from service.core.frame import Records, Vector
 from service.core.intake import MODES, STATES
 from service.core.intake.motion_model import CHANGE, REACH, REST, STEADY
-from service.core.intake.tuning import (
-    LEAST_MODE_PROBABILITY,
-    MAX_TREMOR_M,
-    MODE_ACCELERATION_REVERSIONS_PER_S,
-    MODE_INTENSITIES_M2PS5,
-    MODE_PRIOR,
-    MODE_SWITCH_RATES_PER_S,
-    OUTLIER_STDS,
-    REST_ACCELERATION_STD_MPS2,
-    REST_MAX_SPEED_MPS,
-    REST_SPEED_STD_MPS,
-    START_SPEED_STD_MPS,
-)
 from service.core.vectors import square
 
 
 @compiled
-def start(means: Vector, covariances: Vector, modes: Vector, noise: float, position: Vector, tremor: Vector) -> None:
+def start(
+    parameters: Records,
+    means: Vector,
+    covariances: Vector,
+    modes: Vector,
+    noise: float,
+    position: Vector,
+    tremor: Vector,
+) -> None:
     """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
 
         mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
 
-    with σ_v = START_SPEED_STD_MPS, and the rate ω and the mode's σ² of the `tremor` (1 + MODES,).
+    with σ_v = start_speed_std_mps, and the rate ω and the mode's σ² of the `tremor` (1 + MODES,).
     The variance of the acceleration is the stationary one of the mode CHANGE. The probabilities are
-    MODE_PRIOR.
+    mode_prior.
     """
-    of_acceleration = MODE_INTENSITIES_M2PS5[CHANGE] / (2.0 * MODE_ACCELERATION_REVERSIONS_PER_S[CHANGE])
+    config = parameters[0]
+    of_acceleration = config.mode_intensities_m2ps5[CHANGE] / (2.0 * config.mode_acceleration_reversions_per_s[CHANGE])
     means[:] = 0.0
     covariances[:] = 0.0
     for mode in range(MODES):
         for axis in range(3):
             means[mode, 0, axis] = position[axis]
         covariances[mode, 0, 0] = noise
-        covariances[mode, 1, 1] = START_SPEED_STD_MPS**2
+        covariances[mode, 1, 1] = config.start_speed_std_mps**2
         covariances[mode, 2, 2] = of_acceleration
         _tremble(means[mode], covariances[mode], tremor, mode)
-        modes[mode] = MODE_PRIOR[mode]
+        modes[mode] = config.mode_prior[mode]
 
 
 @compiled
@@ -157,12 +153,13 @@ def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> Non
 
 
 @compiled
-def _come_to_rest(mean: Vector, covariance: Vector) -> None:
+def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None:
     """Condition a moving mode on being slow: a Kalman update by v = 0 with standard deviation
-    REST_SPEED_STD_MPS, then by a = 0 with REST_ACCELERATION_STD_MPS2.
+    rest_speed_std_mps, then by a = 0 with as many m/s²: a resting hand changes its drift by as much
+    in a second.
     """
+    spread = parameters[0].rest_speed_std_mps
     for known in range(1, 3):
-        spread = REST_SPEED_STD_MPS if known == 1 else REST_ACCELERATION_STD_MPS2
         row_of = covariance[known].copy()
         variance = row_of[known] + spread * spread
         for axis in range(3):
@@ -190,39 +187,46 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 
 @compiled
-def bounded(innovation: float) -> float:
+def bounded(parameters: Records, innovation: float) -> float:
     """Squared, normalised innovation x on three axes, at most so large that exp(-½ x) =
-    LEAST_MODE_PROBABILITY³, a factor for each axis: a less probable sample does not distinguish
+    least_mode_probability³, a factor for each axis: a less probable sample does not distinguish
     modes.
     """
-    return min(innovation, 6.0 * OUTLIER_STDS**2)
+    most: float = 6.0 * parameters[0].outlier_variances
+    return min(innovation, most)
 
 
 @compiled
-def _switched(means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector) -> None:
+def _switched(
+    parameters: Records, means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector
+) -> None:
     """Joint probabilities s (MODES, MODES), written to `shares`, of mode i before an interval Δ and
     mode j after it:
 
         s_ij = μ_i ((1 - exp(-λ_i Δ)) ρ_j + δ_ij exp(-λ_i Δ))
 
-    μ are the probabilities `modes`, λ is MODE_SWITCH_RATES_PER_S, ρ is MODE_PRIOR. The transition
+    μ are the probabilities `modes`, λ is mode_switch_rates_per_s, ρ is mode_prior. The transition
     from a moving mode i to REST is weighted by how slow that mode is; s_ii keeps the rest:
 
-        slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + REST_SPEED_STD_MPS²)))
+        slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + rest_speed_std_mps²)))
     """
+    config = parameters[0]
     for i in range(MODES):
-        stay = exp(-MODE_SWITCH_RATES_PER_S[i] * interval_s)
+        stay = exp(-config.mode_switch_rates_per_s[i] * interval_s)
         for j in range(MODES):
-            shares[i, j] = modes[i] * ((1.0 - stay) * MODE_PRIOR[j] + (stay if i == j else 0.0))
+            shares[i, j] = modes[i] * ((1.0 - stay) * config.mode_prior[j] + (stay if i == j else 0.0))
         if i != REST:
             speed = square(means[i, 1])
-            slow = exp(-0.5 * bounded(speed / (covariances[i, 1, 1] + REST_SPEED_STD_MPS * REST_SPEED_STD_MPS)))
+            variance = covariances[i, 1, 1] + config.rest_speed_std_mps * config.rest_speed_std_mps
+            slow = exp(-0.5 * bounded(parameters, speed / variance))
             shares[i, i] += (1.0 - slow) * shares[i, REST]
             shares[i, REST] *= slow
 
 
 @compiled
-def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector, tremor: Vector) -> None:
+def _mix(
+    parameters: Records, means: Vector, covariances: Vector, shares: Vector, expected: Vector, tremor: Vector
+) -> None:
     """Mixed initial condition of each mode j from the `shares` s (MODES, MODES) of `_switched`, in
     place; the predicted probabilities c (MODES,) are written to `expected`.
 
@@ -239,7 +243,7 @@ def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector, t
         for i in range(MODES):
             of_means[j, i], of_covariances[j, i] = means[i], covariances[i]
             if i != j and j == REST:
-                _come_to_rest(of_means[j, i], of_covariances[j, i])
+                _come_to_rest(parameters, of_means[j, i], of_covariances[j, i])
             if i != j and not is_evident:
                 if i == REST:
                     _leave_rest(of_means[j, i], of_covariances[j, i])
@@ -265,23 +269,26 @@ def _mix(means: Vector, covariances: Vector, shares: Vector, expected: Vector, t
 
 
 @compiled
-def _beyond_rest(mean: Vector, tremor: Vector) -> float:
+def _beyond_rest(parameters: Records, mean: Vector, tremor: Vector) -> float:
     """Squared, normalised excess of the speed and tremor of the mode REST over their bounds:
 
         max(|v|² - v_max², 0) / σ_v² + max(|y|² + |w|² / ω² - y_max², 0) / σ²
 
-    with v_max = REST_MAX_SPEED_MPS, σ_v = REST_SPEED_STD_MPS, y_max = MAX_TREMOR_M and the tremor's
+    with v_max = rest_max_speed_mps, σ_v = rest_speed_std_mps, y_max = max_tremor_m and the tremor's
     σ.
     """
+    config = parameters[0]
     speed, amplitude = square(mean[1]), 0.0
     for axis in range(3):
         amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
-    trembles = max(amplitude - MAX_TREMOR_M**2, 0.0) / float(tremor[1 + REST])
-    return max(speed - REST_MAX_SPEED_MPS**2, 0.0) / REST_SPEED_STD_MPS**2 + trembles
+    trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + REST])
+    drifts: float = max(speed - config.rest_max_speed_mps**2, 0.0) / config.rest_speed_std_mps**2
+    return drifts + trembles
 
 
 @compiled
 def update(
+    parameters: Records,
     means: Vector,
     covariances: Vector,
     modes: Vector,
@@ -300,13 +307,13 @@ def update(
         log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
     The innovation in log L is that before the update. For REST, log L is reduced by half of
-    `_beyond_rest`. The probabilities μ stay above about LEAST_MODE_PROBABILITY.
+    `_beyond_rest`. The probabilities μ stay above about least_mode_probability.
     """
     shares, expected, likelihood = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES)
     if tremor[1 + CHANGE] == 0.0:
         _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
-    _switched(means, covariances, modes, interval_s, shares)
-    _mix(means, covariances, shares, expected, tremor)
+    _switched(parameters, means, covariances, modes, interval_s, shares)
+    _mix(parameters, means, covariances, shares, expected, tremor)
     best = -1e300
     for i in range(MODES):
         mean, p = means[i], covariances[i]
@@ -314,15 +321,15 @@ def update(
             for column in range(row):
                 p[row, column] = p[column, row]
         variance, error = measure(mean, p, noise, position)
-        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(error)
+        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(parameters, error)
         if i == REST:
-            likelihood[i] -= 0.5 * _beyond_rest(mean, tremor)
+            likelihood[i] -= 0.5 * _beyond_rest(parameters, mean, tremor)
         best = max(best, likelihood[i])
     for i in range(MODES):
         modes[i] = expected[i] * exp(likelihood[i] - best)
     _normalise(modes)
     for i in range(MODES):
-        modes[i] = max(modes[i], LEAST_MODE_PROBABILITY)
+        modes[i] = max(modes[i], parameters[0].least_mode_probability)
     _normalise(modes)
 
 

@@ -7,13 +7,13 @@ and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each o
     dp = v dt,   dv = a dt,   da = (-k_v v - k_a a) dt + sqrt(q) dW1
     dy = w dt,   dw = (-ω² y - 2 ζ ω w) dt + sqrt(4 ζ ω³ σ²) dW2
 
-Velocity and acceleration revert to zero by k_v (MODE_VELOCITY_REVERSIONS_PER_S2) and k_a
-(MODE_ACCELERATION_REVERSIONS_PER_S); q is MODE_INTENSITIES_M2PS5 [m²/s⁵]. These three and the
-tremor's stationary standard deviation σ differ between the modes; ω, one of TREMOR_RATES_PER_S, and
-ζ = TREMOR_DAMPING are shared. Rate and strength of a hand's tremor are estimated (`tremor`). W1 and
+Velocity and acceleration revert to zero by k_v (mode_velocity_reversions_per_s2) and k_a
+(mode_acceleration_reversions_per_s); q is mode_intensities_m2ps5 [m²/s⁵]. These three and the
+tremor's stationary standard deviation σ differ between the modes; ω, one of tremor_rates_per_s, and
+ζ = tremor_damping are shared. Rate and strength of a hand's tremor are estimated (`tremor`). W1 and
 W2 are independent Wiener processes.
 
-The estimate between two samples is extrapolated differently: for VELOCITY_KEPT_S after the newest
+The estimate between two samples is extrapolated differently: for max_late_s after the newest
 sample, the velocity of a hand that reaches or changes does not revert to zero: otherwise the end of
 a motion would be reported although the next sample may only be late.
 """
@@ -27,26 +27,20 @@ import numpy as np
 
 from service.core.frame import Records, Vector, structured
 from service.core.intake import MODES, TREMOR_RATES
-from service.core.intake.tuning import (
-    MODE_ACCELERATION_REVERSIONS_PER_S,
-    MODE_INTENSITIES_M2PS5,
-    MODE_VELOCITY_REVERSIONS_PER_S2,
-    TREMOR_DAMPING,
-    TREMOR_RATES_PER_S,
-    VELOCITY_KEPT_S,
-)
+from service.core.intake.tuning import IntakeTuning
 from service.core.numerics import SERIES_TERMS
+from service.core.tuning import TUNING
 
 REST, REACH, CHANGE = range(MODES)  # a hand rests, reaches, or changes its motion
 STEADY = MODES  # motion of the bank of tremor filters: REACH that does not end
 
 
 @functools.cache
-def models(period_s: float, count: int) -> Records:
+def models(period_s: float, count: int, numbers: IntakeTuning = TUNING.intake) -> Records:
     """Transition, process noise and extrapolation of all modes over 0 to `count` - 1 periods.
 
     Record n holds, for the interval t = n `period_s`, the fields of `model`, and `onward` (MODES,
-    3, 3), which extrapolates (p, v, a) from the newest sample. With h = min(t, VELOCITY_KEPT_S):
+    3, 3), which extrapolates (p, v, a) from the newest sample. With h = min(t, max_late_s):
 
         onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -k_a]]
 
@@ -56,20 +50,20 @@ def models(period_s: float, count: int) -> Records:
     tremors = [(name, np.float64, (TREMOR_RATES, 2, 2)) for name in ("tremor", "tremor_noise")]
     out = structured(count, [*motions, *tremors, ("onward", np.float64, (MODES, 3, 3))])
     times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
-    kept_on_s: Vector = np.minimum(times_s, VELOCITY_KEPT_S)
-    for name, values in model(times_s).items():
+    kept_on_s: Vector = np.minimum(times_s, numbers.max_late_s)
+    for name, values in model(times_s, numbers).items():
         out[name] = values
     for mode in (REACH, CHANGE):
-        fades = MODE_ACCELERATION_REVERSIONS_PER_S[mode]
-        ending = _over(_motion(MODE_VELOCITY_REVERSIONS_PER_S2[mode], fades), times_s - kept_on_s)[0]
+        fades = numbers.mode_acceleration_reversions_per_s[mode]
+        ending = _over(_motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - kept_on_s)[0]
         out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), kept_on_s)[0])
     out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
 
-def model(interval_s: float | Vector) -> dict[str, Vector]:
+def model(interval_s: float | Vector, numbers: IntakeTuning = TUNING.intake) -> dict[str, Vector]:
     """Transition F and process noise Q over intervals t (...), of the motion of each mode and of a
-    tremor of unit variance at each of the TREMOR_RATES_PER_S:
+    tremor of unit variance at each of the tremor_rates_per_s:
 
     * `transition`, `noise` (..., MODES + 1, 3, 3), with A = [[0, 1, 0], [0, 0, 1], [0, -k_v, -k_a]]
       and c = q; the last one, STEADY, is REACH with k_v = 0
@@ -82,16 +76,16 @@ def model(interval_s: float | Vector) -> dict[str, Vector]:
     """
     interval_s = np.asarray(interval_s, np.float64)
     transition, noise = np.empty((2, *interval_s.shape, MODES + 1, 3, 3))
-    reversions = [*MODE_VELOCITY_REVERSIONS_PER_S2, 0.0]
+    reversions = [*numbers.mode_velocity_reversions_per_s2, 0.0]
     for motion, mode in enumerate((REST, REACH, CHANGE, REACH)):
-        dynamics = _motion(reversions[motion], MODE_ACCELERATION_REVERSIONS_PER_S[mode])
+        dynamics = _motion(reversions[motion], numbers.mode_acceleration_reversions_per_s[mode])
         transition[..., motion, :, :], driven = _over(dynamics, interval_s)
-        noise[..., motion, :, :] = MODE_INTENSITIES_M2PS5[mode] * driven
+        noise[..., motion, :, :] = numbers.mode_intensities_m2ps5[mode] * driven
     tremor, tremor_noise = np.empty((2, *interval_s.shape, TREMOR_RATES, 2, 2))
-    for k, rate in enumerate(TREMOR_RATES_PER_S):
-        oscillator = np.array([[0.0, 1.0], [-(rate**2), -2.0 * TREMOR_DAMPING * rate]])
+    for k, rate in enumerate(numbers.tremor_rates_per_s):
+        oscillator = np.array([[0.0, 1.0], [-(rate**2), -2.0 * numbers.tremor_damping * rate]])
         tremor[..., k, :, :], driven = _over(oscillator, interval_s)
-        tremor_noise[..., k, :, :] = 4.0 * TREMOR_DAMPING * rate * rate * rate * driven
+        tremor_noise[..., k, :, :] = 4.0 * numbers.tremor_damping * rate * rate * rate * driven
     return {"transition": transition, "noise": noise, "tremor": tremor, "tremor_noise": tremor_noise}
 
 

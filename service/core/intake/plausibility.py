@@ -6,10 +6,10 @@ source that contradicts the first. The rules are the same for both hands and for
   the time after which the source is silent. Silence is judged by arrival; after a silence, any
   stamp but the newest one is accepted.
 * A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
-  jump is accepted once CONFIRMED_SAMPLES successive samples, over at least CONFIRMED_S, agree with
+  jump is accepted once CONFIRMED_SAMPLES successive samples, over at least confirmed_s, agree with
   each other. A jump of the arm is accepted only after a silence, because an arm cannot jump.
 * A hand that appears where the other hand was, while that one is no longer seen there, is taken for
-  the other one: the tracker has swapped them. The new position is accepted after `hands.swapped_s`,
+  the other one: the tracker has swapped them. The new position is accepted after `swapped_s`,
   within which the tracker may correct itself.
 * A source is contested when more than CONTESTED_ON_SHARE of its samples within about
   TRACKER_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
@@ -27,13 +27,8 @@ import numpy as np
 from kmp.compiled import compiled
 from service.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from service.core.frame import Records, Vector
+from service.core.intake import CONFIRMED_SAMPLES
 from service.core.intake.hand_estimator import slot
-from service.core.intake.tuning import (
-    CONFIRMED_S,
-    CONFIRMED_SAMPLES,
-    SOURCE_SPREAD_SHARE,
-    SOURCES_APART_M,
-)
 from service.core.vectors import distance, squared_distance
 
 
@@ -47,7 +42,7 @@ def is_of_another(states: Records, parameters: Records, side: int, position: Vec
     """
     state, config, offset = states[0], parameters[0], position - expected
     passed = state.tick - state.other_tick[side]
-    far = distance(offset, state.other_offset[side]) > config.jump
+    far = distance(offset, state.other_offset[side]) > config.jump_m
     in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
     returns = passed < config.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
     state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
@@ -79,7 +74,7 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     """True if the jump of a hand to a position (3,) [m] is accepted; counts successive samples that
     agree.
 
-    Accepted are at least CONFIRMED_SAMPLES samples that agree over CONFIRMED_S; over `swapped_s` if
+    Accepted are at least CONFIRMED_SAMPLES samples that agree over confirmed_s; over `swapped_s` if
     the hand jumped to where the other one was, and that one has not been seen since.
     """
     state, config = states[0], parameters[0]
@@ -92,7 +87,7 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     unseen = state.hand_ticks[1 - side] < first
     if count > 1 and unseen and _is_at_other(states, parameters, side, position):
         state.jump_is_swap[side] = 1
-    enough_s = config.swapped_s if state.jump_is_swap[side] else CONFIRMED_S
+    enough_s = config.swapped_s if state.jump_is_swap[side] else config.confirmed_s
     return bool(count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * config.period_s >= enough_s)
 
 
@@ -107,7 +102,7 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     state, config = states[0], parameters[0]
     seen = state.hand_ticks[1 - side]
     here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = config.jump + config.jump_speed * min((state.tick - seen) * config.period_s, config.swapped_s)
+    near = config.jump_m + config.jump_speed_mps * min((state.tick - seen) * config.period_s, config.swapped_s)
     return bool(seen >= 0 and distance(position, there) < min(near, 0.5 * distance(here, there)))
 
 
@@ -118,17 +113,17 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
     """
     state, config = states[0], parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = distance(position, state.jumped_to[side]) <= config.jump + config.jump_speed * passed * config.period_s
+    near = distance(position, state.jumped_to[side]) <= config.jump_m + config.jump_speed_mps * passed * config.period_s
     return bool(passed < config.stale_ticks and near)
 
 
 @compiled
-def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
+def _returns(states: Records, parameters: Records, side: int, order: int, offset: Vector) -> bool:
     """True if an earlier sample deviated by about the same `offset` (3,) [m] from its neighbours.
 
     The retained samples from number `order` + 2 on are checked; the one before is a neighbour of
     the new deviation. The deviation of a sample is x_k - (x_(k-1) + x_(k+1)) / 2; it may differ
-    from the offset by SOURCE_SPREAD_SHARE |offset|. A second source repeats its offset, the
+    from the offset by source_spread_share |offset|. A second source repeats its offset, the
     outliers of one tracker do not.
     """
     state, around = states[0], np.empty((3, 3))
@@ -136,22 +131,22 @@ def _returns(states: Records, side: int, order: int, offset: Vector) -> bool:
         for k in range(3):
             around[k] = state.kept_positions[side, slot(states, side, before - 1 + k)]
         off = around[1] - 0.5 * (around[0] + around[2])
-        if distance(off, offset) <= SOURCE_SPREAD_SHARE * distance(offset, np.zeros(3)):
+        if distance(off, offset) <= parameters[0].source_spread_share * distance(offset, np.zeros(3)):
             return True
     return False
 
 
 @compiled
-def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> bool:
+def is_to_and_fro(states: Records, parameters: Records, side: int, order: int, position: Vector) -> bool:
     """True if four samples alternate between two positions: a new one (3,) [m], and the three
     before it, whose newest has number `order`. Their intervals may be uneven.
 
     For one of the ALTERNATIONS, which assign the samples to two sources, samples of different
-    sources are at least SOURCES_APART_M apart, and those of one source differ by at most
-    SOURCE_SPREAD_SHARE of the smallest distance between the sources. A pattern with one sample of
+    sources are at least sources_apart_m apart, and those of one source differ by at most
+    source_spread_share of the smallest distance between the sources. A pattern with one sample of
     the second source also requires that this source was seen before (`_returns`).
     """
-    samples = np.empty((4, 3))
+    config, samples = parameters[0], np.empty((4, 3))
     samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
     for sources in ALTERNATIONS:
         within, apart = 0.0, np.inf
@@ -162,8 +157,8 @@ def is_to_and_fro(states: Records, side: int, order: int, position: Vector) -> b
                     within = max(within, between)
                 else:
                     apart = min(apart, between)
-        if apart >= SOURCES_APART_M**2 and within <= SOURCE_SPREAD_SHARE**2 * apart:
+        if apart >= config.sources_apart_m**2 and within <= config.source_spread_share**2 * apart:
             # index of the second source's only sample; 0 if it has two
             odd = 1 if sources == SECOND_NEWEST else 2 if sources == THIRD_NEWEST else 0
-            return odd == 0 or _returns(states, side, order + odd - 1, samples[odd] - samples[0])
+            return odd == 0 or _returns(states, parameters, side, order + odd - 1, samples[odd] - samples[0])
     return False

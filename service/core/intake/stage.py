@@ -22,14 +22,7 @@ from service.core.intake.arm_samples import still_ticks
 from service.core.intake.hand_estimator import HandEstimator
 from service.core.intake.motion_model import models
 from service.core.intake.step import ARM, report, take_arm, take_hand
-from service.core.intake.tuning import (
-    JOINT_JUMP_RADPS,
-    JUMP_M,
-    JUMP_SPEED_MPS,
-    MAX_LATE_S,
-    MAX_OUTSIDE_RAD,
-    SWAPPED_S,
-)
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import HandSettings, Settings
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
@@ -74,11 +67,11 @@ class Intake:
     cause.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        hands = settings.hands
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        hands, numbers = settings.hands, tuning.intake
         self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
-        self._still_ticks = still_ticks(settings)
+        self._still_ticks = still_ticks(settings, tuning)
         self._names = settings.joints.names
         self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
@@ -86,25 +79,44 @@ class Intake:
         stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
         unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
         self._unseen_ticks = unseen_ticks
-        max_late_s = max(MAX_LATE_S, longest_s)
-        self._models = models(settings.period_s, unseen_ticks + math.ceil(max_late_s / settings.period_s) + 1)
+        longest_late_s = max(numbers.max_late_s, longest_s)
+        late_ticks = math.ceil(longest_late_s / settings.period_s)
+        self._models = models(settings.period_s, unseen_ticks + late_ticks + 1, numbers)
         joints = settings.joints
         limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
-        self._parameters = parameters(
+        self.parameters = parameters(
             period_s=settings.period_s,
             stale_ticks=self._stale_ticks,
             stale_max_ticks=stale_max_ticks,
-            max_late_s=max_late_s,
+            longest_late_s=longest_late_s,
             unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
-            jump=JUMP_M,
-            jump_speed=JUMP_SPEED_MPS,
-            swapped_s=SWAPPED_S,
-            joint_jump_speed=max(JOINT_JUMP_RADPS, float((np.array(joints.velocity) / per_rad).max())),
-            plausible_joints=limits + MAX_OUTSIDE_RAD * per_rad * np.array([[-1.0], [1.0]]),
+            joint_jump_speed=max(numbers.joint_jump_radps, float((np.array(joints.velocity) / per_rad).max())),
+            plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
             has_clutch=int(hands.clutch == "key"),
+            **numbers._asdict(),
+            start_speed_std_mps=numbers.start_speed_std_mps,
+            # A faster hand does not rest: reaches are seen at once.
+            rest_max_speed_mps=numbers.outlier_stds * numbers.rest_speed_std_mps,
+            # Squared deviation / variance of an outlier; what differs by less continues its filter.
+            outlier_variances=numbers.outlier_stds**2,
+            # No mode becomes less probable than an outlier on two axes, so that each can return.
+            least_mode_probability=round(math.exp(-(numbers.outlier_stds**2)), 9),
+            tremor_rates_per_s=numbers.tremor_rates_per_s,
+            jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
+            sources_apart_m=numbers.scatter_on_m,
+            # Below twice the acceleration of the strongest tremor, a hand may move to and fro.
+            to_and_fro_mps2=2.0 * numbers.max_tremor_m * numbers.tremor_rate_per_s**2,
+            # Alternating samples raise the contested share up to this limit.
+            to_and_fro_max_share=2.0 * numbers.contested_on_share,
+            contested_off_share=numbers.contested_off_share,
+            scatter_on_m=numbers.scatter_on_m,
+            scatter_off_m=numbers.scatter_off_m,
+            # With fewer, one outlier in four differences looks like scatter.
+            scatter_least_samples=numbers.noise_samples // 2,
+            max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
         self._mappings = {
@@ -116,7 +128,7 @@ class Intake:
             self._mappings[BASE] = np.eye(3, 4), False
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
-        self._estimator = HandEstimator(settings.period_s, self._models)
+        self._estimator = HandEstimator(self.parameters, self._models, numbers)
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""
@@ -142,7 +154,7 @@ class Intake:
                     state["gripper_wish"] = event.value
                 case _:
                     self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
-        return int(report(as_array(state), as_array(frame), self._parameters))
+        return int(report(as_array(state), as_array(frame), self.parameters))
 
     def advance(self, state: Record, ticks: int) -> None:
         """Advance the state by some ticks: hands seen lately move on, others stand still."""
@@ -159,7 +171,7 @@ class Intake:
             sample = z_reversed(sample)
         cause = take_hand(
             as_array(state),
-            self._parameters,
+            self.parameters,
             self._models,
             side,
             sample.stamp_ns,
@@ -178,7 +190,7 @@ class Intake:
             state["rejected"][Cause.INCOMPLETE] += 1
             self._note(state, ARM, Cause.INCOMPLETE, sample)
             return
-        cause = take_arm(as_array(state), self._parameters, sample.stamp_ns, np.array(position), np.array(velocity))
+        cause = take_arm(as_array(state), self.parameters, sample.stamp_ns, np.array(position), np.array(velocity))
         if cause >= 0:
             self._note(state, ARM, cause, sample)
 

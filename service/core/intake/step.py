@@ -22,27 +22,11 @@ from service.core.codes import (
 )
 from service.core.frame import Records, Vector
 from service.core.geometry import ROUND_TO
-from service.core.intake import KEPT
+from service.core.intake import CONFIRMED_SAMPLES, KEPT
 from service.core.intake.arm_samples import compared, unwrap
 from service.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
 from service.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
 from service.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
-from service.core.intake.tuning import (
-    ARM_STILL_RAD,
-    CONFIRMED_S,
-    CONFIRMED_SAMPLES,
-    CONTESTED_OFF_SHARE,
-    CONTESTED_ON_SHARE,
-    JOINT_JUMP_RAD,
-    JUMP_NOISE_STDS,
-    MAX_HAND_DISTANCE_M,
-    SCATTER_LEAST_SAMPLES,
-    SCATTER_OFF_M,
-    SCATTER_ON_M,
-    TO_AND_FRO_MAX_SHARE,
-    TO_AND_FRO_MPS2,
-    TRACKER_MEMORY_S,
-)
 from service.core.vectors import distance, squared_distance
 
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
@@ -51,17 +35,19 @@ JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm
 
 
 @compiled
-def is_contested(states: Records, already: bool) -> bool:
+def is_contested(states: Records, parameters: Records, already: bool) -> bool:
     """True if a hand or the arm is contested: two sources report it.
 
-    A source is contested if its `contested` share is above CONTESTED_ON_SHARE, or if the noise of a
-    hand's samples is above SCATTER_ON_M. If it was contested `already`, the lower limits
-    CONTESTED_OFF_SHARE and SCATTER_OFF_M apply.
+    A source is contested if its `contested` share is above contested_on_share, or if the noise of a
+    hand's samples is above scatter_on_m. If it was contested `already`, the lower limits
+    contested_off_share and scatter_off_m apply.
     """
-    share, scatter_m = (CONTESTED_OFF_SHARE, SCATTER_OFF_M) if already else (CONTESTED_ON_SHARE, SCATTER_ON_M)
-    state = states[0]
+    state, config = states[0], parameters[0]
+    share, scatter_m = config.contested_on_share, config.scatter_on_m
+    if already:
+        share, scatter_m = config.contested_off_share, config.scatter_off_m
     for side in range(2):
-        known = already or state.noise_samples[side] >= SCATTER_LEAST_SAMPLES
+        known = already or state.noise_samples[side] >= config.scatter_least_samples
         if known and state.noise_variance[side] > scatter_m**2:
             return True
     return bool(state.contested.max() > share)
@@ -86,10 +72,10 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 
 @compiled
-def note(states: Records, source: int, jumped: bool, most_s: float, period_s: float) -> None:
+def note(states: Records, parameters: Records, source: int, jumped: bool, most_s: float) -> None:
     """Update the share c of a source's recent samples that contradict the others:
 
-        c = c + (1 - exp(-Δ / TRACKER_MEMORY_S)) (jumped - c)
+        c = c + (1 - exp(-Δ / tracker_memory_s)) (jumped - c)
 
     Δ is half the time since the tick with a sample before the last one; for a further sample in the
     same tick, it is the time since the last tick with one. Δ is at most `most_s`, after which the
@@ -102,8 +88,8 @@ def note(states: Records, source: int, jumped: bool, most_s: float, period_s: fl
     if ticks[1] < state.tick:
         passed *= 0.5  # half the time since the sample before the last one
         ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min(passed * period_s, most_s)
-    share += (1.0 - exp(-passed_s / TRACKER_MEMORY_S)) * ((1.0 if jumped else 0.0) - share)
+    passed_s = min(passed * parameters[0].period_s, most_s)
+    share += (1.0 - exp(-passed_s / parameters[0].tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
     state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
 
@@ -114,30 +100,33 @@ def has_jumped(
     """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
     than a hand can move and a tracker's noise explains:
 
-        |x - p| > max(jump + jump_speed * interval, JUMP_NOISE_STDS * noise standard deviation)
+        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
 
     `interval_s` is the time since the sample from which p was predicted.
     """
     state, config = states[0], parameters[0]
-    gate = max(config.jump + config.jump_speed * interval_s, JUMP_NOISE_STDS * math.sqrt(state.noise_variance[side]))
+    gate = max(
+        config.jump_m + config.jump_speed_mps * interval_s,
+        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
+    )
     return bool(squared_distance(position, expected) > gate * gate)
 
 
 @compiled
-def _turns_hard(states: Records, side: int, at: int, position: Vector, after_s: float, period_s: float) -> bool:
+def _turns_hard(states: Records, parameters: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
     """True if a hand at x_0 (3,) [m], h_0 after the retained sample x_1 at ring index `at`, which
-    followed x_2 after h_1, would have accelerated by at least TO_AND_FRO_MPS2:
+    followed x_2 after h_1, would have accelerated by at least to_and_fro_mps2:
 
-        |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= TO_AND_FRO_MPS2
+        |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= to_and_fro_mps2
 
     Intervals h are at least a period, also those within a tick.
     """
-    past, wanted = states[0].kept_past[side, at], 0.0
+    past, wanted, period_s = states[0].kept_past[side, at], 0.0, parameters[0].period_s
     after_s, before_s = max(after_s, period_s), max(states[0].kept_noise[side, at, 3], period_s)
     for axis in range(3):
         turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
         wanted += (2.0 * turned / (after_s + before_s)) ** 2
-    return wanted >= TO_AND_FRO_MPS2**2
+    return bool(wanted >= parameters[0].to_and_fro_mps2 ** 2)
 
 
 @compiled
@@ -161,11 +150,11 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     if near:
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
-        jumped = fresh and off > JOINT_JUMP_RAD + config.joint_jump_speed * passed_s
-        note(states, ARM, jumped, silent_s, config.period_s)
+        jumped = fresh and off > config.joint_jump_rad + config.joint_jump_speed * passed_s
+        note(states, parameters, ARM, jumped, silent_s)
         if jumped and cause < 0:
             cause = JUMPED
-    if near and (moved > ARM_STILL_RAD or not fresh):
+    if near and (moved > config.arm_still_rad or not fresh):
         state.arm_still_posture[:] = position
         state.arm_still_tick = state.tick
     if cause >= 0:
@@ -177,7 +166,12 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
 
 
 @compiled
-def _malformed(position: tuple[float, float, float], turn: tuple[float, float, float, float], in_base: Vector) -> int:
+def _malformed(
+    parameters: Records,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    in_base: Vector,
+) -> int:
     """Cause for which the pose itself is rejected: NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE; -1 if
     it is accepted. `in_base` (3,) [m] is the position in frame base.
     """
@@ -190,7 +184,8 @@ def _malformed(position: tuple[float, float, float], turn: tuple[float, float, f
         return NOT_FINITE
     if not abs(math.sqrt(norm) - 1.0) <= 0.01:
         return NOT_A_ROTATION
-    return -1 if far <= MAX_HAND_DISTANCE_M * MAX_HAND_DISTANCE_M else OUT_OF_RANGE
+    most_m = parameters[0].max_hand_distance_m
+    return -1 if far <= most_m * most_m else OUT_OF_RANGE
 
 
 @compiled
@@ -207,14 +202,14 @@ def _in_time(
     newest_ns, period_s = state.hand_stamps_ns[side], config.period_s
     passed_s = (state.tick - state.hand_ticks[side]) * period_s
     stale_s = state.stale_ticks[side] * period_s
-    cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.max_late_s)
+    cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.longest_late_s)
     if cause >= 0:
         return cause, 0, state.tick
-    if not fresh and (stamp_ns < newest_ns or not goes_on(states, side, in_base, config.unseen_ticks)):
+    if not fresh and (stamp_ns < newest_ns or not goes_on(states, parameters, side, in_base)):
         state.kept[side] = 0
     elif fresh and stamp_ns < newest_ns:
         order = order_of(states, side, stamp_ns)
-    late = ticks_late(states, side, stamp_ns, period_s, config.max_late_s)
+    late = ticks_late(states, side, stamp_ns, period_s, config.longest_late_s)
     if order >= KEPT - 1:
         return OLDER, 0, state.tick
     if order < 0:
@@ -240,14 +235,15 @@ def take_hand(
     `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
     `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
-    state, period_s, in_base = states[0], parameters[0].period_s, np.empty(3)
+    state, config, in_base = states[0], parameters[0], np.empty(3)
+    period_s = config.period_s
     for i in range(3):
         in_base[i] = frame[i, 3]
         for k in range(3):
             in_base[i] += frame[i, k] * position[k]
     fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
     jumped, order, made, wrong = False, 0, state.tick, 0
-    cause = _malformed(position, turn, in_base)
+    cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
         cause, order, made = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
         another = False
@@ -260,14 +256,14 @@ def take_hand(
             jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
             another = jumped and is_of_another(states, parameters, side, in_base, there)
             if jumped and not another and cause < 0 and order == 0:
-                wrong = wrong_samples(states, models, side, made, in_base)
-            if not another and order < state.kept[side] and state.contested[side] < TO_AND_FRO_MAX_SHARE:
+                wrong = wrong_samples(states, parameters, models, side, made, in_base)
+            if not another and order < state.kept[side] and state.contested[side] < config.to_and_fro_max_share:
                 # a higher share would only decay later
-                another = _turns_hard(states, side, at, in_base, passed_s, period_s)
-                another = another and is_to_and_fro(states, side, order, in_base)
+                another = _turns_hard(states, parameters, side, at, in_base, passed_s)
+                another = another and is_to_and_fro(states, parameters, side, order, in_base)
             jumped = jumped and wrong == 0
         if cause != REPEATED:
-            note(states, side, another, state.stale_ticks[side] * period_s, period_s)
+            note(states, parameters, side, another, state.stale_ticks[side] * period_s)
             if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
                 jumped = is_swapped(states, parameters, side, in_base)
         if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
@@ -284,7 +280,7 @@ def take_hand(
         note_clock(states, parameters, side, stamp_ns, fresh)
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
     if order == 0:
-        _note_correction(states, side, wrong, before, period_s)
+        _note_correction(states, parameters, side, wrong, before)
         state.jump_count[side] = state.jump_is_swap[side] = 0
         state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, frame)
@@ -294,21 +290,22 @@ def take_hand(
 
 
 @compiled
-def _note_correction(states: Records, side: int, wrong: int, before: Vector, period_s: float) -> None:
+def _note_correction(states: Records, parameters: Records, side: int, wrong: int, before: Vector) -> None:
     """Note how far a hand was moved when `wrong` samples were dropped, from the estimate `before`
     (3,) [m].
 
     Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
-    CONFIRMED_S, the hand may be as far away from it (`hand_doubt_m`).
+    confirmed_s, the hand may be as far away from it (`hand_doubt_m`).
     """
-    state = states[0]
+    state, config = states[0], parameters[0]
     if wrong > 0:
         moved = distance(before, state.hands[side, 0])
         state.hand_doubt_m[side] = max(state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO)
         state.corrected_tick[side], state.doubted_samples[side] = state.tick, CONFIRMED_SAMPLES
     elif state.doubted_samples[side] > 0:
         state.doubted_samples[side] -= 1
-    if state.doubted_samples[side] == 0 and (state.tick - state.corrected_tick[side]) * period_s >= CONFIRMED_S:
+    passed_s = (state.tick - state.corrected_tick[side]) * config.period_s
+    if state.doubted_samples[side] == 0 and passed_s >= config.confirmed_s:
         state.hand_doubt_m[side] = 0.0
 
 
@@ -345,5 +342,5 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
             known |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
         known |= CLUTCH_RELEASED
-    contested = is_contested(states, state.reason == TWO_SOURCES)
+    contested = is_contested(states, parameters, state.reason == TWO_SOURCES)
     return known | CONTESTED if contested else known

@@ -2,7 +2,7 @@
 
 The first two filters of the bank have no tremor, and the motions STEADY and CHANGE
 (`motion_model`). Each of the others has the motion STEADY and a tremor of one of the
-TREMOR_RATES_PER_S, so tremor is found at rest and in a reach. It is evident when the recent samples
+tremor_rates_per_s, so tremor is found at rest and in a reach. It is evident when the recent samples
 are much more probable with it than with any motion without one.
 
 The bank takes a sample when SETTLED_SAMPLES newer ones are retained: most late samples have been
@@ -20,105 +20,96 @@ from service.core.geometry import ROUND_TO
 from service.core.intake import BANK, MODES, NO_TREMOR, USUAL_RATE
 from service.core.intake.mode_filter import measure, move_on
 from service.core.intake.motion_model import CHANGE, REST, STEADY
-from service.core.intake.tuning import (
-    END_SHARE,
-    MAX_TREMOR_M,
-    NOISE_OUTLIER_SHARE,
-    OUTLIER_STDS,
-    START_SPEED_STD_MPS,
-    TRACKER_MEMORY_S,
-    TREMOR_RATES_PER_S,
-    TREMOR_STDS_M,
-)
 
 
 @compiled
-def no_tremor(states: Records, side: int) -> None:
+def no_tremor(states: Records, parameters: Records, side: int) -> None:
     """Set the tremor of one hand to that of a hand of which nothing is known: the usual rate, and
-    TREMOR_STDS_M.
+    tremor_stds_m.
     """
-    state = states[0]
+    state, config = states[0], parameters[0]
     state.trembles[side], state.tremor_rate[side] = 0, USUAL_RATE
-    state.tremors[side, 0] = TREMOR_RATES_PER_S[USUAL_RATE]
+    state.tremors[side, 0] = config.tremor_rates_per_s[USUAL_RATE]
     for mode in range(MODES):
-        state.tremors[side, 1 + mode] = TREMOR_STDS_M[mode] ** 2
+        state.tremors[side, 1 + mode] = config.tremor_stds_m[mode] ** 2
 
 
 @compiled
-def note_tremor(states: Records, models: Records, side: int, at: int, period_s: float) -> None:
+def note_tremor(states: Records, parameters: Records, models: Records, side: int, at: int) -> None:
     """Update the bank of one hand by the retained sample at ring index `at`, and the tremor of the
     hand's filter.
 
     The evidence of filter k relative to filter 0, with the likelihood L_k of the sample, and the
     square σ_k² of the amplitude of its tremor (y, w), after the interval Δ:
 
-        e_k = e_k exp(-Δ / TRACKER_MEMORY_S) + log L_k - log L_0
-        σ_k² = σ_k² + (1 - exp(-Δ / TRACKER_MEMORY_S)) (min(|y|² + |w|² / ω_k², y_max²) - σ_k²)
+        e_k = e_k exp(-Δ / tracker_memory_s) + log L_k - log L_0
+        σ_k² = σ_k² + (1 - exp(-Δ / tracker_memory_s)) (min(|y|² + |w|² / ω_k², y_max²) - σ_k²)
 
-    with y_max = MAX_TREMOR_M. |z|² / S in log L is at most NOISE_OUTLIER_SHARE: one outlier is no
+    with y_max = max_tremor_m. |z|² / S in log L is at most outlier_variances: one outlier is no
     evidence.
     """
-    state, position = states[0], states[0].kept_positions[side, at]
+    state, config, position = states[0], parameters[0], states[0].kept_positions[side, at]
     means, covariances, evidence = state.bank_means[side], state.bank_covariances[side], state.bank_evidence[side]
     ticks, noise = state.kept_ticks[side, at] - state.bank_ticks[side], state.noise_variance[side]
     if state.kept_stamps_ns[side, at] <= state.bank_stamps_ns[side] and 0 <= ticks < len(models):
         return
     state.bank_stamps_ns[side], state.bank_ticks[side] = state.kept_stamps_ns[side, at], state.kept_ticks[side, at]
     if not 0 <= ticks < len(models) or state.kept_restarts[side, at] > 0:
-        _start(means, covariances, noise, position)
+        _start(parameters, means, covariances, noise, position)
         return
-    fade, overs, null = exp(-ticks * period_s / TRACKER_MEMORY_S), models[ticks : ticks + 1], 0.0
+    fade, overs, null = exp(-ticks * config.period_s / config.tracker_memory_s), models[ticks : ticks + 1], 0.0
     for k in range(BANK):
         mean, covariance, rate = means[k], covariances[k], max(k - NO_TREMOR, 0)
         if ticks > 0:
-            driven = TREMOR_STDS_M[REST] ** 2 if k >= NO_TREMOR else 0.0
+            driven = config.tremor_stds_m[REST] ** 2 if k >= NO_TREMOR else 0.0
             move_on(mean, covariance, overs, CHANGE if k == 1 else STEADY, rate, driven)
         variance, error = measure(mean, covariance, noise, position)
-        likelihood = -1.5 * log(variance) - 0.5 * min(error, NOISE_OUTLIER_SHARE)
+        likelihood = -1.5 * log(variance) - 0.5 * min(error, config.outlier_variances)
         if k == 0:
             null = likelihood
         evidence[k] = np.rint((evidence[k] * fade + likelihood - null) * ROUND_TO) / ROUND_TO
         if k >= NO_TREMOR:
             amplitude = 0.0
             for axis in range(3):
-                amplitude += mean[3, axis] ** 2 + (mean[4, axis] / TREMOR_RATES_PER_S[rate]) ** 2
+                amplitude += mean[3, axis] ** 2 + (mean[4, axis] / config.tremor_rates_per_s[rate]) ** 2
             strength = state.bank_variances[side, rate]
-            strength += (1.0 - fade) * (min(amplitude, MAX_TREMOR_M**2) - strength)
+            strength += (1.0 - fade) * (min(amplitude, config.max_tremor_m**2) - strength)
             state.bank_variances[side, rate] = strength
-    _choose(states, side)
+    _choose(states, parameters, side)
 
 
 @compiled
-def _choose(states: Records, side: int) -> None:
+def _choose(states: Records, parameters: Records, side: int) -> None:
     """Set the tremor of one hand to that of the filter with the most evidence, max e_k, while it is
-    above -log LEAST_MODE_PROBABILITY, or above END_SHARE of that if the hand trembled already.
+    above -log least_mode_probability, or above end_share of that if the hand trembled already.
 
     The tremor's variance is then at least σ_k² in all modes.
     """
-    state, best = states[0], NO_TREMOR
+    state, config, best = states[0], parameters[0], NO_TREMOR
     for k in range(NO_TREMOR, BANK):
         if state.bank_evidence[side, k] > state.bank_evidence[side, best]:
             best = k
-    least = OUTLIER_STDS**2 * (END_SHARE if state.trembles[side] else 1.0)
-    no_tremor(states, side)
+    least = config.outlier_variances * (config.end_share if state.trembles[side] else 1.0)
+    no_tremor(states, parameters, side)
     if state.bank_evidence[side, best] - max(state.bank_evidence[side, 0], state.bank_evidence[side, 1]) > least:
         state.trembles[side], state.tremor_rate[side] = 1, best - NO_TREMOR
-        state.tremors[side, 0] = TREMOR_RATES_PER_S[best - NO_TREMOR]
+        state.tremors[side, 0] = config.tremor_rates_per_s[best - NO_TREMOR]
         for mode in range(MODES):
             variance = max(state.tremors[side, 1 + mode], state.bank_variances[side, best - NO_TREMOR])
             state.tremors[side, 1 + mode] = variance
 
 
 @compiled
-def _start(means: Vector, covariances: Vector, noise: float, position: Vector) -> None:
+def _start(parameters: Records, means: Vector, covariances: Vector, noise: float, position: Vector) -> None:
     """Start all filters of the bank from a sample (3,) [m] with noise variance r [m²]: mean
     (position, 0, 0, 0, 0), and covariance diag(r, σ_v², 0, σ², (ω σ)²), as `mode_filter.start`.
     """
+    config = parameters[0]
     means[:], covariances[:] = 0.0, 0.0
     for k in range(BANK):
         for axis in range(3):
             means[k, 0, axis] = position[axis]
-        covariances[k, 0, 0], covariances[k, 1, 1] = noise, START_SPEED_STD_MPS**2
+        covariances[k, 0, 0], covariances[k, 1, 1] = noise, config.start_speed_std_mps**2
         if k >= NO_TREMOR:
-            covariances[k, 3, 3] = TREMOR_STDS_M[REST] ** 2
-            covariances[k, 4, 4] = (TREMOR_STDS_M[REST] * TREMOR_RATES_PER_S[k - NO_TREMOR]) ** 2
+            covariances[k, 3, 3] = config.tremor_stds_m[REST] ** 2
+            covariances[k, 4, 4] = (config.tremor_stds_m[REST] * config.tremor_rates_per_s[k - NO_TREMOR]) ** 2

@@ -32,9 +32,9 @@ from service.core.limiter.step import (
     step,
     take,
 )
-from service.core.limiter.tuning import STOP_SPEED_SHARE
 from service.core.separation.stage import Separation
 from service.core.stops import stop_together
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import JointSettings, Settings
 
 
@@ -189,8 +189,10 @@ class Moved(NamedTuple):
 class LimiterStage:
     """Joints of the state (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
 
-    def __init__(self, settings: Settings, arm: Arm) -> None:
+    def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
         self._arm, self._max_speed = arm, settings.tool.max_speed
+        # Speed above which the joints stop: midway between that of closing in and max_speed.
+        self._stop_speed = 0.5 * (1.0 + tuning.arm.tool_speed_share) * self._max_speed
         self._limiter = Limiter(settings.joints, settings.period_s)
         self._jerk = np.array(settings.joints.jerk)
 
@@ -221,7 +223,7 @@ class LimiterStage:
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
         here, excess_speed = self._arm.at(moved.position), 0.0
-        if self._largest_speed_in_stop(moved, here) > STOP_SPEED_SHARE * self._max_speed:
+        if self._largest_speed_in_stop(moved, here) > self._stop_speed:
             moved, limited = self._limiter.stop(*state["joints"]), True
             here = self._arm.at(moved.position)
             speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
@@ -269,6 +271,6 @@ class LimiterStage:
         """
         _, speed, total = tool_speeds(here.record, *moved[1:3], self._jerk)
         most = self._max_speed
-        if speed <= STOP_SPEED_SHARE * most and total > most:
+        if speed <= self._stop_speed and total > most:
             return max(float(speed), self._limiter.speed_in_stop(moved, here))
         return float(speed)

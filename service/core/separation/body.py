@@ -16,14 +16,14 @@ import numpy as np
 from service.core.frame import Records, Vector, structured
 from service.core.geometry import CAPSULE, between_segments, place, rotation
 from service.core.numerics import CAPSULE_FITS, TOLERANCE
-from service.core.separation.tuning import CAPSULE_EXCESS_M, OWN_CLEARANCE_M
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings
 from service.settings.urdf import Shape, Urdf, UrdfJoint
 
 
-def own_clearance(settings: Settings) -> float:
-    """Distance [m] kept between parts of the arm."""
-    return min(settings.obstacles.clearance, OWN_CLEARANCE_M)
+def own_clearance(settings: Settings, tuning: Tuning = TUNING) -> float:
+    """Distance [m] kept between parts of the arm; more would keep it from folding."""
+    return min(settings.obstacles.clearance, tuning.separation.planned_margin_m)
 
 
 class Body(NamedTuple):
@@ -43,13 +43,13 @@ class Body(NamedTuple):
     pairs: Any
 
 
-def body_of(settings: Settings, description: str) -> Body:
+def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Body:
     """Body of the arm that a URDF describes, with the tool on its plate.
 
     Capsules of links that do not follow each other are kept apart. Left out are pairs that the
     joints cannot move against each other, and pairs that belong together: in the configured posture
     they are nearer than the arm's own clearance or, around meshes with one link between them, than
-    this clearance and CAPSULE_EXCESS_M.
+    this clearance and planned_margin_m, as capsules exceed meshes by about as much.
     """
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
@@ -88,8 +88,8 @@ def body_of(settings: Settings, description: str) -> Body:
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
             apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
-            over = CAPSULE_EXCESS_M if meshes and links[j] - links[i] == 2 else 0.0
-            if apart[0] > own_clearance(settings) + over and np.ptp(apart) > TOLERANCE:
+            over = tuning.separation.planned_margin_m if meshes and links[j] - links[i] == 2 else 0.0
+            if apart[0] > own_clearance(settings, tuning) + over and np.ptp(apart) > TOLERANCE:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 

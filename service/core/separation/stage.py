@@ -24,15 +24,7 @@ from service.core.separation import FARTHEST_REPORTED_M, TABLE_DEPTH_M
 from service.core.separation.body import body_of, own_clearance
 from service.core.separation.clearance import NOBODY, clearance
 from service.core.separation.step import excess_of, share_of, step
-from service.core.separation.tuning import (
-    LOOKAHEAD_S,
-    PLANNED_BRAKE_LIMITS,
-    PLANNED_BRAKE_SHARE,
-    PLANNED_MARGIN_M,
-    PLANNED_REACTION_S,
-    TREMOR_SPEED_MPS,
-    UNKNOWN_SPEED_MPS,
-)
+from service.core.tuning import TUNING, Tuning
 from service.core.vectors import times
 from service.settings.config import Settings
 
@@ -49,9 +41,10 @@ class Separation:
     follow.
     """
 
-    def __init__(self, settings: Settings, urdf: str) -> None:
+    def __init__(self, settings: Settings, urdf: str, *, tuning: Tuning = TUNING) -> None:
+        numbers = tuning.separation
         people, things, table, limits = settings.people, settings.obstacles, settings.table, settings.joints
-        body = body_of(settings, urdf)
+        body = body_of(settings, urdf, tuning)
         self.max_speed = float(body.capsules["max_speed"].max())
         centre, half = np.array(table.centre), np.array([*table.half_size, 0.0])
         boxes = [[centre - half - [0.0, 0.0, TABLE_DEPTH_M], centre + half]]
@@ -61,19 +54,36 @@ class Separation:
         direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake, things.brake])
         late_s = things.reaction_ms / 1000
         reaction_s = np.array([(settings.hands.longest_stale_ms + people.reaction_ms) / 1000, late_s, late_s])
+        lookahead_s = 0.5 * numbers.brake_ramp_s * np.arange(5.0)
         self._parameters = parameters(
             brake=brake,
             reaction_s=reaction_s,
-            planned_brake=PLANNED_BRAKE_SHARE
-            * np.minimum(brake, PLANNED_BRAKE_LIMITS * settings.tool.stop_acceleration),
-            planned_reaction_s=np.maximum(reaction_s, PLANNED_REACTION_S),
-            clearance=np.array([people.clearance, things.clearance, own_clearance(settings)]),
-            planned_margin=PLANNED_MARGIN_M,
+            planned_brake=numbers.planned_brake_share
+            * np.minimum(brake, np.array(numbers.planned_brake_limits) * settings.tool.stop_acceleration),
+            planned_reaction_s=np.maximum(reaction_s, numbers.planned_reaction_s),
+            clearance=np.array([people.clearance, things.clearance, own_clearance(settings, tuning)]),
+            planned_margin=numbers.planned_margin_m,
+            planned_brake_share=numbers.planned_brake_share,
+            clearance_gain_per_s=numbers.clearance_gain_per_s,
+            slip_speed_mps=numbers.slip_speed_mps,
+            retreat_speed_mps=2.0 * numbers.slip_speed_mps,
+            # A part returns only if the joints, unstrained, can move it at this speed.
+            retreat_authority_mps=5.0 * (2.0 * numbers.slip_speed_mps),
+            # Inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this
+            # depth: the arm slips by as much in a reaction time.
+            slip_depth_m=numbers.slip_speed_mps * numbers.planned_reaction_s,
+            brake_ramp_s=numbers.brake_ramp_s,  # and the time constant with which a hand's acceleration fades
+            lookahead_s=lookahead_s,
+            # A hand approaches at `unknown_speed` until its velocity is better known than after
+            # its first sample.
+            unknown_velocity_std_mps=2.0 * tuning.intake.start_speed_std_mps / 3.0,
+            unseen_acceleration_mps2=numbers.unseen_acceleration_mps2,
+            contact_margin_m=numbers.contact_margin_m,
             contact_speed=float(people.contact_speed),
-            unknown_speed=UNKNOWN_SPEED_MPS,
+            unknown_speed=numbers.unknown_speed_mps,
             unseen_s=np.array([settings.hands.longest_stale_ms, settings.hands.unseen_ms]) / 1000,
             period_s=settings.period_s,
-            tremor_speed=TREMOR_SPEED_MPS,
+            tremor_speed=numbers.tremor_speed_mps,
             hand_radius=float(people.radius),
             forearm=people.length / np.linalg.norm(direction) * direction,
             frames=body.frames,
@@ -84,7 +94,7 @@ class Separation:
         self._bare = self._parameters.copy()
         self._bare["clearance"] = 0.0
         capsules, joints = len(body.capsules), len(limits.names)
-        most = 2 * capsules * len(LOOKAHEAD_S) + 3 * capsules * len(boxes) + len(body.pairs)
+        most = 2 * capsules * len(lookahead_s) + 3 * capsules * len(boxes) + len(body.pairs)
         self._jerk, self._weights = np.array(limits.jerk), np.square(limits.acceleration)
         self.constraints = self.constraints_for(joints, most)
         self._contacts = structured(0, CONTACT)
@@ -141,7 +151,7 @@ class Separation:
 
     def share(self, velocity: Vector) -> float:
         """Largest share, at most 1, of joint velocities (J,) that keeps all planned limits."""
-        return float(share_of(self.constraints, self.count, velocity))
+        return float(share_of(self.constraints, self.count, velocity, self._parameters))
 
     def excess(self, velocity: Vector, acceleration: Vector) -> float:
         """Largest excess [m/s] over the `allowed` limits at this motion of the joints.

@@ -12,20 +12,6 @@ from service.core.frame import Records, Vector
 from service.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
 from service.core.separation import FARTHEST_REPORTED_M
 from service.core.separation.clearance import ITSELF, PEOPLE, THINGS
-from service.core.separation.tuning import (
-    BRAKE_RAMP_S,
-    CLEARANCE_GAIN_PER_S,
-    CONTACT_MARGIN_M,
-    HAND_ACCELERATION_FADE_S,
-    LOOKAHEAD_S,
-    PLANNED_BRAKE_SHARE,
-    RETREAT_AUTHORITY_MPS,
-    RETREAT_SPEED_MPS,
-    SLIP_DEPTH_M,
-    SLIP_SPEED_MPS,
-    UNKNOWN_VELOCITY_STD_MPS,
-    UNSEEN_ACCELERATION_MPS2,
-)
 from service.core.vectors import norm
 
 
@@ -64,7 +50,7 @@ def step(
 
     where p2 of a hand or a box does not depend on q. With s = `allowed_speed`, the limits are
 
-        hands           allowed = max(contact, s(d, u)) + braked + SLIP_SPEED_MPS
+        hands           allowed = max(contact, s(d, u)) + braked + slip_speed_mps
                         planned = `_planned`(d, u)
         boxes, itself   `_limit`
 
@@ -72,16 +58,16 @@ def step(
     was just seen. contact is contact_speed for the tool's part near a hand that may be touched,
     else 0.
 
-    A moving hand is also evaluated at the times h = moving LOOKAHEAD_S, with moving = `_swiftness`
-    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = HAND_ACCELERATION_FADE_S,
+    A moving hand is also evaluated at the times h = moving lookahead_s, with moving = `_swiftness`
+    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = brake_ramp_s,
     at
 
         p + h v + τ (h - f) a,    with the velocity v + f a,    f = τ (1 - exp(-h / τ))
 
-    braked = brake max(h - BRAKE_RAMP_S, 0) is the speed [m/s] that the arm can brake until then.
+    braked = brake max(h - brake_ramp_s, 0) is the speed [m/s] that the arm can brake until then.
 
     A hand that has been out of sight for t seconds longer than it may be is assumed to accelerate
-    toward the arm by g = UNSEEN_ACCELERATION_MPS2 during t: u grows by w = min(g t, unknown_speed),
+    toward the arm by g = unseen_acceleration_mps2 during t: u grows by w = min(g t, unknown_speed),
     d shrinks by w (t - w / 2g). After a correction, d also shrinks by `hand_doubt_m`, and u is
     unknown_speed.
 
@@ -104,30 +90,30 @@ def step(
             variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
         doubt = state.hand_doubt_m[side]
         known, receives = (
-            variance <= UNKNOWN_VELOCITY_STD_MPS * UNKNOWN_VELOCITY_STD_MPS and doubt == 0.0,
-            _receives(contacts, state.hands, side),
+            variance <= config.unknown_velocity_std_mps * config.unknown_velocity_std_mps and doubt == 0.0,
+            _receives(contacts, state.hands, side, config.contact_margin_m),
         )
         age_s = (state.tick - state.hand_ticks[side]) * config.period_s
         # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
         unseen_s = age_s - config.unseen_s[0] if config.unseen_s[0] < age_s < config.unseen_s[1] else 0.0
-        speed_up = min(UNSEEN_ACCELERATION_MPS2 * unseen_s, config.unknown_speed)
-        nearer = doubt + speed_up * (unseen_s - 0.5 * speed_up / UNSEEN_ACCELERATION_MPS2)
+        speed_up = min(config.unseen_acceleration_mps2 * unseen_s, config.unknown_speed)
+        nearer = doubt + speed_up * (unseen_s - 0.5 * speed_up / config.unseen_acceleration_mps2)
         moment = _swiftness(state.hands[side, 1], config.tremor_speed) if known else 0.0
-        for k in range(len(LOOKAHEAD_S) if moment > 0.0 else 1):
-            ahead = moment * LOOKAHEAD_S[k]
+        for k in range(len(config.lookahead_s) if moment > 0.0 else 1):
+            ahead = moment * config.lookahead_s[k]
             parts = now if k == 0 else then
             if k > 0:
                 for j in range(joints):
                     later[j] = here.joints[j] + ahead * state.joints[1, j]
                 place(later, config.frames, config.axes, capsules, then)
-            faster = HAND_ACCELERATION_FADE_S * (1.0 - exp(-ahead / HAND_ACCELERATION_FADE_S))
+            faster = config.brake_ramp_s * (1.0 - exp(-ahead / config.brake_ramp_s))
             for i in range(3):
                 v, a = state.hands[side, 1, i], state.hands[side, 2, i]
                 velocity[i] = v + faster * a
-                moved = ahead * v + HAND_ACCELERATION_FADE_S * (ahead - faster) * a
+                moved = ahead * v + config.brake_ramp_s * (ahead - faster) * a
                 forearm[0, i] = state.hands[side, 0, i] + moved
                 forearm[1, i] = forearm[0, i] + config.forearm[i]
-            braked = config.brake[PEOPLE] * max(ahead - BRAKE_RAMP_S, 0.0)
+            braked = config.brake[PEOPLE] * max(ahead - config.brake_ramp_s, 0.0)
             for capsule in range(config.first, len(capsules)):
                 part, constraint = capsules[capsule], constraints[count]
                 distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
@@ -146,7 +132,7 @@ def step(
                 if planned < part.max_speed:
                     constraint.planned = planned
                     constraint.allowed = (
-                        max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + SLIP_SPEED_MPS
+                        max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + config.slip_speed_mps
                     )
                     if k > 0:
                         carry_back(near, then[capsule], now[capsule])
@@ -192,14 +178,15 @@ def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> 
 def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
     """Speed [m/s] that motion is planned with: lower than what the rule allows.
 
-        max(PLANNED_BRAKE_SHARE least, allowed_speed) + PLANNED_BRAKE_SHARE braked
+        max(planned_brake_share least, allowed_speed) + planned_brake_share braked
 
     with the planned brake and reaction time, and with the planned margin added to the clearance.
     """
     config = parameters[0]
     brake, reaction_s = config.planned_brake[rule], config.planned_reaction_s[rule]
     planned = allowed_speed(distance, coming, brake, reaction_s, config.clearance[rule] + config.planned_margin)
-    return max(PLANNED_BRAKE_SHARE * least, planned) + PLANNED_BRAKE_SHARE * braked
+    share: float = config.planned_brake_share
+    return max(share * least, planned) + share * braked
 
 
 @compiled
@@ -207,18 +194,18 @@ def _limit(constraints: Records, k: int, parameters: Records, rule: int, distanc
     """Set the limits of constraint k to a thing or another part; return the planned speed [m/s].
 
         left    = distance - clearance
-        allowed = allowed_speed(distance) + SLIP_SPEED_MPS min(max(1 + left / SLIP_DEPTH_M, 0.1), 1)
-        planned = min(planned, max(CLEARANCE_GAIN_PER_S left, -RETREAT_SPEED_MPS))
+        allowed = allowed_speed(distance) + slip_speed_mps min(max(1 + left / slip_depth_m, 0.1), 1)
+        planned = min(planned, max(clearance_gain_per_s left, -retreat_speed_mps))
 
     Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
-    move them at RETREAT_AUTHORITY_MPS.
+    move them at retreat_authority_mps.
     """
     config, constraint = parameters[0], constraints[k]
     left = distance - config.clearance[rule]
-    slip = min(max(1.0 + left / SLIP_DEPTH_M, 0.1), 1.0) * SLIP_SPEED_MPS
+    slip = min(max(1.0 + left / config.slip_depth_m, 0.1), 1.0) * config.slip_speed_mps
     constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
-    planned = min(planned, max(CLEARANCE_GAIN_PER_S * left, -RETREAT_SPEED_MPS))
-    if planned < 0.0 and not _may_pass(constraints, k, RETREAT_AUTHORITY_MPS, config.max_velocity):
+    planned = min(planned, max(config.clearance_gain_per_s * left, -config.retreat_speed_mps))
+    if planned < 0.0 and not _may_pass(constraints, k, config.retreat_authority_mps, config.max_velocity):
         planned = 0.0
     constraint.planned = planned
     return planned
@@ -251,10 +238,10 @@ def _share(near: Vector, limit: float, velocity: Vector) -> float:
 
 
 @compiled
-def _receives(contacts: Records, hands: Vector, side: int) -> bool:
+def _receives(contacts: Records, hands: Vector, side: int, margin_m: float) -> bool:
     """True if the hands are at a via-point where the tool goes with the hand of this side.
 
-    Each coordinate of both hands is within the via-point's radius and CONTACT_MARGIN_M.
+    Each coordinate of both hands is within the via-point's radius and `margin_m`.
     """
     for contact in contacts:
         if contact.side == side:
@@ -262,7 +249,7 @@ def _receives(contacts: Records, hands: Vector, side: int) -> bool:
             for hand in range(2):
                 for i in range(3):
                     far = max(far, abs(hands[hand, 0, i] - contact.hands[hand, i]))
-            if far <= contact.radius + CONTACT_MARGIN_M:
+            if far <= contact.radius + margin_m:
                 return True
     return False
 
@@ -292,17 +279,17 @@ def _bring_together(
 
 
 @compiled
-def share_of(constraints: Records, count: int, velocity: Vector) -> float:
+def share_of(constraints: Records, count: int, velocity: Vector, parameters: Records) -> float:
     """Largest share, at most 1, of joint velocities (J,) that keeps all planned limits.
 
-    min over k of max(planned_k, SLIP_SPEED_MPS / 2) / (row_k · velocity)
+    min over k of max(planned_k, slip_speed_mps / 2) / (row_k · velocity)
     """
     share = 1.0
     for k in range(count):
         speed = 0.0
         for j in range(len(velocity)):
             speed += constraints[k].row[j] * velocity[j]
-        limit = max(constraints[k].planned, 0.5 * SLIP_SPEED_MPS)
+        limit = max(constraints[k].planned, 0.5 * parameters[0].slip_speed_mps)
         if speed > limit:
             share = min(share, limit / speed)
     return share

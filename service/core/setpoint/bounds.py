@@ -6,7 +6,7 @@ docs/bounds.md proves what these bounds guarantee. Its symbols are used here, on
     V         limit of the norm of the velocity: max_speed, or engaging_speed while it engages
     Â, Ĵ      max_acceleration and max_jerk, limits of the norms of acceleration and jerk
     A, J      stop_acceleration and stop_jerk, limits of a stop on each axis
-    ρ         0.06 V, speed at which a setpoint beyond a bound returns (RETURN_SHARE)
+    ρ         0.06 V, speed at which a setpoint beyond a bound returns (return_share)
     π(v, a)   largest displacement [m] along the fastest stop from v, a within A and J
     top       x + π(v, a), the farthest position of the fastest stop
     P         x + π(v + ρ, a), the same for the fastest change to -ρ, in a frame that moves at -ρ
@@ -36,7 +36,6 @@ from service.core.codes import (
 from service.core.frame import Records, Vector
 from service.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.tuning import HULL_MARGIN_M, RETURN_SHARE
 from service.core.stops import fastest_stop
 from service.core.vectors import distance, norm, square, squared_distance
 
@@ -75,26 +74,27 @@ def bounds_around(
     Returns the number of targets in the newest span.
     """
     ticks = remember(hull, ticks, position, parameters[0].span_ticks)
-    bounds(hull, box, parameters[0].lowest, low, high)
+    bounds(hull, box, parameters, low, high)
     return ticks
 
 
 @compiled
-def bounds(hull: Vector, box: Vector, lowest: Vector, low: Vector, high: Vector) -> None:
+def bounds(hull: Vector, box: Vector, parameters: Records, low: Vector, high: Vector) -> None:
     """Write the setpoint's bounds low and high (3,) [m], from the last targets and the workspace.
 
-        low  = max(box[0], lowest, smallest target - HULL_MARGIN_M)
-        high = min(box[1],         largest target  + HULL_MARGIN_M)
+        low  = max(box[0], lowest, smallest target - hull_margin_m)
+        high = min(box[1],         largest target  + hull_margin_m)
 
     `hull` (HULL_SPANS, 2, 3): smallest and largest target of each span. `box` (2, 3): lower and
     upper corner of the workspace. `lowest` (3,): planes of the reach, -inf for none.
     """
+    config = parameters[0]
     for axis in range(3):
         least, greatest = hull[0, 0, axis], hull[0, 1, axis]
         for span in range(1, HULL_SPANS):
             least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
-        low[axis] = max(box[0, axis], lowest[axis], least - HULL_MARGIN_M)
-        high[axis] = min(box[1, axis], greatest + HULL_MARGIN_M)
+        low[axis] = max(box[0, axis], config.lowest[axis], least - config.hull_margin_m)
+        high[axis] = min(box[1, axis], greatest + config.hull_margin_m)
 
 
 @compiled
@@ -122,7 +122,7 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
     if distance(setpoint[2], before[2]) > (config.max_jerk + 1e-6) * config.period_s:
         return JERK_BOUND
     low, high = np.empty(3), np.empty(3)
-    bounds(hull, box, config.lowest, low, high)
+    bounds(hull, box, parameters, low, high)
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - longest_stop:
             return POSITION_BOUND
@@ -152,7 +152,7 @@ def take_safe(
     """
     config = parameters[0]
     max_speed, max_acceleration, max_jerk = config.max_speed, config.stop_acceleration, config.stop_jerk
-    return_speed = RETURN_SHARE * max_speed
+    return_speed = config.return_share * max_speed
     max_joint_cost = 0.0
     for i in range(3):
         for joint in range(costs.shape[2]):

@@ -10,7 +10,7 @@ from kmp.compiled import compiled
 from service.core.frame import Record, Records, Vector, as_array, parameters
 from service.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
 from service.core.numerics import ROUNDING
-from service.core.setpoint.tuning import ORIENTATION_GAIN_PER_S, PLANNED_BRAKE_SHARE, PLANNED_SPEED_SHARE
+from service.core.tuning import TUNING, Tuning
 from service.core.vectors import dot, norm
 from service.settings.config import Settings
 
@@ -18,11 +18,14 @@ from service.settings.config import Settings
 class OrientationSetpoint:
     """Orientation setpoint of the state: a quaternion (4,) and an angular velocity (3,) [rad/s]."""
 
-    def __init__(self, settings: Settings) -> None:
-        tool = settings.tool
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        tool, numbers = settings.tool, tuning.arm
+        speed_share, brake_share, _ = numbers.planned_limit_shares
         self._parameters = parameters(
-            max_speed=PLANNED_SPEED_SHARE * tool.max_turn_speed,
+            max_speed=speed_share * tool.max_turn_speed,
             max_acceleration=float(tool.max_turn_acceleration),
+            planned_brake_share=brake_share,
+            gain=numbers.turn_gain_share * numbers.position_gain_per_s,  # as of quick joints
             about=int(tool.orientation == "full"),
             period_s=settings.period_s,
         )
@@ -77,8 +80,8 @@ def turn_orientation(
         along = dot(target_turning, axis)
     angle = norm(error)
     # rate is constant for small errors; for large ones the turn ends at constant deceleration
-    brake, rate = PLANNED_BRAKE_SHARE * config.max_acceleration, ORIENTATION_GAIN_PER_S
-    near = brake / ORIENTATION_GAIN_PER_S**2
+    brake, rate = config.planned_brake_share * config.max_acceleration, config.gain
+    near = brake / config.gain**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
     for i in range(3):

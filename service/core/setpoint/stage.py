@@ -13,10 +13,10 @@ A step is taken only if the stop after it keeps every limit. Otherwise the setpo
 that the step before has checked. So these limits hold by induction, whatever the target does:
 
 * the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
-* after a start or a hold, until the setpoint is within ENGAGED_GAP_M of its target, the norm of its
+* after a start or a hold, until the setpoint is within stuck_gap_m of its target, the norm of its
   speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
 * the setpoint stays inside the workspace, and within HULL_MARGIN_M of the box around the targets of
-  the last HULL_TIME_S. If that box has moved away, or if following began outside of it, the
+  the last hull_time_s. If that box has moved away, or if following began outside of it, the
   setpoint returns at RETURN_SHARE of max_speed or faster. docs/bounds.md has the proof.
 """
 
@@ -35,9 +35,9 @@ from service.core.setpoint.bounds import broken_bound, farthest
 from service.core.setpoint.orientation import OrientationSetpoint
 from service.core.setpoint.step import finish, lead, ready, write
 from service.core.setpoint.tracker import gains_for, waiting
-from service.core.setpoint.tuning import ENGAGED_GAP_M, GAP_STOPPED_M, GAP_WAITING_M, HULL_TIME_S
 from service.core.skill.model import Target, Wanted
 from service.core.skill.pose import NO_GRIPPER, decided
+from service.core.tuning import TUNING, Tuning
 from service.core.vectors import times
 from service.settings.config import Settings
 
@@ -45,13 +45,15 @@ from service.settings.config import Settings
 class SetpointGenerator:
     """Position setpoint of the state (3, 3): position, velocity and acceleration; by axis."""
 
-    def __init__(self, settings: Settings) -> None:
-        tool, reach = settings.tool, settings.reach
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        tool, reach, numbers = settings.tool, settings.reach, tuning.setpoint
         # [m] a stop at full braking, and one second at max_speed: no stop from outside takes more
         longest_stop = 0.5 * tool.max_speed * tool.max_speed / tool.stop_acceleration + 1.0 * tool.max_speed
+        # Of the tool's limits, and again of the joints', which `joint_costs` has reduced already.
+        speed_share, brake_share, jerk_share = tuning.arm.planned_limit_shares
         self._parameters = parameters(
             period_s=settings.period_s,
-            gains=gains_for(settings),
+            gains=gains_for(settings, tuning),
             max_speed=float(tool.max_speed),
             max_acceleration=tool.acceleration,
             max_jerk=tool.jerk,
@@ -60,11 +62,27 @@ class SetpointGenerator:
             stop_room=tool.room,
             longest_stop=longest_stop,
             lowest=np.array([reach.min_x, -np.inf, reach.min_z]),
-            span_ticks=max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)),
+            span_ticks=max(1, round(numbers.hull_time_s / (HULL_SPANS - 1) / settings.period_s)),
+            **numbers._asdict(),
+            gap_free_m=numbers.gap_free_m,
+            # A planned stop uses at most the tracker's jerk for this error, or it oscillates.
+            stop_jerk_error_m=numbers.hull_margin_m,
+            # The setpoint may stop this far beyond the hands' stop: noise moves resting targets.
+            stop_overshoot_m=2.0 * tuning.intake.least_noise_m,
+            planned_speed_share=speed_share,
+            planned_brake_share=brake_share,
+            # To meet a target that brakes too, the share of the jerk that planning leaves.
+            meeting_brake_least_share=1.0 - jerk_share,
+            barrier_rate_per_s=tuning.arm.position_gain_per_s,  # as the tool closes in on its setpoint
+            # In long periods, where the prediction over one period is less accurate.
+            barrier_time_s=1.0 / (6.0 * tuning.arm.position_gain_per_s),
+            # Progress that is expected of a tool, from up to 0.75 stuck_s of max_speed away.
+            return_share=0.75 * tuning.decision.progress_share,
         )
         self._engaging = self._parameters.copy()
         self._engaging["max_speed"] = tool.engaging_speed
         self._engages = tool.engaging_speed < tool.max_speed
+        self._engaged_gap_m = tuning.decision.stuck_gap_m
 
     def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
         """Start from the motion of the tool (3, 3), which becomes the only known target.
@@ -81,8 +99,10 @@ class SetpointGenerator:
         return self._engaging if as_array(state)["engaging"][0] else self._parameters
 
     def engage(self, state: Record, target: Vector) -> None:
-        """End the engaging of a setpoint that is within ENGAGED_GAP_M of its target (3,) [m]."""
-        if as_array(state)["engaging"][0] and math.dist(target.tolist(), state["setpoint"][0].tolist()) < ENGAGED_GAP_M:
+        """End the engaging of a setpoint that is within stuck_gap_m of its target (3,) [m]."""
+        if not as_array(state)["engaging"][0]:
+            return
+        if math.dist(target.tolist(), state["setpoint"][0].tolist()) < self._engaged_gap_m:
             state["engaging"] = 0
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
@@ -121,11 +141,14 @@ class SetpointGenerator:
 class SetpointStage:
     """Position and orientation setpoints and gripper, in the box (2, 3) [m] of the active skill."""
 
-    def __init__(self, settings: Settings, arm: Arm) -> None:
+    def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
         self._arm, self._period_s = arm, settings.period_s
+        self._gap_waiting_m = tuning.setpoint.gap_waiting_m
+        self._gap_stopped_m = tuning.setpoint.gap_stopped_m
         self._takes_wishes = settings.hands.gripper == "key"
         self._costs = np.empty((3, 3, len(settings.joints.names)))
-        self._position, self._orientation = SetpointGenerator(settings), OrientationSetpoint(settings)
+        self._position = SetpointGenerator(settings, tuning=tuning)
+        self._orientation = OrientationSetpoint(settings, tuning=tuning)
 
     def begin(self, state: Record, frame: Record, here: Kinematics, *, engages: bool = True) -> None:
         """Start the setpoints where the commanded joints place the tool, at the tool's velocity."""
@@ -145,9 +168,10 @@ class SetpointStage:
         self._position.engage(state, target.position)
         limits = self._position.limits(state)
         slow, gap_m = ready(states, here.record, self._arm.parameters, limits, share, self._costs)
-        if gap_m > GAP_WAITING_M:
-            target = waiting(target, state["setpoint"], tool)
-        if gap_m > GAP_STOPPED_M:
+        if gap_m > self._gap_waiting_m:
+            gaps_m = self._gap_waiting_m, self._gap_stopped_m
+            target = waiting(target, state["setpoint"], tool, gaps_m)
+        if gap_m > self._gap_stopped_m:
             box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
         closure = float(states["closure"][0])

@@ -13,39 +13,27 @@ from service.core.kinematics import joint_costs
 from service.core.numerics import LEAST_SPEED_MPS
 from service.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
 from service.core.setpoint.orientation import turn_orientation
-from service.core.setpoint.tuning import (
-    BARRIER_RATE_PER_S,
-    BARRIER_TIME_S,
-    DECELERATION_LOOKAHEAD_S,
-    GAP_FREE_M,
-    GAP_SLOW_M,
-    HAND_BRAKE_MPS2,
-    MEETING_BRAKE_LEAST_SHARE,
-    PLANNED_BRAKE_SHARE,
-    PLANNED_SPEED_SHARE,
-    STOP_JERK_ERROR_M,
-    STOP_OVERSHOOT_M,
-)
 from service.core.vectors import distance, norm
 
 
 @compiled
-def slow_down(setpoint: Vector, tool: Vector, share: float, max_speed: float) -> float:
+def slow_down(setpoint: Vector, tool: Vector, share: float, parameters: Records) -> float:
     """Share of max_speed [m/s] that a setpoint (3, 3) may use while its tool (3,) [m] is behind.
 
-        1 / (1 + max(0, |setpoint - tool| - GAP_FREE_M) / GAP_SLOW_M)
+        1 / (1 + max(0, |setpoint - tool| - gap_free_m) / gap_slow_m)
 
     It is 1 if the setpoint moves toward its tool. If separation allows only a share < 1 of the
     setpoint's speed, the result is at most share |v| / max_speed.
     """
+    config = parameters[0]
     along = gap = 0.0
     for i in range(3):
         ahead = setpoint[0, i] - tool[i]
         along += ahead * setpoint[1, i]
         gap += ahead * ahead
-    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - GAP_FREE_M) / GAP_SLOW_M)
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - config.gap_free_m) / config.gap_slow_m)
     if share < 1.0:
-        slow = min(slow, share * norm(setpoint[1]) / max_speed)
+        slow = min(slow, share * norm(setpoint[1]) / config.max_speed)
     return slow
 
 
@@ -112,13 +100,13 @@ def _track(
         top       speed that is planned with, `slow` times the limit of tool and joints
 
         stop      h = w + o - stop_distance(v, a, B, C)
-                  o    = STOP_OVERSHOOT_M + stop_room v_p² / (2 HAND_BRAKE_MPS2)
-                  v_p  = max(0, v_t + DECELERATION_LOOKAHEAD_S min(a_t, 0))    predicted speed
-        meeting   h = w + STOP_OVERSHOOT_M - stop_distance(v - v_t, a - a_t, M, C)
-                  M = max(B + min(a_t, 0), MEETING_BRAKE_LEAST_SHARE B)
+                  o    = stop_overshoot_m + stop_room v_p² / (2 hand_brake_mps2)
+                  v_p  = max(0, v_t + deceleration_lookahead_s min(a_t, 0))    predicted speed
+        meeting   h = w + stop_overshoot_m - stop_distance(v - v_t, a - a_t, M, C)
+                  M = max(B + min(a_t, 0), meeting_brake_least_share B)
         speed     h = top - (v + a |a| / 2C)
 
-        retained = 1 - min(BARRIER_RATE_PER_S dt, BARRIER_TIME_S / dt)
+        retained = 1 - min(barrier_rate_per_s dt, barrier_time_s / dt)
 
     In the stop, w grows by min(v_p, v) dt in a period. The meeting applies only while the setpoint
     is faster than its target. The jerk is at least -C and, for stop and meeting, at least the one
@@ -149,25 +137,27 @@ def _track(
         distance += along[i] * (target[0, i] - setpoint[0, i])
         v_target += along[i] * feasible * target[1, i]
         a_target += along[i] * target[2, i]
-    brake = PLANNED_BRAKE_SHARE * min(config.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
-    change = PLANNED_BRAKE_SHARE * min(config.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
-    change = min(change, STOP_JERK_ERROR_M * gains[0])
-    top = slow * PLANNED_SPEED_SHARE * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
-    predicted_speed = max(0.0, v_target + DECELERATION_LOOKAHEAD_S * min(a_target, 0.0))
-    overshoot = STOP_OVERSHOOT_M + config.stop_room * predicted_speed * predicted_speed / (2.0 * HAND_BRAKE_MPS2)
+    brake = config.planned_brake_share * min(config.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = config.planned_brake_share * min(config.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
+    change = min(change, config.stop_jerk_error_m * gains[0])
+    top = slow * config.planned_speed_share * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
+    predicted_speed = max(0.0, v_target + config.deceleration_lookahead_s * min(a_target, 0.0))
+    overshoot = config.stop_overshoot_m + config.stop_room * predicted_speed * predicted_speed / (
+        2.0 * config.hand_brake_mps2
+    )
     # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
     now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
     lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
-    # each barrier's distance shrinks at BARRIER_RATE_PER_S at most
-    retained = 1.0 - min(BARRIER_RATE_PER_S * dt, BARRIER_TIME_S / dt)
+    # each barrier's distance shrinks at barrier_rate_per_s at most
+    retained = 1.0 - min(config.barrier_rate_per_s * dt, config.barrier_time_s / dt)
     chosen = stopping(
         distance + overshoot, min(predicted_speed, speed) * dt, speed, a, (brake, change), (u, lowest), retained, dt
     )
     faster, a_faster = speed - v_target, a - a_target
     if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
-        meeting = max(brake + min(a_target, 0.0), MEETING_BRAKE_LEAST_SHARE * brake)
+        meeting = max(brake + min(a_target, 0.0), config.meeting_brake_least_share * brake)
         chosen = stopping(
-            distance + STOP_OVERSHOOT_M, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
+            distance + config.stop_overshoot_m, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
         )
     limit = top - retained * (top - now)
     coasting = _coasting(speed, a, chosen, change, dt)
@@ -254,7 +244,7 @@ def ready(
     """
     joint_costs(arms, heres, costs)
     setpoint, tool = states[0].setpoint, heres[0].position
-    return slow_down(setpoint, tool, share, parameters[0].max_speed), distance(setpoint[0], tool)
+    return slow_down(setpoint, tool, share, parameters), distance(setpoint[0], tool)
 
 
 @compiled

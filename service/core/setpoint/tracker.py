@@ -8,42 +8,38 @@ import numpy as np
 
 from service.core.frame import Vector
 from service.core.intake.motion_model import REACH
-from service.core.intake.tuning import MODE_ACCELERATION_REVERSIONS_PER_S, MODE_VELOCITY_REVERSIONS_PER_S2
+from service.core.intake.tuning import IntakeTuning
 from service.core.joint_limits import acceleration_rate
 from service.core.numerics import GAIN_DECIMALS, SLOWEST_PER_S
-from service.core.setpoint.tuning import (
-    GAP_STOPPED_M,
-    GAP_WAITING_M,
-    JERK_WEIGHT,
-    STIFFEST_PER_M,
-    TRACKER_RATE_SHARE,
-)
 from service.core.skill.model import Target
+from service.core.tuning import TUNING, Tuning
 from service.core.vectors import dot, norm
 from service.settings.config import Settings
 
 
-def gains_for(settings: Settings) -> Vector:
+def gains_for(settings: Settings, tuning: Tuning = TUNING) -> Vector:
     """Gains (5,) of `tracker_gains` for the settings, slow enough for tool, joints and loop.
 
-    With jerk_weight w the tracker's rate is w^(-1/6) [1/s]. The weight is JERK_WEIGHT, or the
+    With jerk_weight w the tracker's rate is w^(-1/6) [1/s]. The weight is jerk_weight, or the
     weight of the largest rate that all can follow, if that is larger:
 
-        rate = min(TRACKER_RATE_SHARE * min over joints of (jerk / acceleration),
-                   max(TRACKER_RATE_SHARE * tool jerk / tool acceleration,
-                       cbrt(STIFFEST_PER_M * tool jerk)),
+        rate = min(tracker_rate_share * min over joints of (jerk / acceleration),
+                   max(tracker_rate_share * tool jerk / tool acceleration,
+                       cbrt(stiffest_per_m * tool jerk)),
                    rate_hz / 2)
-        jerk_weight = max(JERK_WEIGHT, max(rate, SLOWEST_PER_S)^-6)
+        jerk_weight = max(jerk_weight, max(rate, SLOWEST_PER_S)^-6)
 
     The tracker acts once a tick: it would oscillate at the rate of the loop.
     """
-    tool = settings.tool
-    own = max(TRACKER_RATE_SHARE * tool.jerk / tool.acceleration, math.cbrt(STIFFEST_PER_M * tool.jerk))
-    quickest = min(TRACKER_RATE_SHARE * acceleration_rate(settings.joints), own, 0.5 * settings.rate_hz)
-    return tracker_gains(max(JERK_WEIGHT, max(quickest, SLOWEST_PER_S) ** -6))
+    tool, numbers = settings.tool, tuning.setpoint
+    # [1/m] jerk gain / max_jerk of a tool with little jerk
+    stiffest_per_m = 3.0 / numbers.hull_margin_m
+    own = max(numbers.tracker_rate_share * tool.jerk / tool.acceleration, math.cbrt(stiffest_per_m * tool.jerk))
+    quickest = min(numbers.tracker_rate_share * acceleration_rate(settings.joints), own, 0.5 * settings.rate_hz)
+    return tracker_gains(max(numbers.jerk_weight, max(quickest, SLOWEST_PER_S) ** -6), tuning.intake)
 
 
-def tracker_gains(jerk_weight: float) -> Vector:
+def tracker_gains(jerk_weight: float, hands: IntakeTuning = TUNING.intake) -> Vector:
     """Gains k (5,) of the linear-quadratic tracker, rounded to GAIN_DECIMALS.
 
     On each axis, with x the setpoint, p the target, and z = (p - x, p', p'', x', x''):
@@ -61,8 +57,8 @@ def tracker_gains(jerk_weight: float) -> Vector:
     algebraic Riccati equation. By F² = -k_a F - k_v its inverted factor is m_0 + m_1 F.
     """
     rate = jerk_weight ** (-1.0 / 6.0)
-    k_v = MODE_VELOCITY_REVERSIONS_PER_S2[REACH]
-    k_a = MODE_ACCELERATION_REVERSIONS_PER_S[REACH]
+    k_v = hands.mode_velocity_reversions_per_s2[REACH]
+    k_a = hands.mode_acceleration_reversions_per_s[REACH]
     m_0 = rate**3 - 2.0 * rate * k_v - k_a * k_v
     m_1 = k_v - 2.0 * rate**2 - 2.0 * rate * k_a - k_a**2
     determinant = m_0 * (m_0 - k_a * m_1) + k_v * m_1**2
@@ -73,18 +69,20 @@ def tracker_gains(jerk_weight: float) -> Vector:
     return np.round(gains, GAIN_DECIMALS)
 
 
-def waiting(target: Target, setpoint: Vector, tool: Vector) -> Target:
+def waiting(target: Target, setpoint: Vector, tool: Vector, gaps_m: tuple[float, float]) -> Target:
     """Target of a setpoint (3, 3) that is far ahead of its tool (3,) [m], at rest and moved closer.
 
-        share = (GAP_STOPPED_M - gap) / (GAP_STOPPED_M - GAP_WAITING_M), limited to 0 ... 1
+        share = (gap_stopped_m - gap) / (gap_stopped_m - gap_waiting_m), limited to 0 ... 1
         waiting target = setpoint + share (target - setpoint)
 
-    A target in whose direction the setpoint would approach its tool is returned unchanged.
+    `gaps_m` are gap_waiting_m and gap_stopped_m. A target in whose direction the setpoint would
+    approach its tool is returned unchanged.
     """
+    gap_waiting_m, gap_stopped_m = gaps_m
     ahead, to_target = setpoint[0] - tool, target.position - setpoint[0]
     gap = norm(ahead)
     if dot(ahead, to_target) <= 0.0:
         return target
-    share = min(max((GAP_STOPPED_M - gap) / (GAP_STOPPED_M - GAP_WAITING_M), 0.0), 1.0)
+    share = min(max((gap_stopped_m - gap) / (gap_stopped_m - gap_waiting_m), 0.0), 1.0)
     still = np.zeros(3)
     return Target(setpoint[0] + share * to_target, still, still, clamped=target.clamped)

@@ -15,13 +15,15 @@ from service.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_sta
 from service.core.skill.task_clock import move
 from service.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
 from service.core.skill.unseen import deviation_m, off_m
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings
 
 
 class SkillStage:
     """Skill in force; its prediction at the newest sample of a hand is kept in the state."""
 
-    def __init__(self, settings: Settings, skill: Skill) -> None:
+    def __init__(self, settings: Settings, skill: Skill, *, tuning: Tuning = TUNING) -> None:
+        self._hands = tuning.intake
         self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
         self._take(skill)
 
@@ -41,8 +43,11 @@ class SkillStage:
         self._sides = np.array([0, 1] if side is None else [side, side])
         regions = skill.regions
         self._doubts = regions.alarm > 0.0 and bool(skill.model.names)
-        self._rules = parameters(
+        self.rules = parameters(
             period_s=self._period_s,
+            end_share=self._hands.end_share,
+            mode_prior=self._hands.mode_prior,
+            mode_switch_rate=max(self._hands.mode_switch_rates_per_s),
             lag_s=self._lag_s,
             turn_lag_s=self._turn_lag_s,
             late_s=late_s,
@@ -77,7 +82,7 @@ class SkillStage:
         side of a hand that is not seen now. Covariances and closure are computed at new samples
         only. The doubt is the probability that the task did not begin at its first stage.
         """
-        states, frames, rules = as_array(state), as_array(frame), self._rules
+        states, frames, rules = as_array(state), as_array(frame), self.rules
         self._count(state)
         seen = Seen(*self._seen[:6], state["stage_belief"], self._period_s, state["task_clock"])
         is_new, before, known = recall(states, rules, seen), None, state["covariance"]
@@ -95,7 +100,7 @@ class SkillStage:
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
             again = found.covariance, found.turn.covariance, found.closure, found.gate_m  # need not be computed
-            deviation = deviation_m(states, unseen, self._period_s)
+            deviation = deviation_m(states, rules, unseen)
             off = off_m(lambda hands: self.skill.predicted(hands, again).position, seen, columns, deviation)
         doubt, unprimed = 0.0, state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:

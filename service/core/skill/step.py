@@ -12,7 +12,6 @@ from kmp.compiled import compiled
 from kmp.elementary import acos, exp, sin_cos
 from service.core.codes import AMBIGUOUS
 from service.core.frame import Records, Vector
-from service.core.intake.tuning import END_SHARE
 from service.core.skill.model import COVARIANCE_ROUND_TO, REGION_95
 from service.core.skill.skill import is_inside
 from service.core.skill.support import error_probability
@@ -95,13 +94,13 @@ def conclude(
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
     found = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
     frame.error_probability = found + (1.0 - found) * doubt
-    ease = END_SHARE if state.unsure else 1.0
+    ease = rule.end_share if state.unsure else 1.0
     if rule.alarm > 0.0:
         state.unsure = frame.error_probability > ease * rule.alarm
     else:
         state.unsure = math.sqrt(reach_m * reach_m + off * off) > ease * UNSURE_M
     tell_stage(states, frames)
-    if ambiguity <= AMBIGUOUS_PROBABILITY * (END_SHARE if state.reason == AMBIGUOUS else 1.0):
+    if ambiguity <= AMBIGUOUS_PROBABILITY * (rule.end_share if state.reason == AMBIGUOUS else 1.0):
         state.sure_tick = state.tick
     is_ambiguous = (state.tick - state.sure_tick) * rule.period_s > AMBIGUOUS_S
     inside = is_inside(position, rule.workspace, rule.reach)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from service.core.intake.tuning import MAX_LATE_S, OUTLIER_STDS, STILLNESS_LOWPASS_S
+from service.core.tuning import TUNING
 
 # Via-points and stages of a task. Between two via-points, a hand moves along a segment.
 # 0.03 to 0.5. More: stages learn apart. Less: stages share more.
@@ -36,7 +36,7 @@ STAGE_CYCLE_PER_S = 0.2  # [1/s] rate of transitions from the last stage to the 
 FIRST_STAGE_ODDS = 10.0  # probability of the first stage / probability of any other, at the start
 # 0.05 to 1. More: the belief is slower. Less: the belief is faster.
 SAMPLE_CORRELATION_S = 0.2  # samples within this time carry the same evidence
-MAX_SQUARED_DEVIATION = OUTLIER_STDS**2  # larger deviations from a segment carry no more evidence
+MAX_SQUARED_DEVIATION = TUNING.intake.outlier_stds**2  # larger deviations from a segment carry no more evidence
 # 0.05 to 0.5. More: slow motions weigh less. Less: slow motions weigh more.
 DIRECTION_SPEED_MPS = 0.15  # evidence of a direction = tanh(speed along the segment / 0.15 m/s)
 # 1e-3 to 0.015. More: fewer stages are mixed. Less: more stages are mixed.
@@ -73,7 +73,7 @@ PULL_SHARPNESS_PER_M2 = 0.5 / SEGMENT_MIDDLE_M**2
 # Memory of the hands.
 # 0.2 to 1. More: older motion counts. Less: recent motion counts.
 MEMORY_LAG_S = 0.5  # time constant of each filter; half or twice as much predicts recorded partners no better
-MEMORY_LONGEST_STEP_S = MAX_LATE_S  # upper limit of a step: a hand that is not seen does not fade from memory
+MEMORY_LONGEST_STEP_S = TUNING.intake.max_late_s  # a hand that is not seen does not fade from memory in longer steps
 # 0.01 to 0.1. More: orientations are smoother. Less: orientations follow faster.
 TURN_LAG_S = 0.03  # time constant of the filters of a hand's turn; trackers have noise of some 0.01 rad
 # 0.03 to 0.3. More: orientations weigh more. Less: positions weigh more.
@@ -82,7 +82,7 @@ TURN_WEIGHT_M = 0.1  # entries of a rotation matrix become lengths: those of a t
 # Clock of the task.
 # 0.03 to 0.2. More: the clock starts later. Less: a restless hand starts it.
 CLOCK_START_MPS = 0.08  # a faster hand has begun the task; tremor and drift are slower
-CLOCK_LAG_S = STILLNESS_LOWPASS_S  # time constant with which the clock's rate changes, as stillness does
+CLOCK_LAG_S = TUNING.intake.stillness_lowpass_s  # time constant with which the clock's rate changes, as stillness does
 # 0.03 to 0.08. More: more rests within a task count as its begin. Less: fewer returns count.
 OWN_NEAR_M = 0.05  # [m] hands this near to where they began the task have returned there
 

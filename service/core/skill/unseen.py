@@ -10,26 +10,25 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import exp
 from service.core.frame import Records, Vector
-from service.core.intake.tuning import MODE_PRIOR, MODE_SWITCH_RATES_PER_S
 from service.core.skill.memory import turn_lag_s
 from service.core.skill.model import REGION_95, Seen
 
 
 @compiled
-def deviation_m(states: Records, side: int, period_s: float) -> float:
+def deviation_m(states: Records, rules: Records, side: int) -> float:
     """Standard deviation [m] on each axis of the position of a hand that is not seen, τ after its
     newest sample:
 
         σ² = Σ_j (s μ_j + (1 - s) ρ_j) P_j[0, 0],   s = exp(-λ τ)
 
-    μ_j and P_j are probability and covariance of mode j, ρ is MODE_PRIOR, and λ the largest of
-    MODE_SWITCH_RATES_PER_S, at which an unseen hand changes its motion: since it was seen, the
+    μ_j and P_j are probability and covariance of mode j, ρ is mode_prior, and λ the largest of
+    mode_switch_rates_per_s, at which an unseen hand changes its motion: since it was seen, the
     hand may have begun to move, or to rest.
     """
-    state, variance = states[0], 0.0
-    stay = exp(-MODE_SWITCH_RATES_PER_S.max() * (state.tick - state.hand_ticks[side]) * period_s)
-    for mode in range(len(MODE_PRIOR)):
-        share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * MODE_PRIOR[mode]
+    state, rule, variance = states[0], rules[0], 0.0
+    stay = exp(-rule.mode_switch_rate * (state.tick - state.hand_ticks[side]) * rule.period_s)
+    for mode in range(len(rule.mode_prior)):
+        share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * rule.mode_prior[mode]
         variance += share * state.mode_covariances[side, mode, 0, 0]
     return math.sqrt(variance)
 

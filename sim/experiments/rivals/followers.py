@@ -20,6 +20,7 @@ from service.core.frame import Event, Tick, Vector
 from service.core.limiter.stage import Limiter
 from service.core.separation import FARTHEST_REPORTED_M
 from service.core.skill.skill import Skill
+from service.core.tuning import TUNING, Tuning
 from service.settings.config import Settings, robot_description
 from sim.closed_loop import START_NS, hand_event
 from sim.experiments.open_loop import frames, targets
@@ -47,7 +48,7 @@ class Followed(NamedTuple):
 Follower: TypeAlias = Callable[[Moving], Followed]
 
 
-def ours(skill: Skill, settings: Settings) -> Follower:
+def ours(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Follower:
     """The service's core, tick by tick. Like the rivals, it never holds because hands are far from
     the demonstrations, and keeps no distance from people and things.
     """
@@ -59,7 +60,7 @@ def ours(skill: Skill, settings: Settings) -> Follower:
     )
 
     def follow(hands: Moving) -> Followed:
-        seen = frames(skill, _ticks(hands), settings)[SETTLE_TICKS:]
+        seen = frames(skill, _ticks(hands), settings, tuning)[SETTLE_TICKS:]
         speed = np.linalg.norm(np.diff(seen["tool"], axis=0), axis=1) / PERIOD_S
         limited = float(np.mean(seen["flags"] & Flag.SPEED_LIMITED > 0))
         shown = (seen[name] for name in ("hands", "target", "setpoint"))
