@@ -41,7 +41,7 @@ from service.core.vectors import norm, squared_distance
 
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE, PROGRESS, OWN_BEGIN = range(7)
 CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
-RESTS, BEGINS, LEFT = 0.0, 1.0, 2.0  # progress: the hands have not moved, are near where they began, were elsewhere
+NOT_BEGUN, NEAR_BEGIN, GONE = 0.0, 1.0, 2.0  # progress: hands that rest, that moved, that left where they began
 WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
 LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
 
@@ -102,7 +102,7 @@ def _have_returned(hands: Vector, numbers: Vector, clock: Vector) -> bool:
     """True if the hands (6,) [m] are where demonstrations begin, or again where they began."""
     if _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
         return True
-    return clock[PROGRESS] == LEFT and _are_near(hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M))
+    return clock[PROGRESS] == GONE and _are_near(hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M))
 
 
 @compiled
@@ -112,8 +112,9 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
     `still`. Returns true if the task begins again.
 
     `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, the
-    stage, the progress (RESTS, BEGINS or LEFT), and where (6,) [m] these hands rested before they
-    began. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages has one row.
+    stage, the progress (NOT_BEGUN, NEAR_BEGIN or GONE), and where (6,) [m] these hands rested
+    before they began. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages
+    has one row.
     """
     numbers = rows[stage]
     begins_again = False
@@ -121,13 +122,13 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
         clock[:CLOCK_STAGE] = 0.0
         clock[CLOCK_STAGE] = stage
 
-    if clock[PROGRESS] == RESTS and still > 0.5:
+    if clock[PROGRESS] == NOT_BEGUN and still > 0.5:
         clock[OWN_BEGIN:] = hands
     if speed > CLOCK_START_MPS:
-        if clock[PROGRESS] == RESTS:
-            clock[PROGRESS] = BEGINS
+        if clock[PROGRESS] == NOT_BEGUN:
+            clock[PROGRESS] = NEAR_BEGIN
         elif not _are_near(hands, clock[OWN_BEGIN:], OWN_NEAR_M):
-            clock[PROGRESS] = LEFT
+            clock[PROGRESS] = GONE
         if clock[REST_LEFT_S] <= 0.0 and clock[CLOCK_S] >= numbers[OVER_AT]:
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
         clock[REST_LEFT_S] = numbers[REST_AT]
@@ -138,7 +139,7 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
         if before_s > 0.0 and has_rested and _have_returned(hands, rows[0], clock):
             begins_again = True
             clock[:CLOCK_STAGE] = 0.0
-            clock[PROGRESS] = RESTS
+            clock[PROGRESS] = NOT_BEGUN
         elif before_s > 0.0 and clock[REST_LEFT_S] == 0.0 and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
 

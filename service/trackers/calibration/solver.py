@@ -15,7 +15,7 @@ hand turns in its grip; positions that are 20 cm apart show the tracker's axes m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from service.contract.explain import ExplainedError
 from service.core.frame import Vector
@@ -43,9 +44,10 @@ MIN_EXTENT_M = 0.05  # the positions must extend this far in their narrowest dir
 EXTENT_DEVIATIONS = 4.0  # extent of positions or orientations / their standard deviation
 TRACKER_UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
 MAX_SCALE_ERROR = 1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
-MIRRORED_RATIO = 0.5  # the axes are mirrored if reversing one reduces the residual to less than this share
+MIRRORED_RATIO = 0.5  # the residual with the right sense of the axes is below this share of that with the other
 MAX_UNEXPLAINED = 0.5  # the residual of a hand at the tool is at most this share of the tool's motion
 BENCH_HEIGHT_M = 0.4  # the bench extends from the table top to this height
+CONFIDENCE = 0.99  # of the upper limit of the errors' variance: few samples may agree by chance
 EPSILON = 1e-7  # step of numerical derivatives
 TURN_WRIST = "turn the wrist while you lead the tool, about two axes"
 LEAD_APART = "lead the tool farther apart, in all three directions, and for longer"
@@ -111,7 +113,7 @@ class Coverage(NamedTuple):
 
 
 def coverage(tool: Vector, turn: Vector) -> Coverage:
-    """The coverage of tool positions (N, 3) [m] and quaternions (N, 4)."""
+    """The coverage of three or more tool positions (N, 3) [m] and quaternions (N, 4)."""
     _, stretch, axes = np.linalg.svd(tool - tool.mean(axis=0), full_matrices=False)
     rotations = Rotation.from_quat(turn)
     turned = np.linalg.svd((rotations.mean().inv() * rotations).as_rotvec(), compute_uv=False)
@@ -198,31 +200,42 @@ def solve_points(hand: Vector, base: Vector, corners: Vector, *, section: str = 
     """
     if len(hand) < MIN_POINTS:
         raise CalibrationError(f"{len(hand)} points given; {MIN_POINTS} or more needed, 8 recommended")
+    _check_extent(coverage(base, Rotation.identity(len(base)).as_quat()))
+    first = _robust(_touched(hand, base, section))
+    is_near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
+    if is_near.sum() < MIN_POINTS:
+        is_near[:] = True
+    return _refined(_touched(hand[is_near], base[is_near], section), first, corners, "")
+
+
+def _touched(hand: Vector, base: Vector, section: str) -> _Problem:
     upright = Rotation.identity(len(base))
-    _check_extent(coverage(base, upright.as_quat()))
-    first = _robust(_Problem(hand, lambda _: (base, upright), section))
-    near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
-    if near.sum() < MIN_POINTS:
-        near[:] = True
-    hand, base, upright = hand[near], base[near], Rotation.identity(int(near.sum()))
-    return _refined(_Problem(hand, lambda _: (base, upright), section), first, corners, "")
+    return _Problem(hand, lambda _: (base, upright), section)
 
 
 def _degrees(cover: Coverage) -> str:
     return " and ".join(f"{math.degrees(angle):.0f}°" for angle in cover.turned_rad[:2])
 
 
-def _check_extent(cover: Coverage) -> None:
+def _check_extent(cover: Coverage, outliers: Sequence[int] | NDArray[np.intp] = ()) -> None:
     """Raise CalibrationError if the positions are not spread in all three directions: then the
-    pose is uncertain, and mirrored axes would remain unnoticed.
+    pose is uncertain, and mirrored axes would remain unnoticed. `outliers` are the points without
+    which they are not.
     """
-    if cover.extent_m[2] < MIN_EXTENT_M:
-        sizes = " x ".join(f"{100 * size:.0f}" for size in cover.extent_m)
-        x, y, z = cover.narrow
+    if cover.extent_m[2] >= MIN_EXTENT_M:
+        return
+    sizes = " x ".join(f"{100 * size:.0f}" for size in cover.extent_m)
+    axis = "({:.1f}, {:.1f}, {:.1f}) of frame base".format(*cover.narrow)
+    if len(outliers):
+        points = ", ".join(str(number + 1) for number in outliers)
         raise CalibrationError(
-            f"the positions extend over {sizes} cm; {100 * MIN_EXTENT_M:.0f} cm or more needed in every direction. "
-            f"Lead the tool farther apart, above all along ({x:.1f}, {y:.1f}, {z:.1f}) of frame base"
+            f"point {points} does not fit the others, which extend over {sizes} cm alone; {100 * MIN_EXTENT_M:.0f} cm "
+            f"or more needed in every direction. Touch it again, and two more points that are farther along {axis}"
         )
+    raise CalibrationError(
+        f"the positions extend over {sizes} cm; {100 * MIN_EXTENT_M:.0f} cm or more needed in every direction. "
+        f"Lead the tool farther apart, above all along {axis}"
+    )
 
 
 class _Fit(NamedTuple):
@@ -258,17 +271,42 @@ def _robust(problem: _Problem) -> _Fit:
     _check_motion(problem, delay_s, matrix, centre)
     _check_scale(matrix, problem.section)
     fit = _rigid(problem, matrix, centre, delay_s)
-    if np.linalg.det(matrix) < 0:
-        flip = np.array([1.0, 1.0, -1.0])
-        mirrored = _rigid(problem._replace(hand=problem.hand * flip), matrix * flip, centre * flip, delay_s)
-        if np.median(mirrored.off) < MIRRORED_RATIO * np.median(fit.off):
-            raise CalibrationError(
-                f"the tracker's axes are mirrored (left-handed): the residual is {1e3 * np.median(fit.off):.0f} mm, "
-                f"and {1e3 * np.median(mirrored.off):.0f} mm with one axis reversed. base_from_tracker cannot express "
-                "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change "
-                f"{problem.section} axes"
-            )
+    _check_sense(problem, matrix, fit)
     return fit
+
+
+def _check_sense(problem: _Problem, matrix: Vector, fit: _Fit) -> None:
+    """Raise CalibrationError unless the samples fit clearly worse if an axis is reversed: the
+    tracker's axes are left-handed, or the samples do not tell.
+
+    They are reversed along n, in which the hand moves least: h' = c + (I - 2 n n^T) (h - c).
+    """
+    moved = problem.hand - fit.centre
+    narrow = np.linalg.svd(moved, full_matrices=False)[2][2]
+    flip = np.eye(3) - 2.0 * np.outer(narrow, narrow)
+    start = matrix @ flip if np.linalg.det(matrix) < 0 else fit.turn.as_matrix()
+    mirrored = _rigid(problem._replace(hand=fit.centre + moved @ flip), start, fit.centre, fit.delay_s)
+    # Each of few points counts that fits in either sense; of many samples, most do.
+    fits = np.minimum(fit.off, mirrored.off) < OUTLIER_DEVIATIONS * min(fit.deviation_m, mirrored.deviation_m)
+    if fits.sum() < MIN_POINTS:
+        fits[:] = True
+    tool, turn = problem.tool_at(fit.delay_s)
+    _check_extent(coverage(tool[fits], turn.as_quat()[fits]), () if problem.is_held else np.flatnonzero(~fits))
+    middle = np.median if problem.is_held else np.mean
+    off_mm = 1e3 * float(middle(fit.off[fits]))
+    mirrored_mm = 1e3 * float(middle(mirrored.off[fits]))
+    differ = f"the residual is {off_mm:.0f} mm, and {mirrored_mm:.0f} mm with one axis reversed"
+    if mirrored_mm < MIRRORED_RATIO * off_mm:
+        raise CalibrationError(
+            f"the tracker's axes are mirrored (left-handed): {differ}. base_from_tracker cannot express "
+            "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change "
+            f"{problem.section} axes"
+        )
+    if off_mm > MIRRORED_RATIO * mirrored_mm:
+        raise CalibrationError(
+            f"the positions do not tell whether the tracker's axes are mirrored (left-handed): {differ}. "
+            "Repeat the positions, two or more of them at least 20 cm above the others"
+        )
 
 
 def _similar(problem: _Problem) -> tuple[float, Vector, Vector]:
@@ -402,7 +440,9 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
         x = fitted(x, None)
         white, weighted = off(x), slopes(x)
     information = np.einsum("nik,nil->kl", weighted, weighted)
-    variance = np.square(white).sum() / max(3 * samples - count, 1)
+    outliers = len(first.off) - samples  # each has chosen a sample to be left out
+    freedom = max(3 * (samples - outliers) - count, 1)
+    variance = np.square(white).sum() / (3 * samples - count) * freedom / chdtri(freedom, CONFIDENCE)
     covariance, levers = variance * np.linalg.inv(information), corners - x[3:6]
     stds = _stds(covariance, levers)
     remedy = LEAD_APART
@@ -423,7 +463,7 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
         corner_std_m=tuple(stds.tolist()),
         condition=condition,
         samples=len(first.off),
-        outliers=len(first.off) - samples,
+        outliers=outliers,
         remedy=remedy,
     )
 
