@@ -93,9 +93,12 @@ class CompiledCache:
         path = self._path(signature, result.library.codegen)
         with contextlib.suppress(OSError):
             _remove_unused(self._folder)
-            with tempfile.NamedTemporaryFile(dir=self._folder, delete=False) as file:
-                file.write(hashlib.sha256(payload).digest() + payload)
-            os.replace(file.name, path)
+            part = path.with_suffix(f".{os.getpid()}")
+            try:
+                part.write_bytes(hashlib.sha256(payload).digest() + payload)
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Remove what is cached of this function."""

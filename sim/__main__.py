@@ -100,12 +100,12 @@ def main(arguments: list[str] | None = None) -> int:
         settings = cell_of(args.arm)
         scene, _ = (Scene.load(args.scene) if args.scene else Scene()).in_reach(settings.reach)
         if args.via_points:
-            print(requests.encode_json(requests.Add(scene.via_points())).decode())
+            print(requests.encode_json(requests.Add(scene.via_points())).decode(), flush=True)
             return 0
         if not args.hands_only:
             engine_of(args.engine)
         reach = client_settings(connect=args.connect, cell=args.cell)
-    except (SceneError, LaunchError, UnreadableError) as error:
+    except (SceneError, LaunchError, UnreadableError, OSError) as error:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     except (SettingsError, UsageError) as error:

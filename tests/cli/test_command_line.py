@@ -257,14 +257,16 @@ def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> Non
     assert "rrno" not in done.stderr
 
 
-def test_that_the_output_is_full_is_said_in_words() -> None:
+@pytest.mark.parametrize("arguments", ["serve --check", "sim --via-points"])
+def test_that_the_output_is_full_is_said_in_words(arguments: str) -> None:
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "service", "serve", "--check"]
+        command = [sys.executable, "-m", "service", *arguments.split()]
         done = subprocess.run(
             command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=ROOT
         )
     assert done.returncode == 1
-    assert done.stderr == "thirdhand serve: No space left on device; room on that disk needed\n"
+    name = arguments.split(maxsplit=1)[0]
+    assert done.stderr == f"thirdhand {name}: No space left on device; room on that disk needed\n"
 
 
 def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:

@@ -173,3 +173,9 @@ def test_files_that_nobody_reads_any_more_are_removed(checkout: Checkout) -> Non
     checkout.change("outer.py", "10.0", "5.0")
     assert checkout.result() == [10.0, 1]
     assert not old.exists()
+
+
+def test_a_full_disk_is_left_without_parts_of_files(checkout: Checkout) -> None:
+    full = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+    assert checkout.run(full + CALLED) == [20.0, 2]
+    assert [path for path in checkout.cache.rglob("*") if path.is_file()] == []
