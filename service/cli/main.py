@@ -127,7 +127,8 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "connect to this Zenoh endpoint; may be repeated", action="append")
     option(c, "--rate", "HZ", RATE)
-    option(c, "--skill", "FILE", "run this skill, made by `thirdhand learn` (default: the shipped soldering skill)")
+    skill = "run this skill, made by `thirdhand learn` (default: that of the settings, or else the shipped one)"
+    option(c, "--skill", "FILE", skill)
     joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
     option(c, "--record", "DIR", "record to .mcap files in this folder")

@@ -18,7 +18,7 @@ from service.cli.usage import UsageError, end_with
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
-from service.files.shipped import SHIPPED_SKILL, cell_of, skills_folder
+from service.files.shipped import cell_of, skill_file
 from service.process import child
 from service.process.priority import ahead_of_others
 from service.settings.config import Settings, converted
@@ -76,7 +76,7 @@ def _run(args: argparse.Namespace) -> int:
 
         skill, scribe = skill_path(settings, args), Scribe(settings, folder=folder, live_port=args.live)
         more = {"scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
-        missing = daemon.serve(settings, skill, skills=skills_folder(settings), **more)
+        missing = daemon.serve(settings, skill, skills=skill_file(settings).parent, **more)
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
 
@@ -88,7 +88,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
 
 def skill_path(settings: Settings, args: argparse.Namespace) -> Path:
     """The file of the skill to run."""
-    return Path(args.skill or skills_folder(settings) / SHIPPED_SKILL)
+    return Path(args.skill or skill_file(settings))
 
 
 def _open_standard_streams() -> None:

@@ -81,7 +81,6 @@ def launched(
     folder: Path,
     *arguments: str,
     record: Path | None = None,
-    skills: Path | None = None,
     settings: Settings | None = None,
     program: tuple[str, ...] = ("-m", "service"),
     network: str = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n',
@@ -89,12 +88,12 @@ def launched(
 ) -> Iterator[Launched]:
     """A daemon (`thirdhand serve` with the arguments) that ends with the context.
 
-    Its configuration, log and saved via-points are in `folder`, its recordings in `record`, and its
-    skills in `skills`. The cell is described by `settings`; `network` is the section [network] of
-    its configuration. Raises LaunchError.
+    Its configuration, log and saved via-points are in `folder`, its recordings in `record`. The
+    cell is described by `settings`; `network` is the section [network] of its configuration. Raises
+    LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
-    files = {"state": folder / "state", "record": record, "skills": skills}
+    files = {"state": folder / "state", "record": record}
     config.write_text(
         "# A cell with a free port and its own files.\n"
         f"{described(settings or Settings())}{network}[files]\n"

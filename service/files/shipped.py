@@ -24,9 +24,9 @@ def recordings() -> Path:
     return next((folder for folder in folders if folder.is_dir()), folders[1])
 
 
-def skills_folder(settings: Settings) -> Path:
-    """The folder of a cell's skills and demonstrations."""
-    return Path(settings.files.skills).expanduser() if settings.files.skills else recordings()
+def skill_file(settings: Settings) -> Path:
+    """The file of a cell's skill, which is in the folder of its other skills and demonstrations."""
+    return Path(settings.files.skill) if settings.files.skill else recordings() / SHIPPED_SKILL
 
 
 def shipped_skill() -> StoredSkill:

@@ -34,9 +34,15 @@ Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quat
 PerJoint = tuple[float, ...]
 
 # Relative paths in these settings start from the folder of the configuration.
-FROM_FOLDER = (("arm", "urdf"), ("arm", "packages"), ("network", "certificate"), ("network", "zenoh_config"))
+FROM_FOLDER = (
+    ("arm", "urdf"),
+    ("arm", "packages"),
+    ("files", "skill"),
+    ("network", "certificate"),
+    ("network", "zenoh_config"),
+)
 # Relative paths in these settings start from the current folder.
-FROM_HERE = (("files", "state"), ("files", "record"), ("files", "skills"))
+FROM_HERE = (("files", "state"), ("files", "record"))
 MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -267,9 +273,9 @@ class SkillSettings(Section, frozen=True):
 
 
 class Files(Section, frozen=True):
-    """Folders of skills, via-points and recordings, and the limits of recordings."""
+    """The skill, folders of via-points and recordings, and the limits of recordings."""
 
-    skills: str = ""  # a folder; empty: the shipped recordings
+    skill: str = ""  # the skill's file, beside which are the others that clients ask for; empty: the shipped one
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are stored there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
     segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
@@ -491,9 +497,10 @@ def _absolute(value: str, base: Path, where: str) -> str:
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
     """Settings from the content of a TOML file; `origin` names it in errors. Raises SettingsError.
 
-    Relative paths of URDF, packages, certificate and Zenoh configuration start from `folder`, those
-    of [files] from the current folder; all become absolute here. For an arm with its own URDF,
-    settings that are not given are taken from the URDF; no limit may be wider than the URDF's.
+    Relative paths of URDF, packages, skill, certificate and Zenoh configuration start from
+    `folder`, those of other files from the current folder; all become absolute here. For an arm
+    with its own URDF, settings that are not given are taken from the URDF; no limit may be wider
+    than the URDF's.
     """
     try:
         _make_paths_absolute(given, folder)

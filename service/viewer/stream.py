@@ -28,7 +28,7 @@ from service.contract.printable import printable
 from service.core.frame import Record
 from service.core.intake.arm_samples import in_turn
 from service.files.recording import OBJECTS_NOTE
-from service.files.shipped import skills_folder
+from service.files.shipped import skill_file
 from service.learning.demonstration import Demonstration
 from service.settings.config import Settings
 from service.viewer import learned, scene_objects
@@ -124,7 +124,7 @@ class Viewer:
             return
         if self._unread and self._contents is not None:
             self._unread = False
-            self._demonstrations = learned.demonstrations(self._contents, skills_folder(self._settings))
+            self._demonstrations = learned.demonstrations(self._contents, skill_file(self._settings).parent)
             self._put_skill()
         tick = int(frame["tick"])
         if not self._repeated_ns or (self._live and tick - self._repeated_tick > self._repeat_ticks):

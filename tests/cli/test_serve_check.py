@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,6 +68,14 @@ def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_pat
         *("ok configuration", "ok arm", "ok skill", "ok state", "ok recordings", "ok disk", "ok port"),
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
+
+
+def test_the_settings_name_the_skill_beside_them(tmp_path: Path) -> None:
+    named = 'skill = "mytask.npz"'
+    assert f"{tmp_path}/mytask.npz" in lines(tmp_path, files=named, code=1)["wrong skill"][0]
+    shutil.copy(RECORDINGS / "soldering.npz", tmp_path / "mytask.npz")
+    assert "mytask.npz" in lines(tmp_path, files=named, code=0)["ok skill"][0]
+    assert "soldering.npz" in lines(tmp_path, "--skill", str(RECORDINGS / "soldering.npz"), code=0)["ok skill"][0]
 
 
 @pytest.mark.parametrize(

@@ -268,7 +268,7 @@ def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, m
     (tmp_path / "my" / "arm.urdf").write_bytes(WAM.with_name("ur5.urdf").read_bytes())
     cell = WAM.with_name("ur5.toml").read_text().replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
     network = '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = "../zenoh.json5"'
-    files = '[files]\nrecord = "records"\nskills = ""\nstate = "~/state"'
+    files = '[files]\nrecord = "records"\nskill = "mine.npz"\nstate = "~/state"'
     (tmp_path / "my" / "cell.toml").write_text(f"{cell}\n{network}\n{files}\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/me")
@@ -277,7 +277,9 @@ def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, m
     assert read.arm.packages == (str(tmp_path / "my/share"),)
     assert read.network.certificate == str(tmp_path / "my/secrets")
     assert read.network.zenoh_config == str(tmp_path / "my/../zenoh.json5")
-    assert (read.files.record, read.files.skills, read.files.state) == (str(tmp_path / "records"), "", "/home/me/state")
+    assert read.files.record == str(tmp_path / "records")
+    assert read.files.skill == str(tmp_path / "my/mine.npz")
+    assert read.files.state == "/home/me/state"
     again = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert again == msgspec.structs.replace(read, network=Network(), files=Files())
