@@ -20,7 +20,7 @@ from service.contract.explain import ExplainedError
 from service.contract.messages import WireError
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import Status
-from service.files.demonstration_reader import iter_hands, read_demonstration
+from service.files.demonstration_reader import hand_samples, read_demonstration
 from service.files.mcap_file import ends_early
 from service.files.pose_streams import TRACK_NAMES, PoseTopic
 from service.files.recording import Recording
@@ -43,7 +43,7 @@ COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within th
 def play(args: argparse.Namespace) -> int:
     """Publish the hands of a recording; exit code 0 once all are published."""
     try:
-        hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in iter_hands(args.file)]
+        hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in hand_samples(args.file)]
     except WireError as error:
         raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
     start_ns, last_ns = hands[0][0], hands[-1][0]

@@ -17,7 +17,7 @@ from service.client.session import check_files
 from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
-from service.daemon.single_instance import holder_of, state_folder
+from service.daemon.single_instance import allow_descriptors, holder_of, state_folder
 from service.process import bytecode
 from service.scribe.paths import MB, existing_folder
 from service.settings.config import Files, Settings, robot_description, urdf_path
@@ -50,6 +50,7 @@ def check(args: argparse.Namespace) -> int:
         ("arm", _arm, settings),
         ("skill", _skill, settings, skill_path(settings, args)),
         ("state", _folder, state_folder(settings)),
+        ("descriptors", lambda: f"{allow_descriptors()} open files"),
         *[("recordings", _folder, Path(files.record)), ("disk", _disk, files)] * bool(files.record),
         *[("certificates", _certificates, network)] * bool(network.certificate or network.zenoh_config),
         *(("port", _endpoint, endpoint, settings) for endpoint in (*network.listen, *live)),
@@ -82,8 +83,11 @@ def _folder(folder: Path) -> str:
     found = existing_folder(folder)
     if not found.is_dir():
         raise ExplainedError(f"{found} is not a folder; a folder, or nothing, needed there")
-    if os.statvfs(found).f_flag & os.ST_RDONLY:
+    system = os.statvfs(found)
+    if system.f_flag & os.ST_RDONLY:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(found))
+    if not system.f_blocks:
+        raise ExplainedError(f"{found} stores no files; a folder on a disk needed")
     if not os.access(found, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
         raise ExplainedError(f"{folder}: {found} cannot be written by user {os.geteuid()}; its owner can allow that")
     return f"{folder} can be {'written' if found == folder.absolute() else 'made'}"

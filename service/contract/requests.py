@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -12,6 +13,7 @@ from service.contract.messages import Vector3
 from service.contract.records import GONE_S, SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
+_NO_NAME = {"accepted": "a name of up to 64 letters, digits, spaces and . _ -"}
 STARTING = "starting: "  # begins every answer of a daemon that is not ready yet
 NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
 MAX_REACH_M = 0.4  # hands farther away than this are not examined for the reach of a correction
@@ -135,7 +137,7 @@ class HoldRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refused if the arm is held by anybody else. Without, it ends all holds.
     """
 
-    by: Name | Literal[""] = ""
+    by: Annotated[str, msgspec.Meta(max_length=64, pattern=r"\A[\w .-]*\Z", extra=_NO_NAME)] = ""
 
 
 class ViaPointInForce(ViaPoint, frozen=True, kw_only=True):
@@ -198,12 +200,21 @@ def decode_request(data: bytes, kind: Any) -> Any:
     """
     try:
         given = msgspec.json.decode(data or b"{}")
+        json.loads(data or b"{}", object_pairs_hook=_check_once)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RequestError(f"not JSON: {in_words(error, named=False)}") from None
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
         raise RequestError(explained(error, given, kind)) from None
+
+
+def _check_once(pairs: list[tuple[str, Any]]) -> None:
+    """Raise RequestError for a name that an object has twice, as readers differ in which counts."""
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise RequestError(f"{name!r} given twice in one object; each name once needed")
 
 
 encode_json = msgspec.json.encode

@@ -119,6 +119,24 @@ class RequestQueue:
             taken.clear()  # a client's query ends with its last reference
 
 
+def _understood(suffix: str, expression: str, key: str, payload: bytes) -> tuple[object, str]:
+    """The request in a payload, sent to a key expression, and a remark on what was not understood.
+
+    A hold that is not understood is one without a name, because a stop is always obeyed. Raises
+    RequestError for other requests.
+    """
+    if expression != key:
+        raise RequestError(f"{expression} matches several cells; the key {key} needed")
+    try:
+        if len(payload) > channels.LARGEST_REQUEST:
+            raise RequestError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
+        return channels.BY_KEY[suffix].codec.decode(payload), ""
+    except RequestError as error:
+        if suffix != "hold":
+            raise
+        return HoldRequest(), f"the arm holds, but the request was not understood: {error}"
+
+
 class Queryables:
     """The queryables of one cell, which answer from `open` on.
 
@@ -207,16 +225,14 @@ class Queryables:
         key = channels.key(self._settings.cell, suffix)
         with query:  # its end shows the client that there are no more replies
             try:
-                if str(query.key_expr) != key and suffix != "status":
-                    raise RequestError(f"{query.key_expr} matches several cells; the key {key} needed")
                 payload = b"" if query.payload is None else query.payload.to_bytes()
-                if (size := len(payload)) > channels.LARGEST_REQUEST:
-                    raise RequestError(f"a request of {size} bytes, at most {channels.LARGEST_REQUEST} accepted")
                 if suffix == "status":
                     answer, changes = status(published=False), False
                 else:
-                    request = channels.BY_KEY[suffix].codec.decode(payload)
-                    answer, changes = encode_json(self._answer(suffix, request, order)), not isinstance(request, List)
+                    request, remark = _understood(suffix, str(query.key_expr), key, payload)
+                    reply = self._answer(suffix, request, order)
+                    answer = encode_json(msgspec.structs.replace(reply, note=remark) if remark else reply)
+                    changes = not isinstance(request, List)
                 if changes:
                     status(published=True)
             except (RequestError, SkillError) as error:

@@ -24,7 +24,7 @@ from service.settings.config import Settings
 from service.settings.file_content import content
 
 MAX_SESSIONS = 64
-MAX_DESCRIPTORS = 65536
+LEAST_DESCRIPTORS, MAX_DESCRIPTORS = 256, 65536  # with fewer, Zenoh ends while the daemon runs on, deaf
 MAX_HANDSHAKES = 16  # pending handshakes: those that time out are closed together, which delays others
 HANDSHAKE_TIMEOUT_MS = 2000
 ENVELOPE_BYTES = 1024  # key, attachment and Zenoh's headers around the largest request
@@ -118,12 +118,21 @@ def _holder(descriptor: int | None) -> str:
     return "a process that did not write its number"
 
 
-def allow_descriptors() -> None:
-    """Raise the limit of open files, so that a burst of connections does not reach it."""
+def allow_descriptors() -> int:
+    """Raise the limit of open files, so that a burst of connections does not reach it, and return
+    it. Raises ExplainedError for fewer than LEAST_DESCRIPTORS.
+    """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limit < LEAST_DESCRIPTORS:
+        raise ExplainedError(
+            f"this process may open {limit} files, {LEAST_DESCRIPTORS} or more needed: raise its limit with `ulimit "
+            "-Hn`, or with LimitNOFILE= in the unit"
+        )
+    return limit
 
 
 def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:

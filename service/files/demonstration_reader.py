@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from mcap.reader import make_reader
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +21,7 @@ from service.core.intake.stage import UNIT_M, base_from
 from service.core.tuning import TUNING
 from service.files.hands_and_tool import chosen
 from service.files.mcap_file import McapFile, RecordingError, ends_early, existing
-from service.files.mcap_reader import Messages, full_name, next_whole
+from service.files.mcap_reader import Messages, full_name
 from service.files.pose_streams import ENDINGS, GRIPPER_STATE, PLACES_TOPIC, PoseRecording, PoseTopic
 from service.files.track import Track
 from service.files.track_check import LEAST_PIECE_S, Checked, checked, sound
@@ -337,26 +336,28 @@ def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[
     return out
 
 
-def iter_hands(path: str | Path) -> Iterator[tuple[int, str, bytes]]:
+def hand_samples(path: str | Path) -> list[tuple[int, str, bytes]]:
     """Log time [ns], side and CDR bytes of every hand sample, in order of time.
 
     Reads demonstrations, recordings and other ROS 2 recordings. A file that was cut is read up to
-    its cut, in the order of writing. Raises RecordingError.
+    its cut. Raises RecordingError.
     """
     path = existing(path)
-    found: dict[str, str] = {}  # topic by stream
+    messages = Messages(path)
+    topics: dict[str, str] = {}  # by stream
     seen: set[str] = set()
-    with path.open("rb") as stream:
-        messages = iter(Messages(path)) if ends_early(path) else make_reader(stream, validate_crcs=True).iter_messages()
-        while one := next_whole(messages, path):
-            schema, channel, message = one
-            seen.add(topic := channel.topic)
-            name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
-            if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
-                continue
-            if found.setdefault(name, topic) != topic:
-                raise RecordingError(f"{path} has two streams of {name}: {found[name]} and {topic}")
-            yield message.log_time, name.removeprefix("hands/"), message.data
-    if not found:
+    samples: list[tuple[int, str, bytes]] = []
+    for schema, channel, message in messages:
+        seen.add(topic := channel.topic)
+        name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
+        if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
+            continue
+        if topics.setdefault(name, topic) != topic:
+            raise RecordingError(f"{path} has two streams of {name}: {topics[name]} and {topic}")
+        samples.append((message.log_time, name.removeprefix("hands/"), message.data))
+    if messages.faults and not ends_early(path):
+        raise RecordingError(f"{path} is damaged: {messages.faults[0]}")
+    if not topics:
         lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
         raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")
+    return sorted(samples, key=lambda sample: sample[0])

@@ -10,10 +10,12 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -22,8 +24,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Messag
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from service.files.mcap_file import RecordingError
-
+LARGEST_CHUNK_BYTES = 64 << 20  # unpacked; recorders write some MB at most
 Found = tuple[Schema | None, Channel, Message]
 _HEAD = struct.Struct("<BQ")  # opcode, number of the following bytes
 _FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
@@ -168,7 +169,7 @@ class _Reading:
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.CHUNK:
             self._chunked = True
-            return breakup_chunk(Chunk.read(stream), validate_crc=True)
+            return _records_in(Chunk.read(stream))
         if _COMPRESSION.match(content, 28):
             raise ValueError(f"the content is a chunk, the head has type {opcode}")
         if opcode == Opcode.MESSAGE:
@@ -210,7 +211,7 @@ class _Reading:
         try:
             opcode, end = self._head(at)
             if opcode == Opcode.CHUNK:
-                breakup_chunk(Chunk.read(ReadDataStream(BytesIO(self._content(at, end)))), validate_crc=True)
+                _records_in(Chunk.read(ReadDataStream(BytesIO(self._content(at, end)))))
         except _BROKEN:
             return False
         return opcode == Opcode.CHUNK
@@ -234,20 +235,25 @@ class _Reading:
         return self._stream.read(count)
 
 
+def _records_in(chunk: Chunk) -> list[McapRecord]:
+    """The records in a chunk. Raises ValueError for one of more than LARGEST_CHUNK_BYTES, which is
+    not unpacked, and for a wrong checksum.
+    """
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        size = max(size, zstandard.frame_content_size(chunk.data))
+    elif chunk.compression == "lz4":  # its frame need not name its size
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK_BYTES + 1)
+        chunk = replace(chunk, compression="", data=unpacked)
+        size = len(unpacked)
+    if size > LARGEST_CHUNK_BYTES:
+        raise ValueError(f"a chunk of more than {LARGEST_CHUNK_BYTES >> 20} MiB is not unpacked: recorders write less")
+    return breakup_chunk(chunk, validate_crc=True)
+
+
 def full_name(schema: Schema | None) -> str:
     """The full name of a type, `geometry_msgs/msg/PoseStamped` also for
     `geometry_msgs/PoseStamped`; empty without a schema.
     """
     kind = "" if schema is None else schema.name
     return kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
-
-
-def next_whole(messages: Iterator[Found], path: Path) -> Found | None:
-    """The next message of an indexed file; None at its end.
-
-    Raises RecordingError for a damaged file.
-    """
-    try:
-        return next(messages, None)
-    except _BROKEN as error:
-        raise RecordingError(f"{path} is damaged: {type(error).__name__} {error}".strip()) from None

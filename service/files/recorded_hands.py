@@ -22,7 +22,7 @@ from service.contract.messages import WireError
 from service.contract.records import Mode
 from service.core.controller import Controller, run, start_state
 from service.core.frame import Event, Frame, Record, Records, Tick
-from service.files.demonstration_reader import iter_hands
+from service.files.demonstration_reader import hand_samples
 from service.files.mcap_file import RecordingError, existing
 from service.files.mcap_reader import Messages
 from service.files.pose_streams import PoseRecording
@@ -178,7 +178,7 @@ def _of_take(
         remarks.append(f"{path.name} has no skill: {skill.name}, which is shipped, is used; --skill gives another")
     inboxes: dict[int, list[Event]] = {}
     begin_ns: int | None = None
-    for time_ns, side, payload in iter_hands(path):
+    for time_ns, side, payload in hand_samples(path):
         begin_ns = time_ns if begin_ns is None else begin_ns
         kind = f"hands/{side}"
         try:

@@ -37,7 +37,7 @@ from service.settings.file_content import UnusableError, content
 
 SKILL_FORMAT = 6
 TURN, GRIPPER = "turn.", "gripper."  # prefixes of the arrays of their primitives
-LARGEST_FILE = 100_000_000  # [B] unpacked
+LARGEST_FILE, MOST_ARRAYS = 100_000_000, 500  # [B] unpacked, and in how many arrays; a skill has below a hundred
 MOST_POINTS = 2500  # reference points, which bound the duration of a tick
 HIGHEST_GATE_M = 1.0  # a larger threshold would let everything pass
 LONGEST_TEXT, LONGEST_FIGURES = 200, 1_000_000  # characters
@@ -154,17 +154,29 @@ def _digest(file: bytes) -> bytes:
     return hashlib.blake2b(file, digest_size=16).digest()
 
 
+def arrays_in(data: bytes) -> dict[str, Any]:
+    """The arrays in the bytes of an .npz file.
+
+    Raises ValueError if they are too many or too large, which is found before any is unpacked, and
+    what NumPy raises for a damaged archive.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        items = archive.infolist()
+    if len(items) > MOST_ARRAYS:
+        raise ValueError(f"{len(items)} arrays in an archive, at most {MOST_ARRAYS} accepted")
+    if (size := sum(item.file_size for item in items)) > LARGEST_FILE:
+        raise ValueError(f"{size} bytes unpacked, at most {LARGEST_FILE} accepted")
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
 def decoded(data: bytes, *, origin: str) -> StoredSkill:
     """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError."""
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
         made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
         raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            size = sum(item.file_size for item in archive.zip.infolist())
-            if size > LARGEST_FILE:
-                raise SkillError(f"{origin}: {size} bytes unpacked, at most {LARGEST_FILE} accepted")
-            arrays = dict(archive)
+        arrays = arrays_in(data)
         if (number := arrays["format"].item()) != SKILL_FORMAT:
             raise SkillError(
                 f"{origin}: skill of format {number}, of {SKILL_FORMAT} needed: learn it anew with this version"

@@ -20,7 +20,7 @@ from service.contract.explain import in_words, validated
 from service.contract.printable import printable
 from service.contract.requests import Hands, ViaPoint
 from service.learning.demonstration import Demonstration, NamedDemonstration, check
-from service.learning.skill_file import LARGEST_FILE, SkillError, StoredSkill
+from service.learning.skill_file import SkillError, StoredSkill, arrays_in
 
 KEPT_HZ = 50.0
 MOST_KEPT = 50_000  # 5 MB
@@ -81,10 +81,7 @@ def stored_demonstrations(skill: StoredSkill) -> list[NamedDemonstration]:
             f"from; {REMEDY}"
         )
     try:
-        with np.load(io.BytesIO(skill.demonstrations), allow_pickle=False) as archive:
-            if (size := sum(item.file_size for item in archive.zip.infolist())) > LARGEST_FILE:
-                raise SkillError(f"{size} bytes unpacked, at most {LARGEST_FILE} accepted")
-            arrays = dict(archive)
+        arrays = arrays_in(skill.demonstrations)
         about = validated(msgspec.json.decode(arrays["about"].tobytes()), tuple[_About, ...])
         ends = np.cumsum([one.samples for one in about])
         columns = [np.split(arrays[name], ends) for name in ("stamps", "poses", "closures")]

@@ -45,6 +45,9 @@ FROM_FOLDER = (
 FROM_HERE = (("files", "state"), ("files", "record"))
 MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
+SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9  # sizes of numbers but 0; powers of others overflow, or are 0
+FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
+MOST_DOTS = 1000  # in a line of a configuration
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 
@@ -278,8 +281,10 @@ class Files(Section, frozen=True):
     skill: str = ""  # the skill's file, beside which are the others that clients ask for; empty: the shipped one
     state: str = "~/.local/state/thirdhand"  # a folder; via-points are stored there over a restart
     record: str = ""  # a folder; empty: nothing is recorded
-    segment_mb: Positive = 200.0  # at this size a recording ends and the next begins, without a gap
-    segment_minutes: Positive = 10.0  # at this age a recording ends and the next begins, without a gap
+    segment_mb: Annotated[float, msgspec.Meta(ge=0.01)] = (
+        200.0  # at this size a recording ends and the next begins, without a gap
+    )
+    segment_minutes: Positive = 10.0  # age at which the next recording begins, without a gap
     keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's .mcap files; 0: no limit
     keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .mcap files older than this are deleted; 0: no limit
 
@@ -317,8 +322,14 @@ class Settings(Section, frozen=True):
 
     def _problems(self) -> Iterator[str]:
         """Contradictions between values that are valid on their own."""
-        unusable = [path for path, value in _numbers(msgspec.to_builtins(self), "$") if not math.isfinite(value)]
-        yield from (f"{path}: not finite; a finite number needed" for path in unusable)
+        unusable = {
+            path: value
+            for path, value in _numbers(msgspec.to_builtins(self), "$")
+            if value != 0.0 and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER  # also what is not finite
+        }
+        for path, value in unusable.items():
+            sizes = f"{SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
+            yield f"{path}: {value:g} given; a finite number, 0 or of a size from {sizes}, accepted"
         if {".", ".."} & set(self.cell.split("/")):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
         if (size := len(self.cell.encode())) > MAX_CELL_BYTES:
@@ -346,6 +357,8 @@ class Settings(Section, frozen=True):
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
+            if max(map(abs, pose[:3])) > FARTHEST_FRAME_M:
+                yield f"{path}: {list(pose[:3])} given; {FARTHEST_FRAME_M:g} m or less on each axis accepted"
             if abs(norm - 1.0) > 1e-3:
                 yield f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)"
         if not math.hypot(*self.people.toward_elbow) > 1e-6:
@@ -572,6 +585,9 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
     """Settings from TOML text, of one of its cells if it has `[cells]`; see `converted`. Raises
     SettingsError.
     """
+    for number, line in enumerate(text.splitlines(), start=1):
+        if (dots := line.count(".")) > MOST_DOTS:  # as parts of one key they would take minutes
+            raise SettingsError(f"{origin}: line {number} has {dots} dots, at most {MOST_DOTS} accepted")
     try:
         given = tomllib.loads(text)
     except ValueError as error:  # also of a number with too many digits

@@ -9,6 +9,8 @@ import os
 import re
 import shutil
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,9 +67,33 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
 def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_path: Path) -> None:
     found = lines(tmp_path, code=0)
     assert list(found) == [
-        *("ok configuration", "ok arm", "ok skill", "ok state", "ok recordings", "ok disk", "ok port"),
+        *(
+            "ok configuration",
+            "ok arm",
+            "ok skill",
+            "ok state",
+            "ok descriptors",
+            "ok recordings",
+            "ok disk",
+            "ok port",
+        ),
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
+
+
+@pytest.mark.parametrize("option", ["--check", "--joints=assumed"])
+def test_too_few_files_that_may_be_open_prevent_a_start(tmp_path: Path, option: str) -> None:
+    arguments = ["serve", option, "--config", cell(tmp_path)]
+    program = (
+        "import resource, service.cli.main\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (100, 100))\n"
+        f"raise SystemExit(service.cli.main.main({arguments}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
+    assert done.returncode == 1
+    assert "this process may open 100 files, 256 or more needed: raise its limit with" in done.stdout + done.stderr
 
 
 def test_the_settings_name_the_skill_beside_them(tmp_path: Path) -> None:
@@ -89,7 +115,7 @@ def test_the_settings_name_the_skill_beside_them(tmp_path: Path) -> None:
         ("skill", "golden.mcap", {}, ("--skill", str(RECORDINGS / "golden.mcap"))),
         ("state", "is not a folder", {"before": "cell = 'lab/x'\n"}, ()),
         ("recordings", "README.md is not a folder", {}, ("--record", str(ROOT / "README.md" / "x"))),
-        ("disk", "room on that disk needed", {"files": "segment_mb = 1e12"}, ()),
+        ("disk", "room on that disk needed", {"files": "segment_mb = 9e8"}, ()),
         ("certificates", "certificate.pem: a folder with", {"listen": TLS, "network": "certificate = 'none'"}, ()),
         ("certificates", "cannot read the Zenoh configuration", {"network": "zenoh_config = 'none.json5'"}, ()),
         ("router", "Connection refused; a program that listens there needed", {}, ("--connect", "tcp/127.0.0.1:1")),

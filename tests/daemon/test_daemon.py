@@ -165,7 +165,7 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         ("via_points", {"op": "turn"}, "$.op"),
         ("skill", {"name": "sodlering"}, "its skills: soldering"),
         ("skill", {"name": "../secret"}, "$.name"),
-        ("hold", {"why": "so"}, "why"),
+        ("resume", {"why": "so"}, "why"),
         ("via_points", {"op": "list", "a - at `$.x`": 1}, "unknown field"),
         ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}, "unknown field"),
         ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}, "unknown field"),

@@ -167,6 +167,8 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         (b'{"op":', "not JSON: Input data was truncated"),
         (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
         (b"\xff\xfe", "not JSON: JSON is malformed"),
+        (b'{"op": "list", "op": "clear"}', "'op' given twice in one object; each name once needed"),
+        (b'{"op": "add", "points": [{"std": 1, "std": 2}]}', "'std' given twice in one object"),
         (b"[" * 100_000, "not JSON: maximum recursion depth"),
         (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
     ],
@@ -176,8 +178,7 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         ({"name": 3}, "$.name: 3 given; 1 to 64 letters"),
         ({}, "$: field `name` is missing"),
     ],
-    "hold": [*NOT_EMPTY, ({"now": True}, "$: unknown field 'now'; known are by")],
-    "resume": NOT_EMPTY,
+    "resume": [*NOT_EMPTY, ({"by": 5}, "$.by: 5 given; a name of up to 64 letters, digits, spaces and . _ - accepted")],
     "reset": [*NOT_EMPTY, ({"now": True}, "$: unknown field 'now'; known are none")],
 }
 
@@ -191,6 +192,16 @@ def test_a_request_is_refused_whole_and_with_a_reason(
     taught_cell: Cell, suffix: str, request_: Any, message: str
 ) -> None:
     assert taught_cell.refusal(suffix, request_).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "payload", [None, b"hold!", {"now": True}, {"by": 5}, b'{"by": "a", "by": "b"}', b" " * 262_145, b"[" * 100_000]
+)
+def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) -> None:
+    reply = taught_cell.reply("hold", payload)
+    assert reply.ok is not None
+    assert b"the arm holds, but the request was not understood: " in reply.ok.payload.to_bytes()
+    assert taught_cell.kinds()[-1] == "hold"
 
 
 # --- skills and stages ---

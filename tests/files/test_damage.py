@@ -7,8 +7,10 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.opcode import Opcode
 
 from service.cli.view import convert
@@ -16,7 +18,7 @@ from service.contract.cdr import encode_pose
 from service.contract.channels import POSE
 from service.contract.messages import PoseStamped
 from service.core.frame import encode
-from service.files.demonstration_reader import iter_hands, read_demonstration, write_demonstration
+from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
 from service.files.mcap_file import McapFile, RecordingError
 from service.files.recording import Recorder, Recording
 from service.files.steps import Step
@@ -119,6 +121,21 @@ def test_damage_and_a_cut_are_told_apart_also_in_one_file(tmp_path: Path, whole:
     ]
 
 
+@pytest.mark.parametrize("compression", ["zstd", "zstd of another size", "lz4"])
+def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whole: bytes, compression: str) -> None:
+    size = 100 << 20
+    zeros = bytes(size)
+    packed = lz4.frame.compress(zeros) if compression == "lz4" else zstandard.compress(zeros)
+    told_size = size if compression == "zstd" else 1000
+    name = compression[:4].encode()
+    body = struct.pack("<QQQII", 0, 1 << 63, told_size, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    begin, _ = chunks(whole)[0]
+    bomb = struct.pack("<BQ", Opcode.CHUNK, len(body)) + body
+    recording, steps = read(tmp_path / "a.mcap", whole[:begin] + bomb + whole[begin:])
+    assert "a chunk of more than 64 MiB is not unpacked" in str(recording.faults[0])
+    assert sum(step.frame is not None for step in steps) == COUNT
+
+
 def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes) -> None:
     (tmp_path / "a.mcap").write_bytes(flipped(whole, whole.index(b"skill.npz") + 300))
     with pytest.raises(RecordingError, match=r"lacks settings, skill or arm.*an attachment's checksum is wrong"):
@@ -135,7 +152,7 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
     with pytest.raises(RecordingError, match=r"damage at byte .* no poses can be read; nothing is learned"):
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
-        list(iter_hands(path))
+        list(hand_samples(path))
 
 
 def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp_path: Path) -> None:

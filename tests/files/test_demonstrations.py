@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.contract import cdr, channels, messages
 from service.contract.ros2msg import schema
-from service.files.demonstration_reader import iter_hands, read_demonstration, write_demonstration
+from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
 from service.files.mcap_file import RecordingError
 from service.learning.demonstration import Demonstration
 from service.settings.config import Settings, TrackerSettings
@@ -161,14 +161,14 @@ def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(
         for event in tick.inbox
         if event.kind[:5] == "hands"
     ]
-    assert list(iter_hands(tmp_path / "a.mcap")) == wanted
+    assert list(hand_samples(tmp_path / "a.mcap")) == wanted
     data = (tmp_path / "a.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[:-1])
-    assert sorted(iter_hands(tmp_path / "cut.mcap")) == wanted
+    assert sorted(hand_samples(tmp_path / "cut.mcap")) == wanted
     stamps = np.arange(5) * 1_000_000
     good = (stamps, _line(stamps, 1))
     _streams(tmp_path / "b.mcap", {"/t/hands/right": good, "/t/hands/left": (stamps + 1, good[1])})
-    hands = sorted(iter_hands(tmp_path / "b.mcap"), key=lambda sample: sample[0])
+    hands = hand_samples(tmp_path / "b.mcap")
     assert [(time, side) for time, side, _ in hands[:4]] == [
         (5, "right"),
         (6, "left"),
@@ -177,4 +177,4 @@ def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(
     ]
     _streams(tmp_path / "c.mcap", {"/t/tool/pose": good})
     with pytest.raises(RecordingError, match=r"c.mcap has no topic ending in hands/left or hands/right"):
-        list(iter_hands(tmp_path / "c.mcap"))
+        list(hand_samples(tmp_path / "c.mcap"))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import functools
+import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -15,6 +20,7 @@ from service.settings.config import (
     WAM,
     Files,
     Settings,
+    converted,
     load,
     parse,
     robot_description,
@@ -260,6 +266,36 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
     assert insecure.network.listen == ("tcp/0.0.0.0:1",)
     routed = parse("[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml")
     assert routed.network.connect == ("tcp/10.0.0.1:1",)
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The paths of all numbers with decimals in settings."""
+    if isinstance(value, float):
+        yield path
+    for key, inner in value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ()):
+        yield from leaves(inner, (*path, key))
+
+
+@pytest.mark.parametrize("number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf])
+def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float) -> None:
+    usual = msgspec.json.decode(msgspec.json.encode(Settings()))
+    paths = list(leaves(usual))
+    assert len(paths) > 100
+    for path in paths:
+        given = copy.deepcopy(usual)
+        functools.reduce(lambda part, key: part[key], path[:-1], given)[path[-1]] = number
+        with pytest.raises(SettingsError, match=str(path[-1]) if isinstance(path[-1], str) else str(path[-2])):
+            converted(given, origin="cell.toml")
+
+
+@pytest.mark.parametrize("section", ["tool", "hands"])
+def test_a_tool_or_tracker_farther_away_than_any_is_refused(section: str) -> None:
+    name = {"tool": "plate_from_tool", "hands": "base_from_tracker"}[section]
+    assert "100 m or less on each axis" in refusal(f"[{section}]\n{name} = [101.0, 0, 0, 0, 0, 0, 1]")
+
+
+def test_a_key_of_many_parts_is_refused_before_it_is_read() -> None:
+    assert "line 2 has 19999 dots, at most 1000 accepted" in refusal("\n" + ".".join(["a"] * 20_000) + " = 1")
 
 
 def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

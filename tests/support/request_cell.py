@@ -111,12 +111,16 @@ class Cell:
     def refusal(self, suffix: str, request: Any) -> str:
         """The words in which a request is refused; bytes are sent as they are."""
         before = len(self.taken), self.names(), self.place_bytes()
-        payload = request if isinstance(request, bytes) else requests.encode_json(request)
-        replies = list(self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0))
-        assert len(replies) == 1
-        assert replies[0].err is not None
+        reply = self.reply(suffix, request)
+        assert reply.err is not None
         assert (len(self.taken), self.names(), self.place_bytes()) == before
-        return replies[0].err.payload.to_string()
+        return reply.err.payload.to_string()
+
+    def reply(self, suffix: str, request: Any) -> zenoh.Reply:
+        """The only reply to a request; bytes are sent as they are."""
+        payload = request if isinstance(request, bytes) else requests.encode_json(request)
+        (reply,) = self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0)
+        return reply
 
     def names(self) -> list[str]:
         """The places in force."""

@@ -25,7 +25,7 @@ from service.contract.requests import Add, encode_json
 from service.core.arm.stage import Arm
 from service.daemon.launch import free_port
 from service.files.demonstration_files import demonstration_paths, summary, table, trim, uncut
-from service.files.demonstration_reader import iter_hands, read_demonstration
+from service.files.demonstration_reader import hand_samples, read_demonstration
 from service.files.dwells import REST_M
 from service.files.mcap_file import RecordingError
 from service.files.pose_streams import PoseRecording, PoseTopic
@@ -92,7 +92,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     path = tmp_path / "a.mcap"
     taken.write(path)
     assert list(tmp_path.iterdir()) == [path]
-    assert sorted(payload for *_, payload in iter_hands(path)) == sorted(sent)
+    assert sorted(payload for *_, payload in hand_samples(path)) == sorted(sent)
     got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
