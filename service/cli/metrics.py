@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
+from wsgiref.simple_server import WSGIServer
 
 import msgspec
 import zenoh
@@ -25,7 +27,8 @@ try:
 except ModuleNotFoundError:
     raise ExplainedError("prometheus_client is not installed: pip install 'thirdhand[metrics]'") from None
 
-SCRAPE_TIMEOUT_S = 2.0  # a cell that does not answer within this time is down
+SCRAPE_TIMEOUT_S = 2.0  # a cell that does not answer within this time is down, and so is a silent client
+MOST_REQUESTS = 64  # threads at once, of which each request takes one
 Figure = tuple[str, str, float | None, dict[str, str]]  # name, explanation, value, labels
 
 
@@ -39,9 +42,17 @@ def metrics(args: argparse.Namespace) -> int:
             server, thread = start_http_server(address.port, address.host, registry)
         except OSError as error:
             raise ExplainedError(f"--listen {address}: {in_words(error)}") from None
+        _bound(server)
         say(f"metrics for Prometheus: http://{address._replace(port=server.server_port)}/metrics")
         thread.join()
     return 0
+
+
+def _bound(server: WSGIServer) -> None:
+    """Close connections that are silent, and those beyond MOST_REQUESTS at once, without a word."""
+    server.RequestHandlerClass.timeout = SCRAPE_TIMEOUT_S  # type: ignore[attr-defined]
+    server.verify_request = lambda *_: threading.active_count() < MOST_REQUESTS  # type: ignore[method-assign]
+    server.handle_error = lambda *_: None  # type: ignore[method-assign]
 
 
 class CellCollector(Collector):
@@ -82,8 +93,8 @@ def _figures(now: Status) -> Iterator[Figure]:
     for name in ("lateness_us", "work_us", "latency_ms"):
         unit_s, values = 1e-3 if name.endswith("_ms") else 1e-6, getattr(now, name)
         about = "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over 10 s."
-        for quantile, value in zip(("0.5", "0.99", "1"), msgspec.structs.astuple(values), strict=True):
-            yield f"{name[:-3]}_seconds", about, unit_s * value, {"quantile": quantile}
+        for percentile, value in zip(("50", "99", "100"), msgspec.structs.astuple(values), strict=True):
+            yield f"{name[:-3]}_seconds", about, unit_s * value, {"percentile": percentile}
     for cause, count in now.rejected.items():
         yield "rejected_samples_total", "Rejected samples of all sources.", count, {"cause": cause}
     for name, source in now.sources.items():

@@ -47,6 +47,7 @@ MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9  # sizes of numbers but 0; powers of others overflow, or are 0
 FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
+LEAST_REACH_M = 0.01  # an arm that moves its tool by less is none
 MOST_DOTS = 1000  # in a line of a configuration
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
@@ -226,7 +227,7 @@ class Reach(Section, frozen=True):
 
 
 class People(Section, frozen=True):
-    """Speed and separation limits toward people, as in ISO/TS 15066.
+    """Limits of speed and distance toward people, modelled on ISO 10218-2; none is safety-rated.
 
     A hand is a capsule from its tracked point toward the elbow. A part of the arm may approach a
     hand at the speed from which it can stop `clearance` away from the hand, while the hand
@@ -543,6 +544,11 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
     )
     reach = settings.reach
     found = workspace.shell(reach.min_x, reach.min_z)
+    if found.outer < LEAST_REACH_M:
+        raise SettingsError(
+            f"[arm] plate: its joints move the tool by {1000 * found.outer:.0f} mm; an arm that moves it, or a pose of "
+            "the tool away from the last axis ([tool] plate_from_tool), needed"
+        )
     outer = reach.outer if "outer" in given else min(found.outer, reach.outer)
     inner = reach.inner if "inner" in given else min(found.inner, found.inner / found.outer * outer)
     centre = reach.centre if "centre" in given else found.centre

@@ -2,13 +2,14 @@
 // The banner and the buttons that both pages have. A page calls its Link `link`.
 const at = name => document.getElementById(name);
 const SIDES = ["left", "right"];
+const CELL = document.title.replace("thirdhand hands: ", "");
 
 function showBanner({mode, headline, why, remedy}) {
   at("banner").className = mode;
   at("mode").textContent = headline;
   at("why").textContent = why;
   at("remedy").textContent = remedy;
-  document.title = `${headline} - __CELL__`;
+  document.title = `${headline} - ${CELL}`;
 }
 // As on the live page: Resume is grey only while the arm follows, Reset unless there is something to end.
 function showOrders({mode, reason}) {

@@ -2,8 +2,8 @@
 
 It answers requests from its own pages only: `Host` must name this machine, and `Origin`, where a
 browser sends it, must be the same host and port. What changes something also needs the token of
-the server. Every answer has the headers that keep a browser from fetching anything elsewhere, and
-every refusal says why.
+the server. Connections that are silent are closed, and there are not many at once. Every answer
+has the headers that keep a browser from fetching anything elsewhere, and every refusal says why.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import ipaddress
 import re
 import secrets
 import signal
+import socket
 import ssl
 import subprocess
 import threading
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +34,8 @@ JSON = "application/json"
 JAVASCRIPT = "text/javascript; charset=utf-8"
 INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 MAX_BODY_BYTES = 4096  # of a request
+MAX_CONNECTIONS = 256  # at once: some for each page; a process may often open 1024 files
+SILENT_S = 5.0  # a handshake, and then the first request, must be complete after this time
 FOREIGN = "This page answers at this machine's own address only, and only to itself."
 MAX_PAGE_MESSAGE_BYTES = 256  # of a websocket
 CLOSE_CODE = 4000  # a websocket is refused with this close code plus the status of HTTP
@@ -93,6 +97,33 @@ def _self_signed(name: str) -> bytes:
     return subprocess.run(command.split(), check=True, capture_output=True).stdout
 
 
+class _Listener(socket.socket):
+    """A listening socket with MAX_CONNECTIONS accepted ones at once, those in a handshake among
+    them; others are closed.
+    """
+
+    def __init__(self, listen: Address) -> None:
+        super().__init__(socket.AF_INET6 if ":" in listen.host else socket.AF_INET)
+        self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.setblocking(False)
+        self._accepted: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+        try:
+            self.bind(socket.getaddrinfo(*listen, self.family)[0][4])
+            self.listen()
+        except OSError:
+            self.close()
+            raise
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection. Raises ConnectionAbortedError if it was closed at once."""
+        connection, address = super().accept()
+        if sum(one.fileno() >= 0 for one in self._accepted) >= MAX_CONNECTIONS:
+            connection.close()
+            raise ConnectionAbortedError
+        self._accepted.add(connection)
+        return connection, address
+
+
 class WebServer:
     """A server of some routes: by HTTPS with a certificate, else by HTTP.
 
@@ -111,6 +142,7 @@ class WebServer:
         self.scheme = "https" if certificate else "http"
         self._unknown, self._certificate, self._host = unknown, certificate, ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
+        self._silent: set[web.RequestHandler] = set()  # new connections without a request yet
         self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
         self._application.add_routes(routes)
 
@@ -125,13 +157,33 @@ class WebServer:
                 signal.signal(number, lambda *_: self.end())
         runner = web.AppRunner(self._application, access_log=None, handler_cancellation=True, shutdown_timeout=0.1)
         await runner.setup()
+        assert runner.server is not None
+        answering = runner.server
+
+        def connection() -> web.RequestHandler:
+            made = answering()
+            self._silent.add(made)
+            loop.call_later(SILENT_S, self._close_if_silent, made)
+            return made
+
         self._host = listen.host
+        server = None
+        tls = self._certificate and self._certificate.context
         try:
-            await web.TCPSite(runner, *listen, ssl_context=self._certificate and self._certificate.context).start()
-            listening(Address(listen.host, runner.addresses[0][1]))
+            listener = _Listener(listen)
+            limit_s = SILENT_S if tls else None
+            server = await loop.create_server(connection, sock=listener, ssl=tls, ssl_handshake_timeout=limit_s)
+            listening(Address(listen.host, listener.getsockname()[1]))
             await ended.wait()
         finally:
+            if server is not None:
+                server.close()
             await runner.cleanup()
+
+    def _close_if_silent(self, connection: web.RequestHandler) -> None:
+        if connection in self._silent:
+            self._silent.discard(connection)
+            connection.force_close()
 
     def has_token(self, given: str) -> bool:
         """True for the token of this run."""
@@ -139,6 +191,7 @@ class WebServer:
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
+        self._silent.discard(request.protocol)
         if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
             return await refused(request, 403, FOREIGN)
         try:

@@ -62,7 +62,7 @@ def page_of_hands(**more: Any) -> Iterator[tuple[HeadsetPage, Heard]]:
         heard = Heard(hearing)
         with Tracker(session) as tracker:
             client = Client(session, timeout_s=1.0)
-            yield HeadsetPage(tracker, client, Latest(session, "thirdhand"), cell="thirdhand", **more), heard
+            yield HeadsetPage(tracker, client, Latest(session, "thirdhand"), **({"cell": "thirdhand"} | more)), heard
 
 
 @contextlib.asynccontextmanager

@@ -5,21 +5,26 @@ each other.
 from __future__ import annotations
 
 import asyncio
+import html
 import json
+import os
+import re
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
+import aiohttp
 import pytest
 import zenoh
 
 from service.client import Client, endpoints, open_session
 from service.contract import cdr
 from service.contract.incidents import ORDERS
-from service.trackers import browser_hands, cell_view
+from service.trackers import browser_hands, cell_view, web_server
 from service.trackers.cell_view import Latest, carried_out
 from service.trackers.pinch import Pinches
-from service.trackers.web_server import FOREIGN
+from service.trackers.web_server import FOREIGN, server_certificate
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from trackers.test_browser_hands import opened, reason
 
@@ -49,6 +54,46 @@ def test_what_is_refused_is_answered_in_words(name: str) -> None:
             writer.close()
 
     with page_of_hands() as (page, _):
+        asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("scheme", ["http", "https"])
+def test_silent_connections_take_no_more_than_their_share(
+    scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page that is open stays so; once the silent ones are closed, others are answered."""
+    monkeypatch.setattr(web_server, "SILENT_S", 0.5)
+    certificate = server_certificate("localhost", tmp_path) if scheme == "https" else None
+
+    async def scenario() -> None:
+        async with serving_page(page) as at, opened(page, at, ssl=False) as socket:
+            host, port = at.rsplit(":", 1)
+            before = len(os.listdir("/proc/self/fd"))
+            silent = [await asyncio.open_connection(host, port) for _ in range(600)]
+            assert len(os.listdir("/proc/self/fd")) - before < 600 + web_server.MAX_CONNECTIONS + 10
+            await socket.send_bytes(hands_message())
+            async with asyncio.timeout(10):
+                for reader, writer in silent:
+                    await reader.read()
+                    writer.close()
+            async with opened(page, at, ssl=False) as another:
+                await another.send_bytes(hands_message(number=1))
+            await heard.until("left", 1)
+
+    with page_of_hands(certificate=certificate) as (page, heard):
+        asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("cell", ["x`+alert(1)+`", "</title><script>", '"', "${alert(1)}", "__TOKEN__"])
+def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, aiohttp.ClientSession() as session:
+            answered = await session.get(f"http://{at}/?token={page.server.token}")
+            title, rest = re.split("</title>", await answered.text(), maxsplit=1)
+            assert title.endswith(f"thirdhand hands: {html.escape(cell)}")
+            assert cell not in rest
+
+    with page_of_hands(cell=cell) as (page, _):
         asyncio.run(scenario())
 
 

@@ -1,4 +1,4 @@
-"""Separation stage: the speed-and-separation rule of ISO/TS 15066 as limits of joint velocity.
+"""Separation stage: limits of joint velocity, modelled on speed and separation monitoring.
 
 For each pair of nearby parts there is a row, `row · dq <= limit`. It limits the speed at which the
 joints move the nearest points of the pair toward each other. Parts that move away from each other
