@@ -167,7 +167,7 @@ def convert(
     `say` is called with messages on missing parts, which the drawing's log shows too. Raises
     RecordingError, ViewerError.
     """
-    recording = Recording.open(recording_path)
+    recording = Recording.open(recording_path).require_whole()
     with tempfile.TemporaryDirectory() as folder:
         urdf = Path(folder) / "arm.urdf"
         urdf.write_text(recording.urdf, encoding="utf-8")

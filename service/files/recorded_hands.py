@@ -104,7 +104,7 @@ def recorded_hands(
     messages = Messages(existing(path))
     next(iter(messages), None)
     if "format" in messages.metadata.get("thirdhand", {}):
-        return _of_session(Recording.open(path), settings, skill, part)
+        return _of_session(Recording.open(path).require_whole(), settings, skill, part)
     return _of_take(path, settings, skill, part)
 
 

@@ -231,9 +231,13 @@ def _take_hint(path: Path) -> str:
 class Recording:
     """A recording on disk: its settings, its skill, and its steps."""
 
-    def __init__(self, path: Path, settings: Settings, attached: Mapping[str, bytes], metadata: dict[str, str]) -> None:
+    def __init__(
+        self, path: Path, settings: Settings, attached: Mapping[str, bytes], metadata: dict[str, str], damage: str
+    ) -> None:
         self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, ends_early(path)
-        self.skill, self.urdf = attached["skill.npz"], attached.get("arm.urdf", b"").decode(errors="replace")
+        self.skill = attached.get("skill.npz", b"")  # empty if it is damaged, and so is `urdf`
+        self.urdf = attached.get("arm.urdf", b"").decode(errors="replace")
+        self._damage = damage  # before the first message
         checksums = attached.get(CHECKSUMS, b"")
         self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
         self.faults: list[FileFault] = []  # complete once all steps are read
@@ -245,15 +249,12 @@ class Recording:
         messages = Messages(path)
         next(iter(messages), None)
         about, parts = messages.metadata.get("thirdhand"), messages.attachments
-        needed = ["settings.json", "skill.npz", *(["arm.urdf"] if messages.faults else [])]
+        needed = ["settings.json"] if messages.faults else ["settings.json", "skill.npz"]
         if about is None or any(name not in parts for name in needed):
             if any(fault.cut for fault in messages.faults):
                 raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
             if messages.faults:
-                raise RecordingError(
-                    f"{path} lacks settings, skill or arm, which a replay needs: "
-                    + "; ".join(map(str, messages.faults))
-                )
+                raise RecordingError(f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}")
             raise RecordingError(
                 f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
                 + _take_hint(path)
@@ -266,7 +267,16 @@ class Recording:
             settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
         except (msgspec.DecodeError, InvalidError) as error:
             raise RecordingError(f"the settings in {path} are not valid: {in_words(error, named=False)}") from None
-        return cls(path, settings, parts, about)
+        return cls(path, settings, parts, about, "; ".join(map(str, messages.faults)))
+
+    def require_whole(self) -> Self:
+        """This recording. Raises RecordingError if its skill or its arm is damaged."""
+        lacking = [name for name, part in (("skill", self.skill), ("arm", self.urdf)) if not part]
+        if lacking and self._damage:
+            raise RecordingError(
+                f"{self.path} lacks its {' and '.join(lacking)}, without which only a report is possible: {self._damage}"
+            )
+        return self
 
     def ticks(self) -> int | None:
         """The number of ticks in the file's summary; None if the summary is missing."""

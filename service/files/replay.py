@@ -106,7 +106,7 @@ def replay(
     tick, and again from the state after each gap. Two recordings join without a gap if the second
     begins with the last state of the first. Raises RecordingError.
     """
-    recordings = [Recording.open(path) for path in (first, *more)]
+    recordings = [Recording.open(path).require_whole() for path in (first, *more)]
     if output is not None and (more or output.resolve() == Path(first).resolve()):
         raise RecordingError(f"--output {output}: a file other than the recording, and a single recording, needed")
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))

@@ -20,9 +20,12 @@ from service.contract.messages import PoseStamped
 from service.core.frame import encode
 from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
 from service.files.mcap_file import McapFile, RecordingError
+from service.files.recorded_hands import recorded_hands
 from service.files.recording import Recorder, Recording
+from service.files.replay import replayed
 from service.files.steps import Step
 from service.learning.demonstration import Demonstration
+from service.report.report import reported
 from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
 
 COUNT = 600
@@ -137,9 +140,18 @@ def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whol
 
 
 def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes) -> None:
-    (tmp_path / "a.mcap").write_bytes(flipped(whole, whole.index(b"skill.npz") + 300))
-    with pytest.raises(RecordingError, match=r"lacks settings, skill or arm.*an attachment's checksum is wrong"):
-        Recording.open(tmp_path / "a.mcap")
+    path = tmp_path / "a.mcap"
+    for at in (whole.index(b"skill.npz") + 300, whole.index(b"arm.urdf") + 300):
+        path.write_bytes(flipped(whole, at))
+        for use in (replayed, recorded_hands, lambda path: convert(path, tmp_path / "a.rrd")):
+            with pytest.raises(RecordingError, match=r"lacks its (skill|arm), .*an attachment's checksum is wrong"):
+                use(path)
+        columns = reported(path).columns
+        assert columns.ticks.tolist() == list(range(COUNT))
+        assert any("an attachment's checksum is wrong" in gap for gap in columns.gaps)
+    path.write_bytes(flipped(whole, whole.index(b"settings.json") + 300))
+    with pytest.raises(RecordingError, match=r"lacks its settings: .*an attachment's checksum is wrong"):
+        Recording.open(path)
 
 
 def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> None:
