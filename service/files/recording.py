@@ -273,9 +273,8 @@ class Recording:
         """This recording. Raises RecordingError if its skill or its arm is damaged."""
         lacking = [name for name, part in (("skill", self.skill), ("arm", self.urdf)) if not part]
         if lacking and self._damage:
-            raise RecordingError(
-                f"{self.path} lacks its {' and '.join(lacking)}, without which only a report is possible: {self._damage}"
-            )
+            what = " and ".join(lacking)
+            raise RecordingError(f"{self.path} lacks its {what}; only a report does without: {self._damage}")
         return self
 
     def ticks(self) -> int | None:
