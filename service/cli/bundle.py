@@ -29,7 +29,7 @@ from service.settings.whole_file import whole
 
 LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
 _KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL)
-_PARAMETERS = re.compile(r"""\b((?:tcp|tls|udp|quic|ws|serial|vsock|unix[\w-]+)/[^\s"',#]+)#[^\s"',]+""")
+_PARAMETERS = re.compile(r"""\b([a-z][\w+-]*/[^\s"'#]+)#[^\s"']*[^\s"',]""")
 HEAD = """This archive holds no keys, certificates, parameters of endpoints or files of Zenoh.
 Recordings show how hands and arm moved. Read it before you pass it on.\n\n"""
 

@@ -107,6 +107,8 @@ def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pyt
         ("listen tcp/[::1]:7447#a=b, as", "listen tcp/[::1]:7447#(left out), as"),
         ('["tls/bench.local:7447#key=y","udp/1.2.3.4:1"]', '["tls/bench.local:7447#(left out)","udp/1.2.3.4:1"]'),
         ("unixsock-stream//run/x.sock#key=y", "unixsock-stream//run/x.sock#(left out)"),
+        ("tls/a:1#iface=lo,key=y, or", "tls/a:1#(left out), or"),
+        ("a-new-one/a:1#key=y;other=z,w", "a-new-one/a:1#(left out)"),
         ("# a comment, stage #2, tcp/127.0.0.1:7447", "# a comment, stage #2, tcp/127.0.0.1:7447"),
         ("cut: -----BEGIN PRIVATE KEY-----\nMHcC", "cut: (a private key, left out)"),
     ],
