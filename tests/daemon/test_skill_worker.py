@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from service.contract.requests import ViaPoint
@@ -27,10 +26,11 @@ PLACES = Scene().via_points()
 SOLDERING = RECORDINGS / "soldering.npz"
 
 
-def newest_child() -> int:
-    """The process id of the skill worker that was started last."""
-    found = [process for process in psutil.Process().children() if process.name().startswith("skill worker")]
-    return max(found, key=lambda process: process.create_time()).pid
+def process_of(worker: SkillWorker) -> int:
+    """The process id of a skill worker that runs."""
+    pid = worker.start().pid
+    assert pid is not None
+    return pid
 
 
 def is_there(pid: int) -> bool:
@@ -93,20 +93,20 @@ def test_errors_come_back_with_their_words(skill_worker: SkillWorker, skill: Ski
 
 def test_an_error_does_not_end_the_process(skill_worker: SkillWorker, skill: Skill, tmp_path: Path) -> None:
     skill_worker.load(SOLDERING)
-    started = newest_child()
+    started = process_of(skill_worker)
     with pytest.raises(SkillError):
         skill_worker.load(tmp_path / "nowhere.npz")
     assert_same_bits(skill_worker.load(SOLDERING), skill)
-    assert newest_child() == started
+    assert process_of(skill_worker) == started
 
 
 def test_a_killed_process_is_replaced_at_the_next_request(skill_worker: SkillWorker, skill: Skill) -> None:
     skill_worker.load(SOLDERING)
-    started = newest_child()
+    started = process_of(skill_worker)
     os.kill(started, signal.SIGKILL)
     os.waitid(os.P_PID, started, os.WEXITED | os.WNOWAIT)  # until it is dead; the skill worker finds that out itself
     assert_same_bits(skill_worker.load(SOLDERING), skill)
-    assert newest_child() != started
+    assert process_of(skill_worker) != started
     assert not is_there(started)
 
 
@@ -122,7 +122,7 @@ def test_closing_leaves_no_process_and_may_be_repeated(skill: Skill) -> None:
     skill_worker = SkillWorker()
     skill_worker.close()
     assert_same_bits(skill_worker.load(SOLDERING), skill)
-    started = newest_child()
+    started = process_of(skill_worker)
     skill_worker.close()
     skill_worker.close()
     assert not is_there(started)
@@ -149,12 +149,12 @@ def test_a_slow_workshop_is_waited_for_and_what_it_has_imported_stays(
             said.append(str(refused.value))
         assert 1 < len(said) < 300  # each went on where the one before was
         assert "cannot read skill" in said[-1]
-        first = newest_child()
+        first = process_of(worker)
         with pytest.raises(SkillError, match=r"did not answer within 0\.0001 s; nothing was changed"):
             worker.load(SOLDERING, timeout_s=0.0001)
         with pytest.raises(SkillError, match="cannot read skill"):  # a new one, which imports nothing
             worker.load(tmp_path / "nothing.npz", timeout_s=2.0)
-        assert newest_child() != first
+        assert process_of(worker) != first
     finally:
         worker.close()
         server.close()
@@ -165,16 +165,16 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
     worker = SkillWorker()
     try:
         worker.load(SOLDERING)
-        stopped = newest_child()
+        stopped = process_of(worker)
         os.kill(stopped, signal.SIGSTOP)
         with pytest.raises(SkillError, match=r"made no progress for 0\.5 s; nothing was changed"):
             worker.load(SOLDERING)
         assert not is_there(stopped)
         assert_same_bits(worker.load(SOLDERING), skill)
-        slowed = newest_child()
+        slowed = process_of(worker)
         os.kill(slowed, signal.SIGSTOP)
         threading.Timer(0.3, os.kill, [slowed, signal.SIGCONT]).start()
         assert_same_bits(worker.load(SOLDERING), skill)
-        assert newest_child() == slowed
+        assert process_of(worker) == slowed
     finally:
         worker.close()
