@@ -23,7 +23,7 @@ from service.contract import requests
 from service.contract.explain import InvalidError, in_words, validated
 from service.files.shipped import ARMS, cell_of
 from service.settings.config import Reach
-from service.settings.file_content import SettingsError
+from service.settings.file_content import SettingsError, UnusableError, text_in
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -179,8 +179,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def load(path: Path) -> Scene:
         """The scene in a TOML file; places that are not given are nominal. Raises SceneError."""
         try:
-            return validated(tomllib.loads(path.read_text(encoding="utf-8")), Scene)
-        except (OSError, UnicodeDecodeError) as error:
+            return validated(tomllib.loads(text_in(path)), Scene)
+        except (OSError, UnusableError) as error:
             raise SceneError(f"cannot read scene {path}: {in_words(error, named=False)}") from None
         except (tomllib.TOMLDecodeError, InvalidError) as error:
             raise SceneError(f"{path}: {error}") from None

@@ -15,7 +15,7 @@ import zenoh
 from service.client.session import open_session
 from service.contract.channels import ENDPOINT, CellName, lacking
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
+from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in
 
 if sys.version_info >= (3, 11):  # noqa: UP036, as the client alone runs on 3.10 too
     import tomllib
@@ -107,8 +107,8 @@ def _read(path: Path) -> dict[str, Any]:
     SettingsError.
     """
     try:
-        given = tomllib.loads(content(path, LARGEST_CONFIGURATION).decode())
-    except (OSError, UnusableError, UnicodeDecodeError) as error:
+        given = tomllib.loads(text_in(path))
+    except (OSError, UnusableError) as error:
         raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
     except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: {error}") from None

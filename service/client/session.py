@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import re
@@ -267,7 +268,8 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
         return zenoh.Config()
     try:
         file = Path(path).expanduser()
-        content(file, LARGEST_CONFIGURATION)
+        if content(file, LARGEST_CONFIGURATION).startswith(codecs.BOM_UTF8):
+            raise UnusableError("Zenoh reads no byte order mark: save it as UTF-8 without one")
         return zenoh.Config.from_file(file)
     except (OSError, RuntimeError, UnusableError, zenoh.ZError) as error:
         reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())

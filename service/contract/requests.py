@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 from typing import Annotated, Any, Literal, TypeAlias
@@ -198,6 +199,7 @@ def decode_request(data: bytes, kind: Any) -> Any:
 
     Raises RequestError like "$.points[0].left: 2 numbers, 3 needed".
     """
+    data = data.removeprefix(codecs.BOM_UTF8)
     try:
         given = msgspec.json.decode(data or b"{}")
         json.loads(data or b"{}", object_pairs_hook=_check_once)

@@ -19,7 +19,7 @@ from service.contract.channels import CellName
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.messages import BASE
 from service.settings.arm_description import check, completed, description
-from service.settings.file_content import LARGEST_CONFIGURATION, SettingsError, UnreadableError, UnusableError, content
+from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in
 from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
@@ -607,7 +607,7 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
 def load(path: Path, cell: str = "") -> Settings:
     """Settings from a TOML file, of one of its cells. Raises SettingsError, UnreadableError."""
     try:
-        text = content(path, LARGEST_CONFIGURATION, accepts_pipes=True).decode()
-    except (OSError, UnusableError, UnicodeDecodeError) as error:
+        text = text_in(path, accepts_pipes=True)
+    except (OSError, UnusableError) as error:
         raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
     return parse(text, origin=str(path), folder=path.parent, cell=cell)

@@ -4,6 +4,7 @@ errors of a configuration.
 
 from __future__ import annotations
 
+import codecs
 import stat
 from pathlib import Path
 
@@ -40,3 +41,15 @@ def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> b
     if len(data) > largest_bytes:
         raise UnusableError(f"it has more than {largest_bytes} bytes")
     return data
+
+
+def text_in(path: Path, *, accepts_pipes: bool = False) -> str:
+    """The text of a file in UTF-8, of at most LARGEST_CONFIGURATION bytes, without a byte order
+    mark. Raises OSError, UnusableError.
+    """
+    data = content(path, LARGEST_CONFIGURATION, accepts_pipes=accepts_pipes)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        kind = "UTF-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else f"not at byte {error.start}"
+        raise UnusableError(f"text in UTF-8 needed, and it is {kind}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import math
@@ -13,6 +14,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from service.client.client_settings import client_settings
+from service.contract.requests import List, ViaPointsRequest, decode_request
 from service.daemon.launch import described
 from service.files.shipped import cell_of
 from service.settings.config import (
@@ -27,6 +30,7 @@ from service.settings.config import (
 )
 from service.settings.file_content import SettingsError
 from service.settings.network import Network, is_local
+from sim.scene import Scene, SceneError
 from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
 
 
@@ -286,6 +290,31 @@ def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float
         functools.reduce(lambda part, key: part[key], path[:-1], given)[path[-1]] = number
         with pytest.raises(SettingsError, match=str(path[-1]) if isinstance(path[-1], str) else str(path[-2])):
             converted(given, origin="cell.toml")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"),
+    [
+        ("utf-8-sig", ""),
+        ("utf-16", "text in UTF-8 needed, and it is UTF-16"),
+        ("latin-1", "text in UTF-8 needed, and it is not at byte 11"),
+    ],
+)
+def test_a_text_of_another_encoding_is_read_or_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str, words: str
+) -> None:
+    """As editors of Windows write it: settings, a client's settings and a scene."""
+    path = tmp_path / "thirdhand" / "client.toml"
+    path.parent.mkdir()
+    path.write_text("# for the \u00e4rm\n", encoding=encoding)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    for read in (load, lambda _: client_settings(), Scene.load):
+        refused = pytest.raises((SettingsError, SceneError), match=words) if words else contextlib.nullcontext()
+        with refused:
+            read(path)
+    if not words:
+        data = path.read_bytes()
+        assert decode_request(data[:3] + b'{"op": "list"}', ViaPointsRequest) == List()
 
 
 @pytest.mark.parametrize("section", ["tool", "hands"])

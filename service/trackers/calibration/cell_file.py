@@ -18,7 +18,7 @@ import tomlkit.exceptions
 
 from service.contract.explain import InvalidError, in_words, validated
 from service.settings.config import Settings, load, parse
-from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+from service.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content, text_in
 from service.settings.whole_file import whole
 from service.trackers.calibration.solver import Calibration, CalibrationError
 
@@ -66,7 +66,7 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
         path = real_path(path)
     except CalibrationError as error:
         raise CalibrationError(f"{error}. {by_hand}") from None
-    before, text = load(path), content(path, LARGEST_CONFIGURATION).decode()
+    before, text = load(path), text_in(path)
     try:
         document = tomlkit.parse(text)
         section: Any = document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
