@@ -100,3 +100,16 @@ def test_an_arm_stands_where_it_is_told_with_its_meshes(tmp_path: Path) -> None:
     cell = load(tmp_path / "c.toml")
     assert cell.reach.centre == pytest.approx((0.1, -0.3, 0.139), abs=1e-3)
     assert cell.arm.urdf == str(tmp_path / "c.urdf")
+
+
+ONE_JOINT = """<robot name="r"><link name="l0"/><link name="l1"/><joint name="j0" type="revolute"><parent link="l0"/>
+<child link="l1"/><origin xyz="0 0 1"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="10"/></joint>
+</robot>"""
+
+
+def test_an_arm_that_does_not_move_its_tool_is_refused_in_words(tmp_path: Path) -> None:
+    (tmp_path / "one.urdf").write_text(ONE_JOINT)
+    done = told("arm", str(tmp_path / "one.urdf"), "--output", str(tmp_path / "cell.toml"))
+    assert done.returncode in (1, 2)
+    assert "its joints move the tool by 0 mm" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["one.urdf"]

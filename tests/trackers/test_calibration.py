@@ -324,6 +324,21 @@ def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -
         solved(streams._replace(hands={}), Settings(), CORNERS, None)
 
 
+@pytest.mark.parametrize(
+    ("axes", "words"), [((1e3, 1e3, 1e3), "moves 1000 times as far as the tool.*publish mm"), ((1, 1, -1), "mirrored")]
+)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_cause_is_that_of_the_hand_that_moved(side: str, axes: tuple[float, ...], words: str) -> None:
+    """The other one rests on the bench, and is seen by the same tracker."""
+    held = held_by("mocap")
+    held = held._replace(hand=held.hand * axes)
+    noise = np.random.default_rng(2).normal(0.0, 0.001, held.hand.shape) * axes
+    other = "left" if side == "right" else "right"
+    streams = led_of(held, side, **{other: held._replace(hand=held.hand[0] + noise)})
+    with pytest.raises(CalibrationError, match=f"the {side} hand: .*{words}"):
+        solved(streams, Settings(), CORNERS, None)
+
+
 def test_each_hand_is_mapped_by_the_table_of_its_own_tracker() -> None:
     held = held_by("mocap")
     free = held._replace(hand=held.hand[::-1].copy())

@@ -27,6 +27,7 @@ from service.trackers.calibration.solver import (
     CalibrationError,
     Coverage,
     HeldTool,
+    UnrelatedError,
     coverage,
     solve_held,
 )
@@ -270,7 +271,11 @@ def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None
         )
     if not errors:
         raise CalibrationError("no hand arrives: is the tracker running?")
-    raise errors[side] if side is not None else next(iter(errors.values()))
+    if side is not None:
+        raise errors[side]
+    # The hand that moved with the tool, if there is one: the other may rest.
+    blamed = min(errors, key=lambda one: isinstance(errors[one], UnrelatedError))
+    raise CalibrationError(f"the {blamed} hand: {errors[blamed]}" if len(errors) > 1 else str(errors[blamed]))
 
 
 class LedProgress(NamedTuple):
