@@ -30,7 +30,7 @@ from service.learning.learn import learn as learned
 from service.learning.picture import draw
 from service.learning.records import Evidence
 from service.learning.residual_risk import LONGEST_NAME, OPTION
-from service.learning.skill_file import skill_in
+from service.learning.skill_file import skill_in, unusable_name
 from service.learning.stored_demonstrations import stored_demonstrations
 from service.learning.table import table
 from service.learning.takes import check_count
@@ -124,6 +124,9 @@ def learn(args: argparse.Namespace) -> int:
     accepted_by = (args.accept_residual_risk or "").strip()
     if len(accepted_by) > LONGEST_NAME:
         raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
+    name = args.output.stem if args.name is None else args.name
+    if lacking := unusable_name(name):
+        raise UsageError(f"--{lacking}")
     if args.demonstrations[0].exists():  # else its reader reports the missing file
         check_count([path.stem for path in args.demonstrations])
     if refined := skill_in(args.refined) if args.refined else None:
@@ -142,7 +145,7 @@ def learn(args: argparse.Namespace) -> int:
     with steps("learning") as doing:
         skill = learned(
             demonstrations,
-            name=args.name or args.output.stem,
+            name=name,
             names=[path.stem for path in args.demonstrations],
             delay_s=args.delay,
             reach=settings.reach if settings else None,

@@ -35,6 +35,7 @@ from service.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT
 from service.learning.residual_risk import ResidualRisk
 from service.settings.file_content import UnusableError, content
 
+LONGEST_SKILL_NAME = 128  # [characters]
 SKILL_FORMAT = 6
 TURN, GRIPPER = "turn.", "gripper."  # prefixes of the arrays of their primitives
 LARGEST_FILE, MOST_ARRAYS = 100_000_000, 500  # [B] unpacked, and in how many arrays; a skill has below a hundred
@@ -315,8 +316,17 @@ def _is_json(array: NDArray[Any]) -> bool:
     return array.dtype.kind == "U" and len(str(array)) <= LONGEST_FIGURES
 
 
+def unusable_name(name: str) -> str:
+    """What is wrong with a skill's name; empty if it is a name."""
+    if name.strip() and len(name) <= LONGEST_SKILL_NAME and not {"/", "\\"} & set(name):
+        return ""
+    return f"name: {name[:60]!r} given; 1 to {LONGEST_SKILL_NAME} characters without slashes accepted"
+
+
 def _faults(skill: Skill) -> Iterator[str]:
-    """Faults of a skill that would harm the motion."""
+    """Faults of a skill that would harm the motion or mislead a reader."""
+    if lacking := unusable_name(skill.name):
+        yield lacking
     primitive, needed = skill.model.primitive, skill.model.shape
     inputs, outputs = primitive.inputs.shape[1], primitive.outputs
     if (inputs, outputs) != needed:

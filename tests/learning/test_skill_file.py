@@ -244,3 +244,18 @@ def test_a_damaged_archive_is_told_from_what_never_was_one(skill: Skill) -> None
         for begin in (b"", b"P", b"PK", b"PK\x03", b"PK\x07\x08"):
             with pytest.raises(SkillError, match=r"^x: not a skill \(no \.npz archive\)$"):
                 decoded(begin + bytes(random.randrange(256) for _ in range(200)), origin="x")
+
+
+@pytest.mark.parametrize("name", ["", "  ", "a/b", "..\\x", "x" * 129])
+def test_a_name_that_is_empty_or_a_path_is_refused(learned: Skill, name: str) -> None:
+    with pytest.raises(SkillError, match="1 to 128 characters without slashes accepted"):
+        decoded(with_file(replace(learned, name=name)).file, origin="a file")
+
+
+def test_an_archive_of_too_many_arrays_is_refused_at_once(learned: Skill) -> None:
+    out = io.BytesIO(learned.file)
+    with zipfile.ZipFile(out, "a") as archive:
+        for number in range(1000):
+            archive.writestr(f"{number}.npy", b"")
+    with pytest.raises(SkillError, match="arrays in an archive, at most 500 accepted"):
+        decoded(out.getvalue(), origin="a file")
