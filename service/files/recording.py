@@ -249,9 +249,12 @@ class Recording:
         messages = Messages(path)
         next(iter(messages), None)
         about, parts = messages.metadata.get("thirdhand"), messages.attachments
-        needed = ["settings.json"] if messages.faults else ["settings.json", "skill.npz"]
+        is_cut = any(fault.cut for fault in messages.faults)
+        needed = ["settings.json"]  # of a file that is damaged; one that is cut has no ticks for a report
+        if is_cut or not messages.faults:
+            needed += ["skill.npz", *(["arm.urdf"] if is_cut else [])]
         if about is None or any(name not in parts for name in needed):
-            if any(fault.cut for fault in messages.faults):
+            if is_cut:
                 raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
             if messages.faults:
                 raise RecordingError(f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}")

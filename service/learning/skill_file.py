@@ -318,9 +318,9 @@ def _is_json(array: NDArray[Any]) -> bool:
 
 def unusable_name(name: str) -> str:
     """What is wrong with a skill's name; empty if it is a name."""
-    if name.strip() and len(name) <= LONGEST_SKILL_NAME and not {"/", "\\"} & set(name):
+    if name.strip() and len(name) <= LONGEST_SKILL_NAME and "/" not in name:
         return ""
-    return f"name: {name[:60]!r} given; 1 to {LONGEST_SKILL_NAME} characters without slashes accepted"
+    return f"name: {name[:60]!r} given; 1 to {LONGEST_SKILL_NAME} characters without / accepted"
 
 
 def _faults(skill: Skill) -> Iterator[str]:

@@ -47,7 +47,7 @@ MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9  # sizes of numbers but 0; powers of others overflow, or are 0
 FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
-LEAST_REACH_M = 0.01  # an arm that moves its tool by less is none
+LEAST_OUTER_M = 0.01  # an arm that moves its tool by less is none
 MOST_DOTS = 1000  # in a line of a configuration
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
@@ -544,7 +544,7 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
     )
     reach = settings.reach
     found = workspace.shell(reach.min_x, reach.min_z)
-    if found.outer < LEAST_REACH_M:
+    if found.outer < LEAST_OUTER_M:
         raise SettingsError(
             f"[arm] plate: its joints move the tool by {1000 * found.outer:.0f} mm; an arm that moves it, or a pose of "
             "the tool away from the last axis ([tool] plate_from_tool), needed"

@@ -35,7 +35,7 @@ JAVASCRIPT = "text/javascript; charset=utf-8"
 INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 MAX_BODY_BYTES = 4096  # of a request
 MAX_CONNECTIONS = 256  # at once: some for each page; a process may often open 1024 files
-SILENT_S = 5.0  # a handshake, and then the first request, must be complete after this time
+REQUEST_WITHIN_S = 5.0  # a handshake, and then the first request, must be complete after this time
 FOREIGN = "This page answers at this machine's own address only, and only to itself."
 MAX_PAGE_MESSAGE_BYTES = 256  # of a websocket
 CLOSE_CODE = 4000  # a websocket is refused with this close code plus the status of HTTP
@@ -163,7 +163,7 @@ class WebServer:
         def connection() -> web.RequestHandler:
             made = answering()
             self._silent.add(made)
-            loop.call_later(SILENT_S, self._close_if_silent, made)
+            loop.call_later(REQUEST_WITHIN_S, self._close_if_silent, made)
             return made
 
         self._host = listen.host
@@ -171,7 +171,7 @@ class WebServer:
         tls = self._certificate and self._certificate.context
         try:
             listener = _Listener(listen)
-            limit_s = SILENT_S if tls else None
+            limit_s = REQUEST_WITHIN_S if tls else None
             server = await loop.create_server(connection, sock=listener, ssl=tls, ssl_handshake_timeout=limit_s)
             listening(Address(listen.host, listener.getsockname()[1]))
             await ended.wait()

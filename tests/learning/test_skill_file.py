@@ -246,9 +246,9 @@ def test_a_damaged_archive_is_told_from_what_never_was_one(skill: Skill) -> None
                 decoded(begin + bytes(random.randrange(256) for _ in range(200)), origin="x")
 
 
-@pytest.mark.parametrize("name", ["", "  ", "a/b", "..\\x", "x" * 129])
+@pytest.mark.parametrize("name", ["", "  ", "a/b", "x" * 129])
 def test_a_name_that_is_empty_or_a_path_is_refused(learned: Skill, name: str) -> None:
-    with pytest.raises(SkillError, match="1 to 128 characters without slashes accepted"):
+    with pytest.raises(SkillError, match="1 to 128 characters without / accepted"):
         decoded(with_file(replace(learned, name=name)).file, origin="a file")
 
 

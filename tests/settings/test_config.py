@@ -297,7 +297,7 @@ def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float
     [
         ("utf-8-sig", ""),
         ("utf-16", "text in UTF-8 needed, and it is UTF-16"),
-        ("latin-1", "text in UTF-8 needed, and it is not at byte 11"),
+        ("latin-1", "text in UTF-8 needed, and it is not at byte 10"),
     ],
 )
 def test_a_text_of_another_encoding_is_read_or_named(

@@ -376,7 +376,7 @@ def _check_scale(matrix: Vector, section: str) -> None:
     unit = min(TRACKER_UNITS_M, key=lambda name: abs(math.log(TRACKER_UNITS_M[name] / scale)))
     if not 1 / MAX_SCALE_ERROR < TRACKER_UNITS_M[unit] / scale < MAX_SCALE_ERROR:
         unit = ""
-    times = f"{1 / scale:.0f}" if scale < 0.01 else f"{1 / scale:.3g}"
+    times = f"{float(f'{1 / scale:.2g}'):g}"
     found = f"the hand moves {times} times as far as the tool"
     if unit in ("mm", "cm"):
         raise CalibrationError(f'{found}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"')
