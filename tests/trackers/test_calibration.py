@@ -79,7 +79,10 @@ def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: 
     """And how accurately it does: errors are about as large as they are expected to be."""
     errors, shares = [], []
     for seed in SEEDS:
-        found = solve_held(held_by(kind, arm=arm, seed=seed), bench_corners(cell_of(arm)))
+        tool = held_by(kind, arm=arm, seed=seed)
+        found = solve_held(tool, bench_corners(cell_of(arm)))
+        with pytest.raises(CalibrationError, match="mirrored"):
+            solve_held(tool._replace(hand=tool.hand * (1, 1, -1)), bench_corners(cell_of(arm)))
         errors.append(1e3 * error_m(found))
         corners = np.array(found.corners)
         off_m = np.linalg.norm(found.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1)

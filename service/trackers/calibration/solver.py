@@ -44,7 +44,9 @@ MIN_EXTENT_M = 0.05  # the positions must extend this far in their narrowest dir
 EXTENT_DEVIATIONS = 4.0  # extent of positions or orientations / their standard deviation
 TRACKER_UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
 MAX_SCALE_ERROR = 1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
-MIRRORED_RATIO = 0.5  # the residual with the right sense of the axes is below this share of that with the other
+# The residual with the right sense of the axes is below this share of that with the other sense: of
+# points, of which a few agree by chance, and of a held tool.
+MIRRORED_RATIO, HELD_MIRRORED_RATIO = 0.5, 0.75
 MAX_UNEXPLAINED = 0.5  # the residual of a hand at the tool is at most this share of the tool's motion
 BENCH_HEIGHT_M = 0.4  # the bench extends from the table top to this height
 CONFIDENCE = 0.99  # of the upper limit of the errors' variance: few samples may agree by chance
@@ -296,17 +298,17 @@ def _check_sense(problem: _Problem, matrix: Vector, fit: _Fit) -> None:
         fits[:] = True
     tool, turn = problem.tool_at(fit.delay_s)
     _check_extent(coverage(tool[fits], turn.as_quat()[fits]), () if problem.is_held else np.flatnonzero(~fits))
-    middle = np.median if problem.is_held else np.mean
+    middle, ratio = (np.median, HELD_MIRRORED_RATIO) if problem.is_held else (np.mean, MIRRORED_RATIO)
     off_mm = 1e3 * float(middle(fit.off[fits]))
     mirrored_mm = 1e3 * float(middle(mirrored.off[fits]))
     differ = f"the residual is {off_mm:.0f} mm, and {mirrored_mm:.0f} mm with one axis reversed"
-    if mirrored_mm < MIRRORED_RATIO * off_mm:
+    if mirrored_mm < ratio * off_mm:
         raise CalibrationError(
             f"the tracker's axes are mirrored (left-handed): {differ}. base_from_tracker cannot express "
             "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change "
             f"{problem.section} axes"
         )
-    if off_mm > MIRRORED_RATIO * mirrored_mm:
+    if off_mm > ratio * mirrored_mm:
         raise CalibrationError(
             f"the positions do not tell whether the tracker's axes are mirrored (left-handed): {differ}. "
             "Repeat the positions, two or more of them at least 20 cm above the others"
