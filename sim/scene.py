@@ -13,17 +13,16 @@ from service.process import one_blas_thread  # noqa: F401
 import argparse
 import math
 import sys
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 
 from service.contract import requests
-from service.contract.explain import InvalidError, in_words, validated
+from service.contract.explain import in_words, validated
 from service.files.shipped import ARMS, cell_of
 from service.settings.config import Reach
-from service.settings.file_content import SettingsError, UnusableError, text_in
+from service.settings.file_content import SettingsError, UnusableError, text_in, toml_in
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
@@ -179,10 +178,10 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def load(path: Path) -> Scene:
         """The scene in a TOML file; places that are not given are nominal. Raises SceneError."""
         try:
-            return validated(tomllib.loads(text_in(path)), Scene)
+            return validated(toml_in(text_in(path)), Scene)
         except (OSError, UnusableError) as error:
             raise SceneError(f"cannot read scene {path}: {in_words(error, named=False)}") from None
-        except (tomllib.TOMLDecodeError, InvalidError) as error:
+        except ValueError as error:
             raise SceneError(f"{path}: {error}") from None
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,12 +14,7 @@ import zenoh
 from service.client.session import open_session
 from service.contract.channels import ENDPOINT, CellName, lacking
 from service.contract.explain import InvalidError, in_words, validated
-from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in
-
-if sys.version_info >= (3, 11):  # noqa: UP036, as the client alone runs on 3.10 too
-    import tomllib
-else:
-    import tomli as tomllib
+from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
 
@@ -107,10 +101,10 @@ def _read(path: Path) -> dict[str, Any]:
     SettingsError.
     """
     try:
-        given = tomllib.loads(text_in(path))
+        given = toml_in(text_in(path))
     except (OSError, UnusableError) as error:
         raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SettingsError(f"{path}: {error}") from None
     if isinstance(given.get("connect"), str):
         given["connect"] = [given["connect"]]

@@ -317,7 +317,7 @@ def _is_json(array: NDArray[Any]) -> bool:
 
 
 def unusable_name(name: str) -> str:
-    """What is wrong with a skill's name; empty if it is a name."""
+    """The reason why a text cannot be the name of a skill; empty if it can."""
     if name.strip() and len(name) <= LONGEST_SKILL_NAME and "/" not in name:
         return ""
     return f"name: {name[:60]!r} given; 1 to {LONGEST_SKILL_NAME} characters without / accepted"

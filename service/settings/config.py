@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -19,7 +18,7 @@ from service.contract.channels import CellName
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.messages import BASE
 from service.settings.arm_description import check, completed, description
-from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in
+from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
 from service.settings.network import Network, Ros2
 from service.settings.urdf import Urdf, UrdfError
 
@@ -48,7 +47,6 @@ MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 40
 SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9  # sizes of numbers but 0; powers of others overflow, or are 0
 FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
 LEAST_OUTER_M = 0.01  # an arm that moves its tool by less is none
-MOST_DOTS = 1000  # in a line of a configuration
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 
@@ -591,15 +589,10 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
     """Settings from TOML text, of one of its cells if it has `[cells]`; see `converted`. Raises
     SettingsError.
     """
-    for number, line in enumerate(text.splitlines(), start=1):
-        if (dots := line.count(".")) > MOST_DOTS:  # as parts of one key they would take minutes
-            raise SettingsError(f"{origin}: line {number} has {dots} dots, at most {MOST_DOTS} accepted")
     try:
-        given = tomllib.loads(text)
+        given = toml_in(text)
     except ValueError as error:  # also of a number with too many digits
         raise SettingsError(f"{origin}: {error}") from None
-    except RecursionError:
-        raise SettingsError(f"{origin}: tables or lists are nested too deeply") from None
     given = _of_cell(given, cell, origin)
     return converted(given, origin=origin, folder=folder)
 

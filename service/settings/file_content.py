@@ -6,11 +6,19 @@ from __future__ import annotations
 
 import codecs
 import stat
+import sys
 from pathlib import Path
+from typing import Any
 
 from service.contract.explain import ExplainedError
 
+if sys.version_info >= (3, 11):  # noqa: UP036, as the client alone runs on 3.10 too
+    import tomllib
+else:
+    import tomli as tomllib
+
 LARGEST_CONFIGURATION = 1_000_000  # [bytes]
+MOST_DOTS = 1000  # in a line of TOML
 
 
 class UnusableError(ExplainedError, ValueError):
@@ -53,3 +61,14 @@ def text_in(path: Path, *, accepts_pipes: bool = False) -> str:
     except UnicodeDecodeError as error:
         kind = "UTF-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else f"not at byte {error.start}"
         raise UnusableError(f"text in UTF-8 needed, and it is {kind}") from None
+
+
+def toml_in(text: str) -> dict[str, Any]:
+    """The content of TOML text. Raises ValueError."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if (dots := line.count(".")) > MOST_DOTS:  # as parts of one key they would take minutes
+            raise ValueError(f"line {number} has {dots} dots, at most {MOST_DOTS} accepted")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("tables or lists are nested too deeply") from None

@@ -323,8 +323,16 @@ def test_a_tool_or_tracker_farther_away_than_any_is_refused(section: str) -> Non
     assert "100 m or less on each axis" in refusal(f"[{section}]\n{name} = [101.0, 0, 0, 0, 0, 0, 1]")
 
 
-def test_a_key_of_many_parts_is_refused_before_it_is_read() -> None:
-    assert "line 2 has 19999 dots, at most 1000 accepted" in refusal("\n" + ".".join(["a"] * 20_000) + " = 1")
+def test_a_key_of_many_parts_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "\n" + ".".join(["a"] * 20_000) + " = 1"
+    assert "line 2 has 19999 dots, at most 1000 accepted" in refusal(text)
+    path = tmp_path / "thirdhand" / "client.toml"
+    path.parent.mkdir()
+    path.write_text(text)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    for read in (client_settings, lambda: Scene.load(path)):
+        with pytest.raises((SettingsError, SceneError), match="line 2 has 19999 dots, at most 1000 accepted"):
+            read()
 
 
 def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -193,7 +193,7 @@ def solve_held(
         return _Problem(held.hand[rows], tool_at, section, times_s)
 
     first = _robust(problem(rows))
-    is_near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
+    is_near = _inliers(first.off, first.deviation_m)
     found = problem(rows[is_near])
     hint = f" The tool turned by {_degrees(cover)}" if cover.turned_rad[1] < math.radians(20) else ""
     return _refined(found, first, corners, hint)
@@ -208,10 +208,14 @@ def solve_points(hand: Vector, base: Vector, corners: Vector, *, section: str = 
         raise CalibrationError(f"{len(hand)} points given; {MIN_POINTS} or more needed, 8 recommended")
     _check_extent(coverage(base, Rotation.identity(len(base)).as_quat()))
     first = _robust(_touched(hand, base, section))
-    is_near = first.off < OUTLIER_DEVIATIONS * first.deviation_m
-    if is_near.sum() < MIN_POINTS:
-        is_near[:] = True
+    is_near = _inliers(first.off, first.deviation_m)
     return _refined(_touched(hand[is_near], base[is_near], section), first, corners, "")
+
+
+def _inliers(off_m: Vector, deviation_m: float) -> NDArray[np.bool_]:
+    """True for residuals (N,) [m] that are no outliers; for all if fewer than MIN_POINTS remain."""
+    is_inlier = off_m < OUTLIER_DEVIATIONS * deviation_m
+    return np.asarray(is_inlier if is_inlier.sum() >= MIN_POINTS else np.ones_like(is_inlier))
 
 
 def _touched(hand: Vector, base: Vector, section: str) -> _Problem:
@@ -293,9 +297,7 @@ def _check_sense(problem: _Problem, matrix: Vector, fit: _Fit) -> None:
     start = matrix @ flip if np.linalg.det(matrix) < 0 else fit.turn.as_matrix()
     mirrored = _rigid(problem._replace(hand=fit.centre + moved @ flip), start, fit.centre, fit.delay_s)
     # Each of few points counts that fits in either sense; of many samples, most do.
-    fits = np.minimum(fit.off, mirrored.off) < OUTLIER_DEVIATIONS * min(fit.deviation_m, mirrored.deviation_m)
-    if fits.sum() < MIN_POINTS:
-        fits[:] = True
+    fits = _inliers(np.minimum(fit.off, mirrored.off), min(fit.deviation_m, mirrored.deviation_m))
     tool, turn = problem.tool_at(fit.delay_s)
     _check_extent(coverage(tool[fits], turn.as_quat()[fits]), () if problem.is_held else np.flatnonzero(~fits))
     middle, ratio = (np.median, HELD_MIRRORED_RATIO) if problem.is_held else (np.mean, MIRRORED_RATIO)
