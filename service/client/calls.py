@@ -25,6 +25,7 @@ from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
+REPEATED = 2  # queries within the time of one request, if it may be repeated
 RECONNECTED_S = 2.0  # a connection that broke returns within this time, unless the network or the daemon is down
 LIST = requests.encode_json(requests.List())
 Answer = TypeVar("Answer")
@@ -136,15 +137,20 @@ class Client:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
         acts = suffix != "status" and payload != LIST
         may_repeat = not acts or suffix == "hold"  # a second hold changes nothing, and a lost one must not remain so
-        end_s, is_sent = time.monotonic() + min(RECONNECTED_S, self._timeout_s), False
+        queries_left = REPEATED if may_repeat else 1  # a query, or its answer, may be lost
+        query_s = self._timeout_s / queries_left
+        end_s = time.monotonic() + min(RECONNECTED_S, self._timeout_s)
+        is_sent = False
         while True:
             check_open(self._session)
             is_sent |= is_connected(self._session)
-            answer, is_stored = self._asked(suffix, payload)
+            answer, is_stored = self._asked(suffix, payload, query_s)
             if answer is not None:
                 return answer
+            queries_left -= 1
             is_absent = self._is_absent()
-            if is_absent or (is_sent and not may_repeat) or time.monotonic() > end_s:
+            is_over = queries_left <= 0 and time.monotonic() > end_s
+            if is_absent or (is_sent and not may_repeat) or is_over:
                 break
         silent = f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
         if is_sent and acts and not is_absent:
@@ -153,7 +159,7 @@ class Client:
             silent += " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
         raise UnreachableError(silent)
 
-    def _asked(self, suffix: str, payload: bytes) -> tuple[bytes | None, bool]:
+    def _asked(self, suffix: str, payload: bytes, timeout_s: float) -> tuple[bytes | None, bool]:
         """The answer of a live daemon to one query, None if there is none; True if a storage
         answered.
         """
@@ -165,7 +171,7 @@ class Client:
             # With other targets Zenoh may query only a storage that declares itself complete.
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=self._timeout_s,
+            timeout=timeout_s,
         ):
             text = "" if reply.err is None else printable_lines(reply.err.payload.to_bytes().decode(errors="replace"))
             if text == "Timeout":

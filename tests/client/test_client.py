@@ -212,17 +212,30 @@ def test_a_cell_with_slashes_is_a_cell_of_its_own(
         Client(session, "lab", timeout_s=0.5).status()
 
 
-def test_who_does_not_answer_in_time_counts_as_unreachable(
-    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None]
+@pytest.mark.parametrize("suffix", ["hold", "status"])
+def test_a_query_that_is_lost_is_asked_again_if_nothing_is_done_twice(
+    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None], suffix: str
 ) -> None:
-    kept: list[zenoh.Query] = []
-    with daemon.declare_queryable("bench/hold", kept.append):
-        answering("bench/status", ready)
-        Client(session, "bench").wait_until_ready()
-        with pytest.raises(UnreachableError, match="bench/hold"):
-            Client(session, "bench", timeout_s=0.2).ask("hold")
-        assert len(kept) == 1
-        kept[0].drop()
+    lost: list[zenoh.Query] = []
+    client = Client(session, "bench", timeout_s=2.0)
+    with daemon.declare_queryable("bench/resume", lost.append):
+        answering("bench/via_points", ready)
+        client.ask("via_points", {"op": "list"})
+
+        def lose_first(query: zenoh.Query) -> None:
+            if lost:
+                ready(query)
+            else:
+                lost.append(query)
+
+        answering(f"bench/{suffix}", lose_first)
+        assert client.ask(suffix) == json.loads(requests.encode_json(STATUS))
+        assert len(lost) == 1
+        with pytest.raises(UncertainError, match=r"bench/resume: .*may have been carried out"):
+            client.resume()
+        assert len(lost) == 2
+    for query in lost:
+        query.drop()
 
 
 # --- connections that break ----------------------------------------------------------------------
