@@ -207,6 +207,7 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"plate = {json.dumps(arm.plate, ensure_ascii=False)}  # the link that carries the tool\n"
         f"{packages}"
         f"posture = {list(arm.posture)}  # {rad} the tool over the table, pointing down and forward\n"
+        'start = "held"  # after every start the arm waits for `thirdhand resume`\n'
         "\n"
         f"# A guess, from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
         "# Take the values of the maker's data sheet if you have it; begin with a tenth on a real arm.\n"

@@ -14,9 +14,9 @@ import msgspec
 from service.cli.status import AHEAD_MS, disk, hours_until_full
 from service.contract.channels import BY_KEY, key
 from service.contract.evidence import Evidence, explained, lasting, two_places
-from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do
+from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do, word
 from service.contract.messages import Vector3
-from service.contract.records import SIDES, Reason
+from service.contract.records import SIDES, Cause, Reason
 from service.contract.requests import Source, Status
 from service.contract.ros2 import NO_TYPE_HASH
 
@@ -249,12 +249,9 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
 
 def _unit_advice(source: Source) -> str:
     """The remedy if the rejected samples seem to be in another unit; empty otherwise."""
-    looks = re.search(r"looks like (\w+)", source.refused)
-    if looks is None or source.cause != "out_of_range":
-        return ""
-    if looks[1] == "degrees":
-        return what_to_do(Condition.DEGREES)
-    return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{looks[1]}"'
+    if source.unit and source.cause in ("", word(Cause.OUT_OF_RANGE)):
+        return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{source.unit}"'
+    return ""
 
 
 def _driver(before: Status, now: Status) -> Finding:
@@ -297,7 +294,8 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     for side, at in positions.items():
         found = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
         wanted = " to ".join(map(_point, boxes[side])) + " m"
-        yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", found, wanted, advice)
+        remedy = _unit_advice(now.sources[side]) or advice
+        yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", found, wanted, remedy)
     if now.deviation_m is not None:
         found = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
         wanted = f"up to {100 * now.threshold_m:.1f} cm"

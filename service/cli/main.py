@@ -134,7 +134,7 @@ def parser() -> argparse.ArgumentParser:
     option(c, "--record", "DIR", "record to .mcap files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
-    hold = "begin in hold, until `thirdhand resume`: for a service manager, which starts the daemon unattended"
+    hold = "begin in hold, until `thirdhand resume`, whatever [arm] start is: for a service manager"
     flag(c, "--hold", hold)
     log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)

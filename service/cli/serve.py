@@ -75,8 +75,15 @@ def _run(args: argparse.Namespace) -> int:
                 log.warning("%s (standard output: %s)", line, in_words(error))
 
         skill, scribe = skill_path(settings, args), Scribe(settings, folder=folder, live_port=args.live)
-        more = {"scribe": scribe, "start": start, "announce": announce, "hold": args.hold}
-        missing = daemon.serve(settings, skill, skills=skill_file(settings).parent, **more)
+        missing = daemon.serve(
+            settings,
+            skill,
+            skills=skill_file(settings).parent,
+            scribe=scribe,
+            start=start,
+            announce=announce,
+            hold=args.hold or settings.arm.start == "held",
+        )
     logging.shutdown()
     os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
 

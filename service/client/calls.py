@@ -25,7 +25,7 @@ from service.contract.printable import printable_lines
 from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
-REPEATED = 2  # queries within the time of one request, if it may be repeated
+QUERIES = 2  # queries within the time of one request, if it may be repeated
 RECONNECTED_S = 2.0  # a connection that broke returns within this time, unless the network or the daemon is down
 LIST = requests.encode_json(requests.List())
 Answer = TypeVar("Answer")
@@ -137,7 +137,7 @@ class Client:
             raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
         acts = suffix != "status" and payload != LIST
         may_repeat = not acts or suffix == "hold"  # a second hold changes nothing, and a lost one must not remain so
-        queries_left = REPEATED if may_repeat else 1  # a query, or its answer, may be lost
+        queries_left = QUERIES if may_repeat else 1  # a query, or its answer, may be lost
         query_s = self._timeout_s / queries_left
         end_s = time.monotonic() + min(RECONNECTED_S, self._timeout_s)
         is_sent = False

@@ -128,6 +128,11 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
             found, closer = _unseen(seen), _rejected_remedy(seen, *SIDES)
             if not closer and reason is Reason.STALE_HAND and any(_rate_too_low(seen, side) for side in SIDES):
                 closer = what_to_do(Condition.HANDS_TOO_RARE)
+            elif any(source.batches_ms for source in seen.sources.values()):
+                closer = what_to_do(Condition.DELAYED)
+        case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
+            found = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"
+            closer = f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{unit}"'
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
             found = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
         case Reason.TWO_SOURCES:
@@ -208,11 +213,18 @@ def _unseen(seen: Evidence) -> str:
         if (source := seen.sources.get(side)) is not None and not source.fresh:
             since = "has not been seen yet" if source.age_ms is None else f"was last seen {lasting(source.age_ms)} ago"
             since = f"arrives {rate}" if (rate := _rate_too_low(seen, side)) else since
+            since += f", and arrives in batches, {lasting(source.batches_ms)} apart" if source.batches_ms else ""
             instead = (
                 f", as what arrives is rejected as {source.cause}: {source.refused}" if _is_rejected(source) else ""
             )
             said.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
     return "; ".join(said)
+
+
+def _unit_of_all(seen: Evidence) -> str:
+    """The unit in which the positions of all hands that arrive seem to be; empty otherwise."""
+    units = {source.unit for name, source in seen.sources.items() if name in SIDES and source.rate_hz}
+    return units.pop() if len(units) == 1 else ""
 
 
 def _contest(seen: Evidence) -> str:
@@ -322,6 +334,9 @@ def _is_of_a_busy_machine(reason: Reason, seen: Evidence) -> bool:
     """True if a busy machine may have caused the reason, and nothing closer did."""
     if reason not in OF_A_BUSY_MACHINE or (reason is Reason.ARM_ERROR and _contradiction(seen)):
         return False
+    sources = [seen.sources[name] for name in OF_A_BUSY_MACHINE[reason] if name in seen.sources]
+    if reason is Reason.STALE_HAND and any(source.fresh or source.batches_ms for source in sources):
+        return False  # a machine that is late is late with both hands
     return not _rejected_remedy(seen, *OF_A_BUSY_MACHINE[reason])
 
 

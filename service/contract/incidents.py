@@ -248,7 +248,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "correct the publisher's clock; samples are accepted again after the source was silent"),
         Incident(Condition.DELAYED, None, "samples delayed",
             "samples were held up on their way; the source's clock is right",
-            "find what holds samples up: the network, or a publisher or daemon that is too busy"),
+            "if they arrive in batches, as over Wi-Fi that saves power, raise `[hands] stale_max_ms` above their "
+            "interval; otherwise find what holds them up: the network, or a publisher or daemon that is too busy"),
         Incident(Condition.WRONG_UNIT, None, "wrong unit",
             "positions look to be in another unit than `[hands] unit`",
             "write the tracker's unit under `[hands]` in the cell's settings, and restart the daemon"),

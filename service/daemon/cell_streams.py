@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import zenoh
 from zenoh.handlers import RingChannel
 
@@ -21,6 +22,7 @@ from service.settings.config import Settings
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
 MAX_SAMPLE_BYTES = 4096  # limit of a message of a hand or of joints
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
@@ -72,6 +74,15 @@ class Arrivals:
         held_up_ns = delays[accepted][1] - delay_ns
         is_delay = held_up_ns > HELD_UP_NS and delay_ns > min_delay_ns - CLOCK_STEP_NS
         return held_up_ns / 1e9 if is_delay else None
+
+    def batches_ms(self, accepted_ms: float) -> float:
+        """Interval [ms] of the batches in which messages arrive: the median of the pauses between
+        arrivals that are longer than accepted; 0 with fewer than three of them.
+        """
+        arrivals_ms = np.array([stamp_ns + delay_ns for stamp_ns, delay_ns in tuple(self._delays)]) / 1e6
+        pauses_ms = np.diff(arrivals_ms)
+        long_ms = pauses_ms[pauses_ms > accepted_ms]
+        return float(np.median(long_ms)) if len(long_ms) >= LEAST_BATCHES else 0.0
 
     def is_set_back(self, accepted_ns: int) -> bool:
         """True if all messages after the one stamped `accepted_ns` are stamped before it, and there

@@ -15,13 +15,13 @@ import numpy as np
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
 from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, what_to_do, word
 from service.contract.joint_states import measured
-from service.contract.messages import PoseStamped, WireError
+from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
 from service.contract.requests import Source
 from service.core.controller import Controller
 from service.core.frame import Record, Vector
 from service.core.intake import KEPT
-from service.core.intake.far_away import too_far
+from service.core.intake.far_away import too_far, unit_meant
 from service.core.intake.late_samples import lateness_ms
 from service.core.intake.stage import Refused
 from service.core.tuning import TUNING
@@ -113,7 +113,15 @@ class InputMonitor:
             scatter_mm=None
             if source == "arm" or seen < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
+            unit=self._unit_of(arrivals.newest),
+            batches_ms=0.0 if source == "arm" else round(arrivals.batches_ms(stale_ms or settings.hands.stale_ms), 1),
         )
+
+    def _unit_of(self, newest: PoseStamped | JointState | None) -> str:
+        """The unit in which a hand's position seems to be; empty if it is that of the settings."""
+        if not isinstance(newest, PoseStamped):
+            return ""
+        return unit_meant(newest.position, self._settings.hands_in(newest.frame_id).unit)
 
     def _apart_mm(self, source: str, state: Record, now_s: float) -> float:
         """Distance [mm] of two places between which a hand mostly alternated lately; 0: none."""

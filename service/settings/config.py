@@ -164,6 +164,7 @@ class ArmSettings(Section, frozen=True):
     packages: tuple[str, ...] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
     source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
+    start: Literal["follow", "held"] = "follow"  # "held": after every start the arm holds until `thirdhand resume`
     posture: PerJoint = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] preferred; start if assumed
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
     fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
@@ -228,19 +229,26 @@ class People(Section, frozen=True):
     """Limits of speed and distance toward people, modelled on ISO 10218-2; none is safety-rated.
 
     A hand is a capsule from its tracked point toward the elbow. A part of the arm may approach a
-    hand at the speed from which it can stop `clearance` away from the hand, while the hand
-    continues at its present speed and the stop begins `hands.stale_ms` + `reaction_ms` late: a
-    hand may move unseen for `hands.stale_ms`, or for `hands.stale_max_ms` if that is longer. A hand
-    out of sight for longer is assumed to accelerate toward the arm at 5 m/s² up to 1.6 m/s.
+    hand at the speed from which it can stop `clearance` + `position_uncertainty` away from the
+    hand, while the hand continues at its present speed and the stop begins `hands.stale_ms` +
+    `reaction_ms` late: a hand may move unseen for `hands.stale_ms`, or for `hands.stale_max_ms` if
+    that is longer. A hand out of sight for longer is assumed to accelerate toward the arm at 5 m/s²
+    up to 1.6 m/s.
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm
     length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
     toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # [m] least distance to a hand's capsule
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.024  # [m] least distance to a hand's capsule
+    position_uncertainty: Annotated[float, msgspec.Meta(ge=0)] = 0.006  # [m] of hand and arm; 3 deviations of 2 mm
     brake: Positive = 3.0  # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # interval of samples + one tick + ramp of the braking
     contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
+
+    @property
+    def distance(self) -> float:
+        """The distance from a hand's capsule [m] at which a stop ends."""
+        return self.clearance + self.position_uncertainty
 
 
 class Box(Section, frozen=True):

@@ -167,7 +167,7 @@ def _judged(
     distance, speed, coming, own, table = nearest(settings, body, done.joints, done.hands)
     reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
     allowed = np.empty_like(distance)
-    _allow(distance, coming, people.brake, reaction_s, people.clearance, allowed)
+    _allow(distance, coming, people.brake, reaction_s, people.distance, allowed)
     offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
     links = body.capsules["link"]
     tool = links[links > 0] == len(settings.joints.names)
@@ -358,7 +358,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         ax.scatter(distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True)
         distances = np.linspace(-0.1, SHOWN_M, 200)
         for hand, style in ((0.0, "-"), (0.5, "--")):
-            rule = [allowed_speed(d, hand, people.brake, reaction_s, people.clearance) for d in distances]
+            rule = [allowed_speed(d, hand, people.brake, reaction_s, people.distance) for d in distances]
             ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
         closest = shown["closest_of_capsules_mm"]
         ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"least distance: {closest:.0f} mm")

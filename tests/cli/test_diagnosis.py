@@ -281,7 +281,13 @@ def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() ->
 def test_a_unit_that_is_wrong_is_told_with_the_setting_to_write() -> None:
     refused = "at (812, -203, 95), which looks like mm; [hands] unit is 'm', at most 5 m from the base plate accepted"
     left = source(
-        "left", fresh=False, age_ms=None, rejected={"out_of_range": 200}, cause="out_of_range", refused=refused
+        "left",
+        fresh=False,
+        age_ms=None,
+        rejected={"out_of_range": 200},
+        cause="out_of_range",
+        refused=refused,
+        unit="mm",
     )
     first = wrongs(diagnosed(mode="hold", reason="no_hands", sources=left))[0]
     assert "left hand" in first
@@ -291,7 +297,8 @@ def test_a_unit_that_is_wrong_is_told_with_the_setting_to_write() -> None:
 
 def test_joints_in_degrees_are_told_with_the_joints_name() -> None:
     refused = "wam/elbow_pitch_joint at 145.6 rad, which looks like degrees; -0.9 to 3.1 accepted"
-    arm = source("arm", fresh=False, age_ms=None, rejected={"out_of_range": 900}, cause="out_of_range", refused=refused)
+    rejected = {"rejected": {"out_of_range": 900}, "cause": "out_of_range", "refused": refused}
+    arm = source("arm", fresh=False, age_ms=None, advice="publish joints in radians", **rejected)
     first = wrongs(diagnosed(mode="hold", reason="arm_not_ready", sources=arm))[0]
     assert "wam/elbow_pitch_joint at 145.6 rad" in first
     assert "what to do: publish joints in radians" in first

@@ -88,6 +88,10 @@ def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
         assert blamed == ("see what else runs on this machine" in explained(reason, seen).what_to_do)
     refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'")
     assert "busy" not in explained(Reason.STALE_HAND, seen._replace(sources={"left": refused})).why
+    stale = Source(rate_hz=60.0, age_ms=130.0)
+    for left, is_blamed in ((stale, True), (Source(rate_hz=60.0, age_ms=9.0, fresh=True), False)):
+        sources = {"left": left, "right": stale}
+        assert ("busy" in explained(Reason.STALE_HAND, seen._replace(sources=sources)).why) == is_blamed
 
 
 @pytest.mark.thorough

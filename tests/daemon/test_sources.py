@@ -19,6 +19,7 @@ from service.contract.requests import Percentiles, Status
 from service.core.controller import Controller
 from service.core.frame import Event, Frame, Tick, blank, frame_layout
 from service.core.intake import KEPT
+from service.core.intake.stage import UNIT_M
 from service.core.skill.skill import Skill
 from service.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, apart_m, evidence
 from service.daemon.status import CellStatus
@@ -50,11 +51,14 @@ class Cell:
         self.frame: Frame = blank(frame_layout(7))
         self.log: list[str] = []
 
-    def tell(self, *messages: tuple[str, PoseStamped | JointState], late_ns: int = 0) -> None:
-        """One tick, in whose inbox messages are by source."""
+    def tell(self, *messages: tuple[str, PoseStamped | JointState], late_ns: int = 0, at_ns: int | None = None) -> None:
+        """One tick, in whose inbox messages are by source; they arrive at a time, or so much later
+        than their stamps.
+        """
         index = next(self.ticks)
         for source, message in messages:
-            self.sources.arrivals[KEY_OF_SOURCE[source]].take(message, message.stamp_ns + late_ns)
+            arrival_ns = message.stamp_ns + late_ns if at_ns is None else at_ns
+            self.sources.arrivals[KEY_OF_SOURCE[source]].take(message, arrival_ns)
         inbox = tuple(Event(KEY_OF_SOURCE[source], b"", message) for source, message in messages)
         self.frame = self.controller.step(Tick(index, inbox))
 
@@ -208,7 +212,7 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
     assert (told_held.rejected, told_stepped.rejected) == ({"ahead": 1}, {"ahead": 1})
     delayed, ahead = told_held.sources["right"], told_stepped.sources["right"]
     assert delayed.refused.endswith("which was held up for 1.99 s on its way; the clock is right")
-    assert delayed.advice == "find what holds samples up: the network, or a publisher or daemon that is too busy"
+    assert "find what holds them up: the network" in delayed.advice
     assert ahead.refused.endswith("after the newest accepted one: its clock stepped ahead")
     assert ahead.advice.startswith("correct the publisher's clock")
     assert delayed.advice in held.cell.log[-1]
@@ -317,6 +321,45 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     told = cell.status(0.6)
     assert "the right hand was last seen" in told.because
     assert not told.sources["right"].fresh
+
+
+@pytest.mark.parametrize(("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")])
+def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
+    skill: Skill, unit: str, reported: str
+) -> None:
+    settings = Settings(hands=HandSettings(unit=unit))  # type: ignore[arg-type]
+    cell = Cell(skill, settings)
+    for k in range(100):
+        hands = [
+            (side, pose(1 + k, tuple(metres / UNIT_M[reported] for metres in position)))
+            for side, position in (("left", LEFT), ("right", RIGHT))
+        ]
+        cell.tell(*hands, ("arm", joints(1 + k)))
+        cell.status(k / 500)
+    told = cell.status(0.2)
+    assert told.mode == "hold"
+    assert f"look like {reported}," in told.because or f"which looks like {reported}; " in told.because
+    assert {source.unit for name, source in told.sources.items() if name != "arm"} == {reported}
+
+
+@pytest.mark.parametrize("batch_ticks", [60, 100, 150])
+def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill, batch_ticks: int) -> None:
+    cell, period_ns = Cell(skill), S // 500
+    waiting: list[tuple[str, PoseStamped]] = []
+    told = cell.status(0.0)
+    for k in range(5 * batch_ticks):
+        stamp_ns = 1 + k * period_ns
+        if k % 7 == 0:
+            waiting += [("left", pose(stamp_ns, LEFT)), ("right", pose(stamp_ns, RIGHT))]
+        is_sent = k % batch_ticks == batch_ticks - 1
+        cell.tell(("arm", joints(stamp_ns)), *(waiting[-8:] if is_sent else ()), at_ns=stamp_ns)
+        if is_sent:
+            waiting.clear()
+        told = cell.status(k / 500)
+        if k % batch_ticks == batch_ticks - 2 and k > 4 * batch_ticks:
+            assert (told.mode, told.reason) == ("hold", "stale_hand")
+            assert f"arrives in batches, {1000 * batch_ticks // 500} ms apart" in told.because
+            assert "raise [hands] stale_max_ms" in told.remedy
 
 
 def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_seen(skill: Skill) -> None:

@@ -20,7 +20,7 @@ from service.cli.main import parser
 from service.client import Client, RefusedError
 from service.daemon.systemd import Systemd
 from sim.scene import Scene
-from support.cell import Daemon, Tracker, serving, told
+from support.cell import LISTENING, Daemon, Tracker, serving, told
 from support.paths import ROOT
 
 UNIT = ROOT / "examples" / "thirdhand@.service"
@@ -71,8 +71,9 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
     mark = tmp_path / "mark"
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
-    arguments = ("--joints", "assumed", "--hold")
-    with serving(tmp_path, *arguments, before=STANDS_STILL.format(mark=str(mark))) as daemon, Tracker(daemon.session):
+    arguments = ("--joints", "assumed")
+    before = STANDS_STILL.format(mark=str(mark))
+    with serving(tmp_path, *arguments, "--hold", before=before) as daemon, Tracker(daemon.session):
         started = manager.heard(30, "READY=1")
         assert started[-1] == "READY=1"
         assert "STATUS=starting: importing" in started[0]
@@ -83,16 +84,17 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
         engaged_by_resume(daemon)
         mark.touch()
         manager.heard(3 * PING_S)  # a ping for the last tick may be under way
-        before = daemon.client.ask("status")["tick"]
+        tick = daemon.client.ask("status")["tick"]
         assert "WATCHDOG=1" not in manager.heard(8 * PING_S)
-        assert daemon.client.ask("status")["tick"] == before  # all but the loop goes on
+        assert daemon.client.ask("status")["tick"] == tick  # all but the loop goes on
         mark.unlink()
         assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
 
         daemon.process.send_signal(signal.SIGKILL)
         daemon.process.wait(20)
     manager.heard(0.1)
-    with serving(tmp_path, *arguments) as daemon, Tracker(daemon.session):
+    held = LISTENING + '[arm]\nstart = "held"\n'
+    with serving(tmp_path, *arguments, network=held) as daemon, Tracker(daemon.session):
         assert manager.heard(30, "READY=1")[-1] == "READY=1"
         engaged_by_resume(daemon)
         assert daemon.end() == 0

@@ -196,7 +196,7 @@ def test_the_arm_keeps_away_from_where_a_hand_that_has_gone_was_seen_last(skill:
     there = (0.5, 0.21, 0.4)  # where the tool is to go
     seen = served(skill, 0, 50, count=3500, at=there)
     assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}
-    assert seen["hand_distance"].min() > ASSUMED.people.clearance - 0.001
+    assert seen["hand_distance"].min() > ASSUMED.people.distance - 0.001
     free = served(skill, 0, 0, count=3500)
     near, away = (np.linalg.norm(found["tool"][-1] - there) for found in (free, seen))
     assert near < 0.03

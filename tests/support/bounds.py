@@ -331,7 +331,7 @@ def allowed_speeds(distance: Vector, hand_speed: Vector | float, session: Sessio
     """
     people = session.settings.people
     late = people.brake * (session.settings.hands.stale_ms + people.reaction_ms) / 1000.0
-    square = late**2 + hand_speed**2 + 2.0 * people.brake * (distance - people.clearance)
+    square = late**2 + hand_speed**2 + 2.0 * people.brake * (distance - people.distance)
     return np.maximum(0.0, np.sqrt(np.maximum(square, 0.0)) - late - hand_speed)
 
 

@@ -9,7 +9,21 @@ from service.contract.evidence import figures
 from service.core.intake.stage import UNIT_M
 from service.core.tuning import TUNING
 
-PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the base plate, in the unit that was meant
+PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the tracker's origin, in the unit that was meant
+
+
+def unit_meant(position: Sequence[float], unit: str) -> str:
+    """The unit in which a position was probably reported, if that is not `unit`; empty otherwise.
+
+    In `unit`, its distance from the origin is nothing that a hand has; among the units in which it
+    is, the one nearest to 1 m is meant.
+    """
+    distance = math.hypot(*position)
+    nearest_m, farthest_m = PLAUSIBLE_DISTANCES_M
+    if nearest_m < distance * UNIT_M[unit] < farthest_m:
+        return ""
+    meant = [name for name, size_m in UNIT_M.items() if nearest_m < distance * size_m < farthest_m]
+    return min(meant, key=lambda name: abs(math.log(distance * UNIT_M[name])), default="")
 
 
 def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
@@ -17,14 +31,9 @@ def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
     distance.
 
     The position was read in `unit`, which `rule` states (by default, the setting `[hands] unit`).
-    Among the other units that give a plausible distance, the message names the one nearest to 1 m.
     """
-    far = sum(v * v for v in position) ** 0.5
-    meant = [
-        u for u, m in UNIT_M.items() if u != unit and PLAUSIBLE_DISTANCES_M[0] < far * m < PLAUSIBLE_DISTANCES_M[1]
-    ]
-    meant.sort(key=lambda u: abs(math.log(far * UNIT_M[u])))
-    like = f", which looks like {meant[0]}" if meant else ""
+    meant = unit_meant(position, unit)
+    like = f", which looks like {meant}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
     most_m = TUNING.intake.max_hand_distance_m
     return f"at {figures(position)}{like}; {rule}, at most {most_m:g} m from the base plate accepted"

@@ -61,7 +61,7 @@ class Separation:
             planned_brake=numbers.planned_brake_share
             * np.minimum(brake, np.array(numbers.planned_brake_limits) * settings.tool.stop_acceleration),
             planned_reaction_s=np.maximum(reaction_s, numbers.planned_reaction_s),
-            clearance=np.array([people.clearance, things.clearance, own_clearance(settings, tuning)]),
+            clearance=np.array([people.distance, things.clearance, own_clearance(settings, tuning)]),
             planned_margin=numbers.planned_margin_m,
             planned_brake_share=numbers.planned_brake_share,
             clearance_gain_per_s=numbers.clearance_gain_per_s,
