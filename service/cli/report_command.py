@@ -22,12 +22,13 @@ from service.contract.records import Mode
 from service.files.recording import Recording
 from service.process.progress import progress
 from service.report.columns import KEPT
-from service.report.report import Report, reported
-from service.report.tables import Table, comparison, names_of, summary, tables
+from service.report.report import Report, overview, reported
+from service.report.tables import Table, comparison, every_figure, names_of, overviews, summary, tables
 from service.settings.whole_file import whole
 
 BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
+MANY = 10  # of more recordings, each has a row in a table and no report of its own
 MOST_ROWS = 40  # a table on a terminal has at most this many rows
 PLAIN_WIDTH = 120  # [characters] width of tables that are not printed on a terminal
 
@@ -40,6 +41,8 @@ def report(args: argparse.Namespace) -> int:
         raise UsageError(f"--csv {args.csv} is a file; a folder needed")
     if args.lerobot and args.lerobot.exists():
         raise UsageError(f"--lerobot {args.lerobot} exists already; a new folder needed")
+    if len(args.files) > MANY and not args.lerobot:
+        return _report_many(args)
     reports = [one for _, one in of_each(args, "reading", reported, alone=_reported)]
     console = plain_console()
     for one in reports:
@@ -65,6 +68,26 @@ def report(args: argparse.Namespace) -> int:
             part.write_text(page(reports, progress=done), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
     return 0 if len(reports) == len(args.files) else 1
+
+
+def _report_many(args: argparse.Namespace) -> int:
+    """Report on more recordings than anyone reads one by one: a row for each, and totals."""
+    recordings = [one for _, one in of_each(args, "reading", overview)]
+    console = plain_console()
+    for table in overviews(recordings) if recordings else ():
+        print_table(console, table)
+    if args.csv and recordings:
+        args.csv.mkdir(parents=True, exist_ok=True)
+        for table in (*overviews(recordings), every_figure(recordings)):
+            _write(args.csv / f"{table.name}.csv", table)
+        console.print(Text(printable(f"tables in {args.csv}")))
+    if args.html and recordings:
+        from service.report.page import page_of_many  # its import is slow
+
+        with whole(args.html) as part:
+            part.write_text(page_of_many(recordings), encoding="utf-8")
+        console.print(Text(printable(f"page {args.html}")))
+    return 0 if len(recordings) == len(args.files) else 1
 
 
 def _reported(path: Path) -> Report:
@@ -120,7 +143,7 @@ def write_csv(reports: Sequence[Report], folder: Path) -> None:
     """Write each table of a report, and every tick in `ticks.csv`, to a folder with the report's
     name, and for several reports a comparison beside these folders.
     """
-    for name, one in zip(names_of(reports), reports, strict=True):
+    for name, one in zip(names_of([one.path for one in reports]), reports, strict=True):
         inside = folder / name
         inside.mkdir(parents=True, exist_ok=True)
         for table in tables(one):

@@ -135,6 +135,9 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
             closer = f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{unit}"'
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
             found = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
+            if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:
+                found = f"the {' and the '.join(jumping)} jumped in the last second; {found}"
+                closer = what_to_do(word(Cause.JUMPED))
         case Reason.TWO_SOURCES:
             found = _contest(seen)
         case Reason.ARM_NOT_READY:
@@ -225,6 +228,11 @@ def _unit_of_all(seen: Evidence) -> str:
     """The unit in which the positions of all hands that arrive seem to be; empty otherwise."""
     units = {source.unit for name, source in seen.sources.items() if name in SIDES and source.rate_hz}
     return units.pop() if len(units) == 1 else ""
+
+
+def _jumps(seen: Evidence, side: str) -> bool:
+    """True if the newest rejected sample of a hand, within the last second, had jumped."""
+    return side in seen.sources and seen.sources[side].cause == word(Cause.JUMPED)
 
 
 def _contest(seen: Evidence) -> str:

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from service.contract.printable import printable
 from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
-from service.report.report import Report
-from service.report.tables import Table, comparison, names_of, summary, tables
+from service.report.report import Overview, Report
+from service.report.tables import Table, comparison, names_of, overviews, summary, tables
 from service.settings import palette
 
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
@@ -44,7 +44,7 @@ svg { max-width: 100%; height: auto } p { margin: .3rem 0 }
 @mpl.rc_context({"text.parse_math": False})  # names with dollar signs are not formulas
 def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda count: None) -> str:
     """The page as HTML."""
-    names = names_of(reports)
+    names = names_of([report.path for report in reports])
     title = f"Report: {', '.join(names)}"
     parts = [f"<h1>{escape(title)}</h1>"]
     if len(reports) > 1:
@@ -58,6 +58,16 @@ def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda 
             parts += [_svg(_over_time(report), f"{name}-time-"), _svg(_from_above(report), f"{name}-above-")]
         parts += [_table(table) for table in tables(report)]
         progress(i + 1)
+    return _document(title, parts)
+
+
+def page_of_many(recordings: Sequence[Overview]) -> str:
+    """The page on many recordings, as HTML: a row for each, and totals."""
+    title = f"Report on {len(recordings)} recordings"
+    return _document(title, [f"<h1>{title}</h1>", *map(_table, overviews(recordings))])
+
+
+def _document(title: str, parts: Sequence[str]) -> str:
     body = "\n".join(parts)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'

@@ -121,6 +121,31 @@ class Figure(NamedTuple):
     digits: int
 
 
+class Overview(NamedTuple):
+    """What a table of many recordings needs of one: its figures, without its ticks."""
+
+    path: Path
+    cell: str
+    week: str  # of its begin, by ISO 8601: 2026-W48
+    begins: str
+    lasts_s: float
+    figures: tuple[Figure, ...]
+
+    def value(self, name: str) -> float:
+        """A figure's value; 0 if it is not known."""
+        return next((figure.value or 0.0 for figure in self.figures if figure.name == name), 0.0)
+
+    @property
+    def holds_s(self) -> dict[str, float]:
+        """Time in holds [s] by reason, without those that did not occur."""
+        start = f"{word(Mode.HOLD)}: "
+        return {
+            figure.name.removeprefix(start): figure.value
+            for figure in self.figures
+            if figure.name.startswith(start) and figure.value
+        }
+
+
 class Report:
     """The report on one recording, made from its `columns`."""
 
@@ -173,6 +198,13 @@ class Report:
         """The tool's least distance from a via-point of this name [m]; None without a visit."""
         return min((p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None)
 
+    def overview(self) -> Overview:
+        """What a table of many recordings needs of this one."""
+        begins = datetime.fromtimestamp(self.columns.start_ns / 1e9, tz=UTC)
+        week = begins.strftime("%G-W%V") if len(self.columns.frames) else "never"
+        cell = self.columns.recording.settings.cell
+        return Overview(Path(self.path), cell, week, self.begins, self.lasts_s, tuple(self.figures()))
+
     def figures(self) -> Iterator[Figure]:
         """The numbers for a comparison of recordings."""
         yield Figure("duration", self.lasts_s, "s", 1)
@@ -203,6 +235,11 @@ class Report:
         for place in dict.fromkeys(place.name for place in self.places):
             best = self.best_m(place)
             yield Figure(f"place {place}: nearest", None if best is None else 1000 * best, "mm", 1)
+
+
+def overview(path: Path) -> Overview:
+    """The overview of the recording in a file. Raises RecordingError."""
+    return reported(path).overview()
 
 
 def reported(path: str | Path, *, progress: Callable[[int], None] = lambda ticks: None) -> Report:

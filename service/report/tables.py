@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from service.contract.incidents import what_happened, what_to_do, word
 from service.contract.printable import printable
 from service.contract.records import Mode
-from service.report.report import Figure, Joint, Percentiles, Report, Span, differing_settings
+from service.report.report import Figure, Joint, Overview, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
+IN_A_ROW = {  # figures of a recording among many, with the heads of their columns
+    "faults": "faults",
+    "missing or damaged": "missing",
+    "latency, median": "latency [ms]",
+    "tool to target, median": "off [mm]",
+    "closest approach": "near [mm]",
+}
 NOTHING_MISSING = "Nothing is missing in it."
 
 
@@ -220,40 +229,84 @@ def summary(report: Report) -> list[str]:
 
 
 def comparison(reports: Sequence[Report]) -> Iterator[Table]:
-    """Figures of several reports side by side; for two reports also settings that differ."""
-    names = names_of(reports)
-    yield side_by_side(names, [list(report.figures()) for report in reports])
-    if len(reports) == 2:
-        settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(*reports))
-        if settings:
-            yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+    """Figures of two reports side by side, and settings that differ; of more, a row for each."""
+    if len(reports) != 2:
+        yield from overviews([report.overview() for report in reports])
+        return
+    one, other = reports
+    names = names_of([one.path, other.path])
+    yield side_by_side(names, list(one.figures()), list(other.figures()))
+    settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(one, other))
+    if settings:
+        yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
 
 
-def side_by_side(names: Sequence[str], columns: Sequence[Sequence[Figure]]) -> Table:
-    """Figures in a column for each name; for two also their differences. Figures that are 0 in all
-    columns are left out.
-    """
-    by_name = [{figure.name: figure for figure in column} for column in columns]
-    two = len(columns) == 2
+def side_by_side(names: Sequence[str], one: Sequence[Figure], other: Sequence[Figure]) -> Table:
+    """Figures of two recordings and their differences, without those that are 0 in both."""
+    first = {figure.name: figure for figure in one}
+    second = {figure.name: figure for figure in other}
     rows = []
-    for name in dict.fromkeys(name for one in by_name for name in one):
-        figures = [one.get(name) for one in by_name]  # None: a via-point that was not taught there
-        values = [figure and figure.value for figure in figures]
-        known = next(figure for figure in figures if figure is not None)
+    for name, known in (second | first).items():
+        values = [figures[name].value if name in figures else None for figures in (first, second)]
         if any(values):
-            row = [f"{name} [{known.unit}]" if known.unit else name]
-            row += [NONE if value is None else f"{value:.{known.digits}f}" for value in values]
-            rows.append((*row, *([_difference(known, values[0], values[1])] if two else [])))
-    heads = ("figure", *names, *(("difference",) if two else ()))
-    return Table("comparison", "Side by side", heads, tuple(rows))
+            row = (_with_unit(known), *(_value(known, value) for value in values))
+            rows.append((*row, _difference(known, *values)))
+    return Table("comparison", "Side by side", ("figure", *names, "difference"), tuple(rows))
 
 
-def names_of(reports: Sequence[Report]) -> list[str]:
-    """A unique name for each report: that of its file, with a number if it is not the first."""
+def overviews(recordings: Sequence[Overview]) -> Iterator[Table]:
+    """A row for each of many recordings, and totals by cell and week."""
+    rows = []
+    names = names_of([one.path for one in recordings])
+    for name, one in zip(names, recordings, strict=True):
+        followed = _share(one.value("follow"), one.lasts_s)
+        held = f"{sum(one.holds_s.values()):.1f}"
+        of = {figure.name: figure for figure in one.figures}
+        others = [_value(of[shown], of[shown].value) for shown in IN_A_ROW]
+        rows.append((name, f"{one.lasts_s:.1f}", followed, held, *others))
+    heads = ("recording", "for [s]", "follow [%]", "hold [s]", *IN_A_ROW.values())
+    yield Table("recordings", "Recordings", heads, tuple(rows))
+    yield _totals(recordings)
+
+
+def _totals(recordings: Sequence[Overview]) -> Table:
+    """Time recorded and followed, faults, and holds by reason, for each cell and week."""
+    groups: dict[tuple[str, str], list[Overview]] = {}
+    for one in recordings:
+        groups.setdefault((one.cell, one.week), []).append(one)
+    rows = []
+    for (cell, week), those in sorted(groups.items()):
+        lasts_s = sum(one.lasts_s for one in those)
+        followed_s = sum(one.value("follow") for one in those)
+        faults = sum(one.value("faults") for one in those)
+        held_s: Counter[str] = Counter()
+        for one in those:
+            held_s.update(one.holds_s)
+        holds = ", ".join(f"{reason} {seconds:.1f} s" for reason, seconds in held_s.most_common())
+        share = _share(followed_s, lasts_s)
+        rows.append((cell, week, str(len(those)), f"{lasts_s / 3600:.2f}", share, f"{faults:.0f}", holds or NONE))
+    heads = ("cell", "week", "recordings [1]", "recorded [h]", "followed [%]", "faults [1]", "holds")
+    return Table("totals", "Totals by cell and week", heads, tuple(rows), numbers=0)
+
+
+def every_figure(recordings: Sequence[Overview]) -> Table:
+    """A row for each recording with all its figures."""
+    known = {figure.name: figure for one in recordings for figure in one.figures}
+    rows = []
+    for one in recordings:
+        of = {figure.name: figure for figure in one.figures}
+        values = (_value(known[name], of[name].value if name in of else None) for name in known)
+        rows.append((str(one.path), one.cell, one.week, one.begins, *values))
+    heads = ("recording", "cell", "week", "begins", *map(_with_unit, known.values()))
+    return Table("figures", "All figures", heads, tuple(rows), numbers=4)
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """A unique name for each recording: that of its file, with a number if it is not the first."""
     seen: dict[str, int] = {}
     names = []
-    for report in reports:
-        stem = printable(report.path.stem)
+    for path in paths:
+        stem = printable(path.stem)
         seen[stem] = seen.get(stem, 0) + 1
         names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
     return names
@@ -264,6 +317,18 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> str:
         return NONE
     text = f"{other - one:+.{figure.digits}f}"
     return "same" if float(text) == 0.0 else text
+
+
+def _with_unit(figure: Figure) -> str:
+    return f"{figure.name} [{figure.unit}]" if figure.unit else figure.name
+
+
+def _value(figure: Figure, value: float | None) -> str:
+    return NONE if value is None else f"{value:.{figure.digits}f}"
+
+
+def _share(part_s: float, whole_s: float) -> str:
+    return f"{100 * part_s / whole_s:.1f}" if whole_s else NONE
 
 
 def _short(value: object) -> str:

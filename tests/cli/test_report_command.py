@@ -74,6 +74,34 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     assert float(row["tool[2]"]) == pytest.approx(float(frames[5000]["tool"][2]), rel=1e-6)
 
 
+def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
+    tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / f"thirdhand-20261128-1200{number:02}.mcap" for number in range(12)]
+    for file in files:
+        file.symlink_to(golden)
+    page, folder = tmp_path / "report.html", tmp_path / "tables"
+    assert main(["report", *map(str, files), "--html", str(page), "--csv", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 30
+    for file in files:
+        assert sum(file.stem in line for line in lines) == 1
+        assert page.read_text(encoding="utf-8").count(f"<td>{file.stem}</td>") == 1
+    figures = rows(folder / "figures.csv")
+    assert [row[0] for row in figures[1:]] == list(map(str, files))
+    assert len(rows(folder / "recordings.csv")) == 13
+    heads, total = rows(folder / "totals.csv")
+    totals = dict(zip(heads, total, strict=True))
+    assert totals["recordings [1]"] == "12"
+    one = dict(zip(figures[0], figures[1], strict=True))
+    held_s = 12 * float(one["hold: far_from_demonstrations [s]"])
+    found_s = float(re.search(r"far_from_demonstrations ([\d.]+) s", totals["holds"])[1])  # type: ignore[index]
+    assert found_s == pytest.approx(held_s, abs=12 * 0.05)
+    assert float(totals["followed [%]"]) == pytest.approx(
+        100 * float(one["follow [s]"]) / float(one["duration [s]"]), abs=1
+    )
+
+
 def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

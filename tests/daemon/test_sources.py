@@ -342,6 +342,19 @@ def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
     assert {source.unit for name, source in told.sources.items() if name != "arm"} == {reported}
 
 
+def test_a_hand_that_jumps_away_is_explained_by_its_tracker(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(400):
+        far_m = 0.3 if k > 300 else 0.0
+        left = pose(1 + k * S // 500, (LEFT[0] + far_m, *LEFT[1:]))
+        cell.tell(("left", left), ("right", pose(left.stamp_ns, RIGHT)), ("arm", joints(left.stamp_ns)))
+        cell.status(k / 500)
+    told = cell.status(0.8)
+    assert (told.mode, told.reason) == ("hold", "far_from_demonstrations")
+    assert told.because.startswith("the left hand jumped in the last second; ")
+    assert told.remedy.startswith("look for reflections")
+
+
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
 def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill, batch_ticks: int) -> None:
     cell, period_ns = Cell(skill), S // 500

@@ -272,9 +272,6 @@ def take_hand(
         state.rejected[cause] += 1
         return cause
     before = state.hands[side, 0].copy()
-    if jumped and fresh:  # no hand jumps: a few in a second are a tracker that loses it, or two of them
-        share = state.contested[side] + 0.5 * config.contested_on_share
-        state.contested[side] = np.rint(min(share, 1.0) * ROUND_TO) / ROUND_TO
     if wrong > 0:
         drop(states, side, wrong)
     if order == 0 and made == state.tick and wrong == 0:
