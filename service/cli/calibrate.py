@@ -36,6 +36,7 @@ from service.trackers.calibration.collecting import (
     held_tool,
     lead,
     solved,
+    the_hand,
     tracker_of,
 )
 from service.trackers.calibration.solver import (
@@ -48,6 +49,7 @@ from service.trackers.calibration.solver import (
 
 CHECK_S = 10.0
 CALIBRATE_POLL_S = 0.02
+OTHER_HAND_S = 0.3  # a tracker that sees both hands publishes both within this time
 HINT_S = 5.0  # progress without a terminal is shown in this interval
 
 
@@ -104,8 +106,8 @@ def _live(
         record = _last(live.led(most_states=1), file, settings, args.hand)
     else:
         begun_s = time.monotonic()
+        side = the_hand(live.arriving, args.hand)
         if given:
-            side = _side(live, args)
             track, remarks = live.led(most_states=1).hands[side], list[str]()
             tracker_of(track, settings)
             frame = track.frame
@@ -119,17 +121,18 @@ def _live(
                         live,
                         settings,
                         corners,
-                        args.hand,
+                        side,
                         accept_m=accept_m,
                         longest_s=args.seconds,
                         is_ended=pressed,
                         show=_shower(),
+                        warn=say,
                     )
                 )
             except KeyboardInterrupt:
                 say("ended by Ctrl-C")
-            found = solved(live.led(), settings, corners, args.hand)
-            calibration, side, frame, remarks = found.calibration, found.side, found.frame, list(found.remarks)
+            found = solved(live.led(), settings, corners, side)
+            calibration, frame, remarks = found.calibration, found.frame, list(found.remarks)
         remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
         record = _record(calibration, side, frame or settings.hands.frame, "points" if given else "held")
         _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
@@ -145,20 +148,18 @@ def _live(
 
 
 def _await(live: LiveLed, args: argparse.Namespace, *, needs_joints: bool) -> None:
-    """Wait until hands and joints arrive. Raises CalibrationError after --wait."""
+    """Wait until hands and joints arrive, and for the other hand a moment longer. Raises
+    CalibrationError after --wait.
+    """
     begun_s = time.monotonic()
     while missing := live.unheard(args.hand, needs_joints=needs_joints):
         if time.monotonic() - begun_s > args.wait:
             raise CalibrationError(live.not_received(missing))
         time.sleep(CALIBRATE_POLL_S)
         live.collect()
-
-
-def _side(live: LiveLed, args: argparse.Namespace) -> str:
-    """The hand that touches. Raises UsageError if both arrive and none is given."""
-    if args.hand is None and len(live.arriving) > 1:
-        raise UsageError("both hands arrive: give the one that touches the points by --hand")
-    return str(args.hand or live.arriving[0])
+    if args.hand is None:
+        time.sleep(OTHER_HAND_S)
+        live.collect()
 
 
 def _touched(

@@ -36,7 +36,7 @@ def add_options(c: argparse.ArgumentParser) -> None:
         "the calibration, else by the last one"
     )
     flag(c, "--check", check)
-    hand = "the hand that holds or touches (default: the one that moves with the tool)"
+    hand = "the hand that holds or touches (default: the only one that arrives)"
     option(c, "--hand", None, hand, choices=SIDES)
     recording = "use this recording of hands and joint states, instead of a running cell"
     option(c, "--from", "FILE", recording, dest="recording", type=Path)

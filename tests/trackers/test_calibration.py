@@ -311,12 +311,14 @@ def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
     return LedTracks({side: of_hand(side, held), **{name: of_hand(name, one) for name, one in hands.items()}}, tool)
 
 
-def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -> None:
+def test_of_two_hands_one_must_be_given_and_an_exchange_is_named() -> None:
     held = held_by("mocap")
     free = held._replace(hand=held.hand[::-1].copy())
     streams = led_of(held, "right", left=free)
-    assert solved(streams, Settings(), CORNERS, None).side == "right"
     assert solved(streams, Settings(), CORNERS, "right").frame == "mocap"
+    assert solved(led_of(held), Settings(), CORNERS, None).side == "right"
+    with pytest.raises(CalibrationError, match="both hands arrive: give the one that is at the tool, by --hand"):
+        solved(streams, Settings(), CORNERS, None)
     with pytest.raises(
         CalibrationError, match=r"does not move .*\. hands/right moves with the tool, with a residual of 1 mm"
     ):
@@ -331,15 +333,15 @@ def test_the_hand_that_moves_with_the_tool_is_found_and_an_exchange_is_named() -
     ("axes", "words"), [((1e3, 1e3, 1e3), "moves 1000 times as far as the tool.*publish mm"), ((1, 1, -1), "mirrored")]
 )
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_the_cause_is_that_of_the_hand_that_moved(side: str, axes: tuple[float, ...], words: str) -> None:
+def test_the_cause_is_that_of_the_hand_at_the_tool(side: str, axes: tuple[float, ...], words: str) -> None:
     """The other one rests on the bench, and is seen by the same tracker."""
     held = held_by("mocap")
     held = held._replace(hand=held.hand * axes)
     noise = np.random.default_rng(2).normal(0.0, 0.001, held.hand.shape) * axes
     other = "left" if side == "right" else "right"
     streams = led_of(held, side, **{other: held._replace(hand=held.hand[0] + noise)})
-    with pytest.raises(CalibrationError, match=f"the {side} hand: .*{words}"):
-        solved(streams, Settings(), CORNERS, None)
+    with pytest.raises(CalibrationError, match=words):
+        solved(streams, Settings(), CORNERS, side)
 
 
 def test_each_hand_is_mapped_by_the_table_of_its_own_tracker() -> None:
@@ -349,7 +351,7 @@ def test_each_hand_is_mapped_by_the_table_of_its_own_tracker() -> None:
     mocap = of_right.poses * np.r_[[1000.0, 1000.0, -1000.0], np.ones(4)]
     streams = LedTracks({"left": of_left._replace(frame="webxr"), "right": of_right._replace(poses=mocap)}, tool)
     tables = {"mocap": TrackerSettings(unit="mm", axes="left-handed")}
-    found = solved(streams, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, None)
+    found = solved(streams, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, "right")
     assert (found.side, found.frame) == ("right", "mocap")
     assert 1e3 * error_m(found.calibration) < 1.5
     wrong = {"mocap": TrackerSettings(axes="left-handed")}
@@ -600,7 +602,10 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     urdf = ROOT / "service" / "arms" / "ur5.urdf"
     text = (ROOT / "service" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
     (tmp_path / "cell.toml").write_text(text)
-    cell = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
+    file = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
+    asked = told(*file)
+    assert (asked.returncode, "both hands arrive: give the one that is at the tool" in asked.stderr) == (1, True)
+    cell = [*file, "--hand", "left"]
     done = told(*cell)
     assert done.returncode == 0, done.stderr
     assert "left hand     held, 40 s, 398 samples, 0 outliers" in done.stdout
@@ -630,7 +635,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
         done = told(*cell, *more)
         assert (done.returncode, words in done.stderr) == (code, True), done.stderr
     assert load(tmp_path / "cell.toml").hands.base_from_tracker[0] == pytest.approx(1.44)
-    without = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "ur5")
+    without = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "ur5", "--hand", "left")
     assert 'Write this into the cell\'s settings; --config FILE does it:\n[hands]\nframe = "mocap"' in without.stdout
     wrong_arm = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam")
     assert "has no joints/state of the joints wam/base_yaw_joint" in wrong_arm.stderr
@@ -644,7 +649,7 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
     cell.write_text(text)
     recording(tmp_path / "led.mcap", held_by("mocap"), path_of("wam", 0).joints, Settings(), "webxr")
     command = ["calibrate", "--from", led, "--config", str(cell)]
-    done = told(*command)
+    done = told(*command, "--hand", "left")
     assert done.returncode == 0, done.stderr
     assert "\n[trackers.mocap]\nbase_from_tracker = [" in done.stdout
     np.testing.assert_allclose(load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002)
@@ -662,7 +667,7 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
     assert "hands are of two trackers, 'mocap' and 'webxr': give the hand that holds the tool by --hand" in done.stderr
     assert told(*command, "--check", "--hand", "left").returncode == 0
     cell.write_text(text.replace("mocap", "optitrack"))
-    done = told(*command)
+    done = told(*command, "--hand", "left")
     assert (done.returncode, "hands/left is in frame 'mocap', which has no table" in done.stderr) == (1, True)
     assert load(cell).hands == HandSettings(frame="webxr")
 
@@ -691,8 +696,11 @@ def test_what_cannot_be_meant_is_said(arguments: list[str], code: int, words: st
 class LedCell:
     """An arm that is led in real time and a hand that holds its tool, published until closed.
 
-    While `touched` is a position in frame `base` [m], the right hand rests there instead.
+    While `touched` is a position in frame `base` [m], the right hand rests there instead. While not
+    `is_seen`, it is not published.
     """
+
+    is_seen = True
 
     def __init__(self, endpoint: str, settings: Settings, arm: LedArm) -> None:
         self.touched: tuple[float, float, float] | None = None
@@ -711,7 +719,8 @@ class LedCell:
             at = self._hands[k] if self.touched is None else np.array(self.touched)
             seen = TURN.inv().apply(at - ORIGIN) + 0.001 * random.normal(size=3)
             pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(seen.tolist()), (0.0, 0.0, 0.0, 1.0))
-            self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
+            if self.is_seen:
+                self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
 
     def __enter__(self) -> LedCell:
         return self
@@ -763,8 +772,15 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
     cell, endpoint = tmp_path / "my.toml", f"tcp/127.0.0.1:{free_port()}"
     cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
     arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
-    with calibrating("--config", str(cell), "--listen", endpoint) as process, LedCell(endpoint, Settings(), arm):
+    with (
+        calibrating("--config", str(cell), "--listen", endpoint) as process,
+        LedCell(endpoint, Settings(), arm) as hand,
+    ):
         line_with(process, "hold the tool and lead it")
+        hand.is_seen = False
+        line_with(process, "hands/right no longer arrives")
+        hand.is_seen = True
+        line_with(process, "all streams arrive again")
         assert "accuracy" in line_with(process, "led over")
         time.sleep(8)
         press_enter(process)

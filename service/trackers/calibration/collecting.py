@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ from service.trackers.calibration.solver import (
     CalibrationError,
     Coverage,
     HeldTool,
-    UnrelatedError,
     coverage,
     solve_held,
 )
@@ -41,6 +40,7 @@ LEAST_LED_S = 15.0  # the tool is led at least this long
 LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at half of that
 LEAST_LED_M, LEAST_TURNED_RAD = 0.10, math.radians(40)  # and at least this far, in each direction
 LED_POLL_S = 0.05
+STREAM_ENDS_S = 1.0  # a stream that is silent for longer has ended
 LARGEST_POSITION = 1e9  # in any unit; squares of larger numbers overflow
 FAR_RATIO = 100.0  # positions are left out if they are this many times as far from the median as half of them
 MIN_MEDIAN_OFF = 0.05  # in the tracker's unit: a hand that rested for most of the time may still move by 5 m
@@ -108,6 +108,12 @@ class LiveLed(Capture):
     def arriving(self) -> list[str]:
         """The sides of the hands that arrive."""
         return [side for side in SIDES if self.samples[ENDINGS[side]]]
+
+    @property
+    def ended(self) -> list[str]:
+        """The streams that arrived, but not in the last STREAM_ENDS_S."""
+        since_ns = time.time_ns() - round(1e9 * STREAM_ENDS_S)
+        return [key for key, samples in self.samples.items() if samples and samples[-1].arrived_ns < since_ns]
 
     def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
         """The hands and the tool of the last `since_s` [s], None: all; the tool with at most
@@ -236,46 +242,47 @@ def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
     return track.stamps_ns, bool(abs(np.median(track.logged_ns - track.stamps_ns)) > 1e9 * CLOCK_TOLERANCE_S)
 
 
+def the_hand(hands: Collection[str], side: str | None) -> str:
+    """The hand that is calibrated: that of a side, or else the only one that arrives. Raises
+    CalibrationError: which hand a tracker calls left is not assumed.
+    """
+    if side is None and len(hands) > 1:
+        raise CalibrationError("both hands arrive: give the one that is at the tool, by --hand left or --hand right")
+    if not hands:
+        raise CalibrationError("no hand arrives: is the tracker running?")
+    if side is not None and side not in hands:
+        raise CalibrationError(f"{ENDINGS[side]} is needed, and nothing arrives there; {', '.join(hands)} arrives")
+    return side or next(iter(hands))
+
+
 def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int) -> SolvedHand:
-    """The calibration by the hand of a side; without one, by the hand that moves with the tool. It
-    is that of this hand's tracker; the other hand may have another one.
+    """The calibration by the hand of a side, or by the only one that arrives. It is that of this
+    hand's tracker; the other hand may have another one.
 
     Raises CalibrationError, which names the other hand if that one moves with the tool.
     """
-    found: dict[str, SolvedHand] = {}
-    errors: dict[str, CalibrationError] = {}
-    for one in SIDES:
-        if (track := led.hands.get(one)) is None:
-            continue
-        try:
-            hands = settings.hands_in(tracker_of(track, settings))
-            held, remarks = held_tool(track, led.tool, hands)
-            calibration = solve_held(held, corners, section=settings.tracker_section(track.frame), **more)
-        except CalibrationError as error:
-            errors[one] = error
-        else:
-            found[one] = SolvedHand(calibration, one, track.frame, held, [*led.remarks, *remarks])
-        if one == side and one in found:
-            return found[one]
-    if side is None and found:
-        return min(found.values(), key=lambda one: one.calibration.rms_m)
-    if side is not None and side not in led.hands:
-        others = f"; {', '.join(led.hands)} arrives" if led.hands else ""
-        raise CalibrationError(f"{ENDINGS[side]} is needed, and nothing arrives there{others}")
-    if side is not None and found:
-        (other,) = found
-        raise CalibrationError(
-            f"{errors[side]}. {ENDINGS[other]} moves with the tool, with a residual of "
-            f"{1e3 * found[other].calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else "
-            "the tracker exchanges left and right"
-        )
-    if not errors:
-        raise CalibrationError("no hand arrives: is the tracker running?")
-    if side is not None:
-        raise errors[side]
-    # The hand that moved with the tool, if there is one: the other may rest.
-    blamed = min(errors, key=lambda one: isinstance(errors[one], UnrelatedError))
-    raise CalibrationError(f"the {blamed} hand: {errors[blamed]}" if len(errors) > 1 else str(errors[blamed]))
+    side = the_hand(led.hands, side)
+    try:
+        return _solved(led, settings, corners, side, **more)
+    except CalibrationError as error:
+        for other in led.hands.keys() - {side}:
+            try:
+                found = _solved(led, settings, corners, other, **more)
+            except CalibrationError:
+                continue
+            raise CalibrationError(
+                f"{error}. {ENDINGS[other]} moves with the tool, with a residual of "
+                f"{1e3 * found.calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else the "
+                "tracker exchanges left and right"
+            ) from None
+        raise
+
+
+def _solved(led: LedTracks, settings: Settings, corners: Vector, side: str, **more: int) -> SolvedHand:
+    track = led.hands[side]
+    held, remarks = held_tool(track, led.tool, settings.hands_in(tracker_of(track, settings)))
+    calibration = solve_held(held, corners, section=settings.tracker_section(track.frame), **more)
+    return SolvedHand(calibration, side, track.frame, held, [*led.remarks, *remarks])
 
 
 class LedProgress(NamedTuple):
@@ -321,18 +328,24 @@ def lead(
     longest_s: float,
     is_ended: Callable[[], bool],
     show: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> str:
-    """Collect while the tool is led; return the reason for the end.
+    """Collect while the tool is led; return the reason for the end. `warn` is told when a stream
+    ends or continues, `show` how far it is.
 
     It ends once the accuracy is half of `accept_m`, after LED_S once it is accepted, when
     `is_ended`, or after `longest_s`.
     """
     begun_s = shown_s = time.monotonic()
+    ended: list[str] = []
     while (now_s := time.monotonic()) - begun_s < longest_s:
         time.sleep(LED_POLL_S)
         live.collect()
         if is_ended():
             return "ended by the operator"
+        if live.ended != ended:
+            ended = live.ended
+            warn(f"{' and '.join(ended)} no longer arrives" if ended else "all streams arrive again")
         if now_s - shown_s < SHOW_EVERY_S:
             continue
         found = progress(live.led(most_states=4 * SHOWN_SAMPLES), settings, corners, side)

@@ -60,10 +60,6 @@ class CalibrationError(ExplainedError, ValueError):
     """A calibration that is not possible; the message has the cause and the remedy."""
 
 
-class UnrelatedError(CalibrationError):
-    """The hand does not move with the tool."""
-
-
 class HeldTool(NamedTuple):
     """A hand that holds the tool: its times (N,) [s] and positions (N, 3) [m] in the tracker's
     frame; and times (M,) [s], positions (M, 3) [m] and quaternions (M, 4) of the tool in frame
@@ -366,7 +362,7 @@ def _check_motion(problem: _Problem, delay_s: float, matrix: Vector, centre: Vec
     off_m = np.median(np.linalg.norm(moved - np.median(moved, axis=0) - tool, axis=1))
     motion_m = np.median(np.linalg.norm(tool, axis=1))
     if off_m > MAX_UNEXPLAINED * motion_m:
-        raise UnrelatedError(
+        raise CalibrationError(
             f"the hand does not move with the tool: they differ by {1e3 * off_m:.0f} mm while the tool moves by "
             f"{1e3 * motion_m:.0f} mm. Hold the tool in the tracked hand, and let go of it only at the end"
         )
