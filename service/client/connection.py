@@ -16,7 +16,15 @@ import zenoh
 from service.client.calls import Client
 from service.client.client_settings import client_settings
 from service.client.session import check_open, put
-from service.client.streams import UNTURNED, Watch, checked_frame, checked_stamp, publisher, wait_until_heard
+from service.client.streams import (
+    UNTURNED,
+    Watch,
+    checked_frame,
+    checked_stamp,
+    encoded_joints,
+    publisher,
+    wait_until_heard,
+)
 from service.contract import cdr, markers
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
 from service.contract.requests import NORM_TOLERANCE, Reply, ViaPoint
@@ -99,6 +107,22 @@ class Connection(Client, AbstractContextManager["Connection"]):
         or more.
         """
         self._publish_bool("clutch", pressed)
+
+    def joints(
+        self,
+        names: Sequence[str],
+        position: Sequence[float],
+        velocity: Sequence[float] = (),
+        *,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Publish the measured joints [rad, rad/s; m, m/s if prismatic] of an arm that is led or
+        that a program of its own moves. An arm that follows this cell uses a `Follower`.
+        """
+        encoded_joints(0, names, position, velocity)  # raises before anything is sent
+        if not finite((*position, *velocity)):
+            raise ValueError(f"joints: {list(position)} and {list(velocity)} given; finite numbers needed")
+        self._publish({"joints/state": lambda ns: encoded_joints(ns, names, position, velocity)}, stamp_ns)
 
     def guided(self, led: bool) -> None:
         """Publish that somebody leads the arm by hand, or no longer does. While it is led, call

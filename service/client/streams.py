@@ -48,6 +48,22 @@ def no_room_to_brake(tick_s: float) -> str:
     )
 
 
+def encoded_joints(stamp_ns: int, names: Sequence[str], position: Sequence[float], velocity: Sequence[float]) -> bytes:
+    """A message with joints [rad, rad/s]; velocities may be empty. Raises ValueError unless there
+    is one number for each joint.
+    """
+    try:
+        state = JointState(stamp_ns, tuple(names), tuple(position), tuple(velocity))
+        if len(state.position) != len(state.names) or len(state.velocity) not in (0, len(state.names)):
+            raise TypeError
+        return cdr.encode_joints(state)
+    except (struct.error, TypeError, OverflowError, AttributeError):
+        raise ValueError(
+            f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and velocities of "
+            f"{len(names)} joints needed"
+        ) from None
+
+
 def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
     """A publisher on one channel of a cell; messages that cannot be sent at once are dropped.
     Raises UnreachableError if the session was closed.
@@ -298,17 +314,7 @@ class Follower(_Received):
         """
         check_open(self._session)
         now_ns = time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns)
-        state = JointState(now_ns, self._names, tuple(position), tuple(velocity))
-        try:
-            if len(state.position) != len(self._names) or len(state.velocity) not in (0, len(self._names)):
-                raise TypeError
-            message = cdr.encode_joints(state)
-        except (struct.error, TypeError, OverflowError):
-            raise ValueError(
-                f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and velocities of "
-                f"{len(self._names)} joints needed"
-            ) from None
-        put(self._session, self._state, message)
+        put(self._session, self._state, encoded_joints(now_ns, self._names, position, velocity))
 
     def close(self) -> None:
         """End the subscription and the publisher."""

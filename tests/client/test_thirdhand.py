@@ -148,6 +148,14 @@ PUBLISHED: dict[str, tuple[Callable[[Connection], None], dict[str, Any]]] = {
         lambda cell: cell.gripper(0.25, stamp_ns=8),
         {"gripper/state": JointState(8, ("gripper",), (0.25,), ())},
     ),
+    "the joints": (
+        lambda cell: cell.joints(["a", "b"], [0.5, -1], [0.0, 2.0], stamp_ns=9),
+        {"joints/state": JointState(9, ("a", "b"), (0.5, -1.0), (0.0, 2.0))},
+    ),
+    "the joints without velocities": (
+        lambda cell: cell.joints(("a",), (0.5,), stamp_ns=9),
+        {"joints/state": JointState(9, ("a",), (0.5,), ())},
+    ),
     "a pressed clutch": (lambda cell: cell.clutch(True), {"clutch": True}),
     "the gripper that a person wants": (
         lambda cell: cell.wish_gripper(1.0, stamp_ns=8),
@@ -181,6 +189,9 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "no rotation": (lambda cell: cell.tool((0, 0, 0, 0, 0, 0, 2)), r"tool: quaternion .* has norm 2; 1 needed"),
     "no clutch": (lambda cell: cell.clutch(1), "clutch: 1 given; True or False needed"),  # type: ignore[arg-type]
     "too far closed": (lambda cell: cell.gripper(1.5), r"closure: 1.5 given; 0 \(open\) to 1 \(closed\) needed"),
+    "a joint too few": (lambda cell: cell.joints(["a", "b"], [1]), "positions and velocities of 2 joints needed"),
+    "a joint in words": (lambda cell: cell.joints(["a"], ["up"]), "of 1 joints needed"),  # type: ignore[list-item]
+    "a joint nowhere": (lambda cell: cell.joints(["a"], [math.nan]), r"joints: \[nan\] .* finite numbers needed"),
     "no closure": (lambda cell: cell.gripper(None), r"closure: \[None\] given; 0 \(open\)"),  # type: ignore[arg-type]
     "a shape": (lambda cell: cell.objects([BOX._replace(shape="cone")]), "shape 'cone' given; one of box, ball, cyl"),
     "no size": (lambda cell: cell.objects([BOX._replace(size=(0.1, 0.1, 0.0))]), "object 'board': .* or no size"),
