@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -33,7 +34,7 @@ def poses(bodies: Iterable[Any], keys: Mapping[int, str], stamp_ns: int) -> Iter
 
 def main() -> None:
     """Publishes until Ctrl-C."""
-    from natnet import DataFrame, NatNetClient
+    from natnet import DataFrame, NatNetClient, NatNetError
 
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--server", default="127.0.0.1", help="address of the machine with Motive")
@@ -54,6 +55,13 @@ def main() -> None:
 
         client = NatNetClient(args.server, args.local, use_multicast=False)
         client.on_data_frame_received_event.handlers.append(publish)
+        while not client.connected:
+            try:
+                client.connect()
+            except (TimeoutError, OSError, NatNetError) as error:
+                reason = str(error) or "no answer"
+                print(f"waiting for Motive at {args.server}, which must stream as unicast: {reason}", file=sys.stderr)
+                time.sleep(1)
         with client:
             client.run_async()
             while True:
