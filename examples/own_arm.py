@@ -58,7 +58,8 @@ if __name__ == "__main__":
     parser.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
     args, stop = parser.parse_args(), threading.Event()
     settings = load(args.config) if args.config else Settings()
-    client = client_settings(connect=args.connect, cell=settings.cell if args.config else None)
+    where = args.connect or (settings.network.reached_at if args.config else None)
+    client = client_settings(connect=where, cell=settings.cell if args.config else None)
     with client.session(timeout_s=None) as session:
         signal.signal(signal.SIGINT, lambda *_: stop.set())  # from now on Ctrl-C brakes first
         follow(FakeArm(settings), session, client.cell, stop=stop)

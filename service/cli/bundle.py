@@ -19,7 +19,7 @@ import msgspec
 
 from service.cli.doctor import doctor
 from service.cli.status import status
-from service.cli.usage import check_writable
+from service.cli.usage import check_writable, reaching
 from service.contract.explain import ExplainedError, in_words
 from service.files.mcap_file import machine
 from service.files.shipped import cell_of
@@ -38,6 +38,7 @@ def bundle(args: argparse.Namespace) -> int:
     """Write the archive and print what it holds; exit code 0 also if the daemon does not answer."""
     settings, now = cell_of(str(args.config)) if args.config else None, datetime.now(UTC)
     args.cell = args.cell or (settings or Settings()).cell
+    args.connect = list(reaching(args, settings).connect)
     path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
     check_writable(path)
     installed = {(one.metadata["Name"], one.version) for one in metadata.distributions()}

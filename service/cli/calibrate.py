@@ -75,7 +75,7 @@ def calibrate(args: argparse.Namespace) -> int:
         return _checked(led, settings, record, args) if args.check else 0
     settings = settings or Settings()
     with (
-        inputs_session(args, CONNECT_TIMEOUT_S) as session,
+        inputs_session(args, CONNECT_TIMEOUT_S, settings) as session,
         contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
     ):
         return _live(live, settings, file, given, only_check, args)

@@ -26,7 +26,7 @@ def follow(args: argparse.Namespace) -> int:
             f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with examples/own_arm.py"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
-    reach = reaching(args)
+    reach = reaching(args, settings)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
         from service.arms.drive import Drive, DriveError  # slow imports: a missing daemon is reported before

@@ -100,7 +100,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     check_writable(path)
     places = places_in(args.places) if args.places else ()
     cell, ended = args.cell or settings.cell, EnterPressed()
-    with inputs_session(args, CONNECT_TIMEOUT_S) as session:
+    with inputs_session(args, CONNECT_TIMEOUT_S, settings) as session:
         if args.until == "key":
             say("Enter or Ctrl-C ends it")
         captured = capture(

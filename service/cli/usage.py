@@ -14,13 +14,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+import msgspec
 import zenoh
 
 from service.client import ClientSettings, UnreachableError, client_settings, open_session
 from service.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from service.contract.explain import did_you_mean, in_file, in_words
 from service.contract.requests import Add, RequestError, ViaPoint, decode_request
-from service.settings.config import RATES_HZ
+from service.settings.config import RATES_HZ, Settings
 from service.settings.file_content import UnusableError, content
 
 CONNECT_TIMEOUT_S = 3.0
@@ -134,9 +135,14 @@ def check_writable(path: Path, suffix: str = "") -> None:
         raise UsageError(f"{path} cannot be written: {in_words(error, named=False)}") from None
 
 
-def reaching(args: argparse.Namespace) -> ClientSettings:
-    """The client settings in a command line. Raises SettingsError."""
-    return client_settings(connect=args.connect, cell=vars(args).get("cell"))
+def reaching(args: argparse.Namespace, settings: Settings | None = None) -> ClientSettings:
+    """The client settings in a command line; if they name no endpoint, those at which the daemon of
+    a cell's `settings` is reached. Raises SettingsError.
+    """
+    reach = client_settings(connect=args.connect, cell=vars(args).get("cell"))
+    if settings is None or reach.connect or reach.zenoh_config:
+        return reach
+    return msgspec.structs.replace(reach, connect=settings.network.reached_at)
 
 
 def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_S) -> zenoh.Session:
@@ -146,11 +152,12 @@ def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_
     return reaching(args).session(timeout_s=timeout_s, at_once=timeout_s is not None)
 
 
-def inputs_session(args: argparse.Namespace, timeout_s: float) -> zenoh.Session:
+def inputs_session(args: argparse.Namespace, timeout_s: float, settings: Settings | None = None) -> zenoh.Session:
     """A session that receives what trackers and arm publish: a client of the daemon or router, or
     with --listen one to which they connect. Raises UnreachableError.
     """
-    listen, reach = [args.listen] if args.listen else [], reaching(args)
+    listen = [args.listen] if args.listen else []
+    reach = reaching(args, settings)
     try:
         return open_session(
             connect=args.connect or () if listen else reach.connect,

@@ -57,6 +57,12 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     ros2_domain: Domain = None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
     allow_insecure: bool = False  # accept a network without TLS: everyone on it, or at its router, can move the arm
 
+    @property
+    def reached_at(self) -> tuple[str, ...]:
+        """The endpoints at which programs of this machine reach the daemon."""
+        listening = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", one) for one in self.listen]
+        return tuple(one for one in listening if not re.search(r":0([?#]|$)", one)) or self.connect
+
     def __post_init__(self) -> None:
         given = {"listen": self.listen, "connect": self.connect}
         for name, endpoint in ((f"{key}[{i}]", one) for key, some in given.items() for i, one in enumerate(some)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import copy
 import functools
@@ -14,6 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from service.cli.usage import reaching
 from service.client.client_settings import client_settings
 from service.contract.requests import List, ViaPointsRequest, decode_request
 from service.daemon.launch import described
@@ -260,6 +262,35 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
 )
 def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, local: bool) -> None:
     assert is_local(endpoint) == local
+
+
+@pytest.mark.parametrize(
+    ("network", "endpoints"),
+    [
+        ({}, ("tcp/127.0.0.1:7447",)),
+        ({"listen": ("tcp/0.0.0.0:1", "tcp/[::]:2"), "allow_insecure": True}, ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2")),
+        ({"listen": ("tcp/127.0.0.1:0",)}, ()),
+        ({"listen": ("tcp/127.0.0.1:0",), "connect": ("tcp/[::1]:5",)}, ("tcp/[::1]:5",)),
+        ({"listen": ("unixsock-stream//run/th.sock",)}, ("unixsock-stream//run/th.sock",)),
+    ],
+)
+def test_programs_of_this_machine_reach_the_daemon_where_it_listens(
+    network: dict[str, Any], endpoints: tuple[str, ...]
+) -> None:
+    assert Network(**network).reached_at == endpoints
+
+
+def test_an_endpoint_of_the_command_line_or_the_environment_is_used_before_that_of_the_settings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = Settings(network=Network(listen=("tcp/127.0.0.1:1",)))
+    args = argparse.Namespace(connect=None, cell=None)
+    assert reaching(args).connect == ()
+    assert reaching(args, settings).connect == ("tcp/127.0.0.1:1",)
+    monkeypatch.setenv("THIRDHAND_CONNECT", "tcp/127.0.0.1:2")
+    assert reaching(args, settings).connect == ("tcp/127.0.0.1:2",)
+    args.connect = ["tcp/127.0.0.1:3"]
+    assert reaching(args, settings).connect == ("tcp/127.0.0.1:3",)
 
 
 def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
