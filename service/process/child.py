@@ -15,6 +15,7 @@ import contextlib
 import ctypes
 import gc
 import importlib
+import logging
 import mmap
 import os
 import select
@@ -249,6 +250,7 @@ def _serve(control: socket.socket) -> None:
     _continue_with_parent()
     _set_name("fork server")
     gc.disable()  # imports leave no garbage
+    logging.getLogger("kmp").setLevel(logging.ERROR)  # the parent's log says what is compiled
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(CHILD_NICE)

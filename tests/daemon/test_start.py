@@ -4,6 +4,7 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
@@ -106,7 +107,7 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     (tmp_path / "cell.toml").write_text(
         f'[network]\nlisten = ["{endpoint}"]\n[files]\nstate = "{tmp_path / "state"}"\n'
     )
-    command = [sys.executable, "-m", "service", "serve", "--config", str(tmp_path / "cell.toml")]
+    command = [sys.executable, "-m", "service", "serve", "--log", "json", "--config", str(tmp_path / "cell.toml")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as service:
         assert service.stderr is not None
         begun_s = time.monotonic()
@@ -124,6 +125,7 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
         lasted_s = time.monotonic() - begun_s
         service.kill()
         logged = service.communicate()[1].splitlines()
+    assert all(json.loads(line)["logger"] == "thirdhand" for line in logged)  # also what compilers say
     counts = [found for line in answers if (found := COUNTED.search(line))]
     there = [int(found[2]) for found in counts]
     assert there == sorted(there)
