@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +26,7 @@ from service.contract.printable import printable
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.core.intake.stage import UNIT_M
-from service.files.mcap_file import RecordingError, existing
+from service.files.mcap_file import RecordingError, begin_of, existing
 from service.files.mcap_reader import FileFault, Messages, full_name
 from service.files.motion_capture import CAPTURE_FRAME, Captured, read_c3d, read_motive
 from service.files.tool_poses import tool_poses
@@ -116,6 +117,7 @@ class PoseRecording:
     def _existing(self) -> Path:
         if not self.path.is_file():
             raise RecordingError(f"there is no file {self.path}")
+        begin_of(self.path)
         return self.path
 
     def _read_captured(self, captured: Captured) -> None:
@@ -163,10 +165,19 @@ class PoseRecording:
             raise RecordingError(
                 f"{self.path} is a data set of LeRobot, whose columns do not name hands and tool. {FROM_ARRAYS}"
             )
-        if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
+        has_metadata = (self.path / "metadata.yaml").exists()
+        if self.path.is_dir() and not has_metadata and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder without metadata.yaml: give its files, {self.path}/*.mcap")
+        files = [self._existing()] if not self.path.is_dir() else sorted(self.path.glob("*.db3"))
+        for file in (*files, *self.path.glob("*.mcap")):
+            begin_of(file)
+        is_killed = any(Path(f"{file}-wal").exists() for file in files)
         try:
             is_ros_1 = self.path.suffix == ".bag"
+            if files and not is_ros_1 and (is_killed or not has_metadata):
+                for file in files:
+                    self._read_sqlite(file)
+                return
             with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
                 self.topics = {one.topic: one.msgtype for one in bag.connections}
                 self._ros_1_topics = set(self.topics) if is_ros_1 else set()
@@ -174,8 +185,18 @@ class PoseRecording:
                 for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
                     self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
         except Exception as error:  # the exceptions of the bags' storages have no common base
-            missing = "" if self.path.exists() else " It does not exist."
-            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{missing}") from None
+            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
+
+    def _read_sqlite(self, file: Path) -> None:
+        """Read a `.db3`, and what a recorder that was killed has left in its `-wal`."""
+        with contextlib.closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            kinds = dict(database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr'"))
+            self.topics |= kinds
+            for topic, logged_ns, data in database.execute(
+                "SELECT name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id ORDER BY timestamp"
+            ):
+                if kinds.get(topic) in (*POSE_TYPES, JOINTS.type):
+                    self._raw.setdefault(topic, []).append((logged_ns, bytes(data)))
 
     def _decoded(self, topic: str, decode: Callable[[bytes], Value]) -> Iterator[tuple[int, Value]]:
         """Time of recording [ns] and value of each message of a topic.

@@ -4,8 +4,11 @@ and joint states, in a tracker's axes and unit, by clocks that differ.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
+import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +110,17 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         np.testing.assert_array_equal(got.stamps_ns, STAMPS)
         np.testing.assert_allclose(got.left[:, :2], np.column_stack([WAY, np.full(len(WAY), -0.3)]))
         np.testing.assert_allclose(got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)]))
+    if plugin is StoragePlugin.SQLITE3:
+        with contextlib.closing(sqlite3.connect(file)) as recorder:  # one that was killed, before its metadata
+            recorder.execute("PRAGMA journal_mode = WAL")
+            recorder.execute("DELETE FROM messages WHERE timestamp > ?", (int(STAMPS[20]),))
+            recorder.commit()
+            shutil.copytree(folder, killed := tmp_path / "killed")
+        (killed / "metadata.yaml").unlink()
+        assert (killed / f"{file.name}-wal").stat().st_size > 0
+        for path in (killed, killed / file.name):
+            assert len(read_demonstration(path, topics=sources).stamps_ns) == 20
+        path = file
     for given, words in (
         ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
         ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
@@ -219,7 +233,7 @@ def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count
 def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     (tmp_path / "a.db3").write_bytes(b"nothing")
     for path in (tmp_path, tmp_path / "a.db3", tmp_path / "b.bag"):
-        with pytest.raises(RecordingError, match=r"is not a bag that can be read: "):
+        with pytest.raises(RecordingError, match=r"is not a bag that can be read: |there is no file .*bag"):
             read_demonstration(path)
 
 
