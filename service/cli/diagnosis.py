@@ -112,6 +112,8 @@ def _in_order_of_cause(
     if of_humble := [one for one in published if one.endswith(f"/{NO_TYPE_HASH}")][:MOST_OTHER_KEYS]:
         found, advice = f"Humble publishes {', '.join(of_humble)}", what_to_do(Condition.HUMBLE)
         yield Finding("note", "ROS 2", found, "keys with the hash of their type, as of Iron and later", advice)
+    for name in now.streams:
+        yield from _rejected(before, now, name)
     yield _driver(before, now)
     yield from _drives(travels)
     if "arm" in now.sources and now.command_heard:
@@ -226,8 +228,9 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
-    source, what, seconds = now.sources[name], SOURCE_NAMES[name], max((now.time_ns - before.time_ns) / 1e9, 0.1)
-    earlier, arriving_hz = before.sources.get(name, Source()).rejected, max(source.rate_hz, 1.0)
+    source, what = now.inputs[name], SOURCE_NAMES.get(name, name)
+    seconds = max((now.time_ns - before.time_ns) / 1e9, 0.1)
+    earlier, arriving_hz = before.inputs.get(name, Source()).rejected, max(source.rate_hz, 1.0)
     rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
     share = max(source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz)
     for cause, rate in rates.items():

@@ -15,9 +15,7 @@ from kmp import AffineMean
 from service.cli.many_files import of_each
 from service.cli.usage import UsageError, check_writable, places_in, reached
 from service.client import Client, Tracker
-from service.contract import cdr
 from service.contract.explain import ExplainedError
-from service.contract.messages import WireError
 from service.contract.printable import printable, printable_lines
 from service.contract.requests import Status
 from service.files.demonstration_reader import hand_samples, read_demonstration
@@ -42,10 +40,7 @@ COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within th
 
 def play(args: argparse.Namespace) -> int:
     """Publish the hands of a recording; exit code 0 once all are published."""
-    try:
-        hands = [(time_ns, side, cdr.decode_pose(payload)) for time_ns, side, payload in hand_samples(args.file)]
-    except WireError as error:
-        raise ExplainedError(f"{args.file}: a hand's pose is not readable: {error}") from None
+    hands = hand_samples(args.file, say=say)
     start_ns, last_ns = hands[0][0], hands[-1][0]
     if ends_early(args.file):
         print(f"{args.file} was cut: its end is missing, the rest is played", file=sys.stderr)

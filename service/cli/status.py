@@ -147,7 +147,7 @@ def rows(now: Status) -> dict[str, str]:
         "tool's limits": "; ".join(f"{where} {limits.text}" for where, limits in now.tool_limits.items()),
         "limited by": now.binding,
         "gripper": now.gripper + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
-        "rejected": "; ".join(_rejected(name, source) for name, source in now.sources.items() if source.rejected)
+        "rejected": "; ".join(_rejected(name, source) for name, source in now.inputs.items() if source.rejected)
         or "none",
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
         "disk": disk(scribe) if scribe.get("free_mb") is not None else "",
@@ -252,4 +252,5 @@ def _turned(now: Status) -> str:
 
 def _rejected(name: str, source: Source) -> str:
     newest = f" (newest as {source.cause}: {source.refused})" if source.refused else ""
-    return f"{SOURCE_NAMES[name]} " + ", ".join(f"{count} {cause}" for cause, count in source.rejected.items()) + newest
+    counts = ", ".join(f"{count} {cause}" for cause, count in source.rejected.items())
+    return f"{SOURCE_NAMES.get(name, name)} {counts}{newest}"

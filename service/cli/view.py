@@ -31,7 +31,7 @@ from service.contract.explain import ExplainedError, in_words
 from service.contract.incidents import word
 from service.contract.records import Mode
 from service.daemon.launch import free_port
-from service.files.mcap_file import RecordingError
+from service.files.mcap_file import RecordingError, begin_of
 from service.files.recording import OBJECTS_NOTE, Recording
 from service.files.steps import Gap
 from service.process.progress import progress, say
@@ -92,8 +92,7 @@ def _kind(path: Path) -> bytes:
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     if not path.is_file():  # reading a pipe could wait forever
         raise ExplainedError(f"{path} is not a file; a recording (.mcap) or a drawing of Rerun's (.rrd) needed")
-    with path.open("rb") as file:
-        begins = file.read(len(MCAP0_MAGIC))
+    begins = begin_of(path)
     for magic in (RRD_MAGIC, MCAP0_MAGIC):
         if begins.startswith(magic):
             return magic

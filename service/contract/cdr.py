@@ -1,5 +1,5 @@
-"""ROS 2 messages in CDR, little endian: the bytes of every stream on the wire and of every message
-in a recording.
+"""ROS 2 messages in CDR: the bytes of every stream on the wire and of every message in a recording.
+They are written little endian, and read in each encoding of plain CDR (XTypes 1.3, 7.6.3.1).
 
 Written by hand because the loop encodes and decodes several per tick, in a microsecond each.
 """
@@ -34,8 +34,24 @@ _TICK = struct.Struct("<qII")
 _ATTACHMENT = struct.Struct("<Qqq")
 _STAMPED = 12  # bytes of header and stamp
 _MOST_LAYOUTS = 16
-_LONGEST = 8192  # bytes; bounds the time in which the loop reads a message
+MAX_BYTES = 8192  # bounds the time in which the loop reads a message
 LONGEST_TRANSFORMS = 32768  # bytes of a TFMessage: of about 300 transforms
+# CDR and CDR2 by the number with which a message begins: byte order, largest alignment [bytes].
+# CDR2 has the number of RTPS, which implementations of DDS write, or that of XTypes.
+_PLAIN = {
+    b"\x00\x00": (">", 8),
+    b"\x00\x01": ("<", 8),
+    b"\x00\x06": (">", 4),
+    b"\x00\x07": ("<", 4),
+    b"\x00\x10": (">", 4),
+    b"\x00\x11": ("<", 4),
+}
+_REFUSED = {
+    **dict.fromkeys((b"\x00\x02", b"\x00\x03"), "PL_CDR"),
+    b"\x00\x04": "XML",
+    **dict.fromkeys((b"\x00\x08", b"\x00\x09", b"\x00\x14", b"\x00\x15"), "DELIMITED_CDR2"),
+    **dict.fromkeys((b"\x00\x0a", b"\x00\x0b", b"\x00\x12", b"\x00\x13"), "PL_CDR2"),
+}
 
 
 def _stamp(stamp_ns: int) -> tuple[int, int]:
@@ -226,19 +242,33 @@ def _text(raw: bytes) -> str:
         raise WireError("a string that is not UTF-8") from None
 
 
+@functools.cache
+def _big_endian(layout: struct.Struct) -> struct.Struct:
+    return struct.Struct(f">{layout.format.lstrip('<')}")
+
+
 class Reader:
-    """A cursor over CDR bytes; reads beyond the end raise WireError."""
+    """A cursor over CDR bytes; reads beyond the end raise WireError.
+
+    The options, which follow the number of the encoding, count padding bytes at the end. They are
+    not needed, because up to three bytes may follow each message.
+    """
 
     def __init__(self, data: bytes, most: int | None = None) -> None:
         if most is not None and len(data) > most:
             raise WireError(f"a message of {len(data)} bytes, at most {most} accepted")
-        if data[:4] != CDR_HEADER:
-            raise WireError(f"header {data[:4].hex(' ') or 'missing'}, little-endian CDR {CDR_HEADER.hex(' ')} needed")
+        if data[:2] not in _PLAIN or len(data) < 4:
+            encoding = f"encoding {_REFUSED[data[:2]]}, " if data[:2] in _REFUSED else ""
+            raise WireError(f"{encoding}header {data[:4].hex(' ') or 'missing'}; plain CDR or CDR2 needed")
+        order, self._max_align = _PLAIN[data[:2]]
+        self._is_big_endian = order == ">"
         self._data = data
         self._at = 4
 
     def unpack(self, layout: struct.Struct, align: int) -> tuple[Any, ...]:
-        at = self._at + (-(self._at - 4) % align)
+        if self._is_big_endian:
+            layout = _big_endian(layout)
+        at = self._at + (-(self._at - 4) % min(align, self._max_align))
         self._at = at + layout.size
         try:
             return layout.unpack_from(self._data, at)
@@ -251,19 +281,28 @@ class Reader:
             raise WireError(f"a length of {count} with {len(self._data) - self._at} bytes left")
         return count
 
+    def items(self) -> int:
+        """Length of a sequence of strings or structures, which CDR2 precedes by its bytes."""
+        if self._max_align == 4:
+            self.length()
+        return self.length()
+
     def string(self) -> str:
+        return _text(self._raw_string())
+
+    def _raw_string(self) -> bytes:
         count = self.length()
         raw = self._data[self._at : self._at + count]
         self._at += count
-        return _text(raw)
+        return raw
 
     def doubles(self) -> tuple[float, ...]:
         count = self.length()
         return self.unpack(struct.Struct(f"<{count}d"), 8) if count else ()
 
     def skip(self, layout: struct.Struct, align: int) -> None:
-        """Skip a sequence of items of one layout."""
-        if count := self.length():
+        """Skip a sequence of items of one layout: numbers, or structures of them."""
+        if count := self.length() if layout.size == align else self.items():
             self.unpack(struct.Struct(f"{count * layout.size}x"), align)
 
     def header(self) -> tuple[int, str]:
@@ -273,6 +312,9 @@ class Reader:
         """Seconds and nanoseconds, parent, child, and pose of a TransformStamped, in a quarter of
         the time of single reads: messages hold many, of which the loop needs two.
         """
+        if self._is_big_endian or self._max_align == 4:
+            stamp: Any = self.unpack(_STAMP, 4)
+            return stamp, self._raw_string(), self._raw_string(), self.unpack(_POSE, 8)
         data, parent_at = self._data, self._at + -self._at % 4 + _TRANSFORM.size
         try:
             seconds, nanoseconds, parent_size = _TRANSFORM.unpack_from(data, parent_at - _TRANSFORM.size)
@@ -292,7 +334,7 @@ class Reader:
 
 
 def _read_pose(data: bytes, *layouts: struct.Struct) -> tuple[Any, ...]:
-    reader = Reader(data, _LONGEST)
+    reader = Reader(data, MAX_BYTES)
     stamp, frame = reader.header()
     pose, *more = (reader.unpack(layout, 8) for layout in layouts)
     reader.end()
@@ -340,9 +382,9 @@ def decode_joints(data: bytes) -> JointState:
                 numbers[v + 1 :],
                 known.frame_id,
             )
-    reader = Reader(data, _LONGEST)
+    reader = Reader(data, MAX_BYTES)
     stamp, frame = reader.header()
-    names = tuple(reader.string() for _ in range(reader.length()))
+    names = tuple(reader.string() for _ in range(reader.items()))
     position, velocity, effort = reader.doubles(), reader.doubles(), reader.doubles()
     reader.end()
     message = JointState(stamp, names, position, velocity, effort, frame)
@@ -398,16 +440,30 @@ def _spellings(frames: tuple[str, ...]) -> frozenset[bytes]:
     return frozenset(slash + bytes_of_frame(frame) for frame in frames for slash in (b"", b"/"))
 
 
-def decode_transforms(data: bytes, frames: tuple[str, ...] = ()) -> list[tuple[str, PoseStamped]]:
+def decode_transforms(
+    data: bytes,
+    frames: tuple[str, ...] = (),
+    *,
+    longest: int = LONGEST_TRANSFORMS,
+    rejected: list[str] | None = None,
+) -> list[tuple[str, PoseStamped]]:
     """The child frames in the CDR bytes of a TFMessage, each with its pose in its parent; with
-    `frames` only these. Names have no leading slash. Raises WireError.
+    `frames` only these. Names have no leading slash.
+
+    Raises WireError; mistakes of single transforms are appended to `rejected` instead, if given.
     """
-    reader, wanted, found = Reader(data, LONGEST_TRANSFORMS), _spellings(frames), []
-    for _ in range(reader.length()):
+    reader, wanted, found = Reader(data, longest), _spellings(frames), []
+    for _ in range(reader.items()):
         stamp, parent, child, pose = reader.transform()
-        if not frames or child in wanted:
+        if frames and child not in wanted:
+            continue
+        try:
             frame, name = (_text(raw).lstrip("/") for raw in (parent, child))
             found.append((name, PoseStamped(_stamp_ns(*stamp), frame, pose[:3], pose[3:])))
+        except WireError as error:
+            if rejected is None:
+                raise
+            rejected.append(str(error))
     reader.end()
     return found
 

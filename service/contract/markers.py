@@ -56,7 +56,7 @@ def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
     Raises WireError.
     """
     reader, found = cdr.Reader(data, LARGEST), []
-    for _ in range(reader.length()):
+    for _ in range(reader.items()):
         _, frame = reader.header()
         name = reader.string()
         _, kind, action = reader.unpack(_KIND, 4)

@@ -300,6 +300,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     remedy: str = ""  # what to do about it
     time_ns: int = 0  # time of the status by the daemon's clock
     sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
+    streams: dict[str, Source] = {}  # all other streams that the cell receives, by key
     frames: tuple[str, ...] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
     trackers: dict[str, tuple[float, ...]] = {}  # pose of each known tracker frame in `base`, by the frame's name
     joints: tuple[str, ...] = ()  # their names, in order
@@ -330,6 +331,11 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     guided: bool = False  # True while the arm's driver reports that it is led by hand
     memory_mb: dict[str, float] = {}  # resident memory of the processes `daemon` and `scribe`
     offer: str = ""  # what to learn from corrections that were repeated; empty: nothing
+
+    @property
+    def inputs(self) -> dict[str, Source]:
+        """All streams that the cell receives: `sources` and `streams`."""
+        return self.sources | self.streams
 
     @property
     def needed(self) -> tuple[str, ...]:

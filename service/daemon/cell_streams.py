@@ -23,7 +23,6 @@ KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
 LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
-MAX_SAMPLE_BYTES = 4096  # limit of a message of a hand or of joints
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
     ARM_STATE: lambda settings: settings.arm.source == "state",
@@ -177,8 +176,8 @@ class CellStreams:
     def _decoded(self, suffix: str, raw: Any) -> Event | None:
         channel, arrivals = channels.BY_KEY[suffix], self._arrivals[suffix]
         try:
-            if len(raw) > MAX_SAMPLE_BYTES:
-                raise WireError(f"{len(raw)} bytes, at most {MAX_SAMPLE_BYTES} accepted")
+            if len(raw) > cdr.MAX_BYTES:
+                raise WireError(f"{len(raw)} bytes, at most {cdr.MAX_BYTES} accepted")
             payload, at_ns = bytes(raw), time.time_ns()
             message = channel.codec.decode(payload)
             if suffix == ARM_STATE:

@@ -124,7 +124,7 @@ class Daemon:
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
         self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
-        self._side_streams = side_streams(self._session, settings, scribe, self.note)
+        self._side_streams = side_streams(self._session, settings, scribe, self._sources.arrivals)
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
         self._start, self._is_open = start, False
@@ -361,7 +361,7 @@ class Daemon:
                 if error_text not in logged_errors:
                     logged_errors.append(error_text)
                     log.warning("%s", error_text)
-            for line in self._sources.news(status.sources, time.monotonic()):
+            for line in self._sources.news(status.inputs, time.monotonic()):
                 log.warning("%s", line)
             if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
                 logged_mode = (status.mode, status.reason)
@@ -386,6 +386,8 @@ class Daemon:
         for name, source in self._sources.update(self._controller, state, now_s):
             sources[name] = source
             clock.between_ticks()
+        streams = self._sources.streams(now_s)
+        clock.between_ticks()
         inside = self._measured_arm.inside(state)
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
         machine, scribe = self._machine, self._scribe.status()
@@ -397,7 +399,7 @@ class Daemon:
             clock.between_ticks()
             percentiles[name] = window.percentiles()
         clock.between_ticks()
-        known = self._failure, inside, machine.at_stop, self._sources.clutch(state)
+        known = self._failure, inside, machine.at_stop, self._sources.clutch(state), streams
         return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),

@@ -1,4 +1,5 @@
-"""The input of each hand and of the arm: rates, clocks, and rejected samples with their causes.
+"""The input of each hand, of the arm and of all other streams: rates, clocks, and rejected samples
+with their causes.
 
 The loop only counts samples. Everything else is computed beside it, ten times a second.
 """
@@ -10,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from statistics import median
 
+import msgspec
 import numpy as np
 
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
@@ -23,9 +25,10 @@ from service.core.frame import Record, Vector
 from service.core.intake import KEPT
 from service.core.intake.far_away import too_far, unit_meant
 from service.core.intake.late_samples import lateness_ms
-from service.core.intake.stage import Refused
+from service.core.intake.stage import Intake, Refused
 from service.core.tuning import TUNING
 from service.daemon.cell_streams import Arrivals, heard
+from service.daemon.side_streams import side_keys
 from service.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
@@ -59,17 +62,28 @@ class InputMonitor:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.arrivals = {channel.key: Arrivals() for channel in heard(settings)}
-        self._histories = {source: _History() for source in SOURCES if KEY_OF_SOURCE[source] in self.arrivals}
+        keys = [*(channel.key for channel in heard(settings)), *side_keys(settings)]
+        self.arrivals = {key: Arrivals() for key in keys}
+        self._keys = {source: key for source, key in KEY_OF_SOURCE.items() if key in keys}
+        self._keys |= {key: key for key in keys if key not in self._keys.values()}
+        self._histories = {name: _History() for name in self._keys}
         self._counted_s = 0.0
 
     def update(self, controller: Controller, state: Record, now_s: float) -> Iterator[tuple[str, Source]]:
         """Each source with its name at this moment, from the state of this controller."""
-        for source in self._histories:
-            yield source, self._source(source, controller, state, now_s)
+        for source in SOURCES:
+            if source in self._keys:
+                yield source, self._source(source, controller, state, now_s)
 
-    def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
-        history, arrivals, index = self._histories[source], self.arrivals[KEY_OF_SOURCE[source]], SOURCES.index(source)
+    def streams(self, now_s: float) -> dict[str, Source]:
+        """All other streams at this moment, by key."""
+        return {name: self._stream(name, now_s) for name in self._keys if name not in SOURCES}
+
+    def _stream(self, name: str, now_s: float, intake: Intake | None = None) -> Source:
+        """Rate, clock and rejected messages of a stream; the `intake` rejects samples of hands and
+        arm.
+        """
+        history, arrivals = self._histories[name], self.arrivals[self._keys[name]]
         if history.counts and history.counts[-1][1] != arrivals.count and arrivals.newest is not None:
             history.clocks.append((now_s, (arrivals.at_ns - arrivals.newest.stamp_ns) / 1e6))
         history.counts.append((now_s, arrivals.count))
@@ -77,37 +91,45 @@ class InputMonitor:
             history.counts.popleft()
         while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
             history.clocks.popleft()
-        (since_s, before), intake = history.counts[0], controller.intake
-        rejected = {word(cause): int(n) for cause, n in zip(Cause, intake.rejected[index], strict=True) if n}
-        rejected |= {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
+        since_s, before = history.counts[0]
+        rejected = {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
+        if intake is not None:
+            counts = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
+            rejected = {word(cause): int(n) for cause, n in counts if n} | rejected
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
-            if cause == MALFORMED:
+            if cause == MALFORMED or intake is None:
                 history.found[cause] = explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
             else:
-                refused = intake.refused[source, Cause[cause.upper()]]
+                refused = intake.refused[name, Cause[cause.upper()]]
                 seen_of = evidence(refused, self._settings, arrivals)
                 history.found[cause] = explained(refused.cause, seen_of)
             history.cause, history.refused_s = cause, now_s
         history.seen, lately = rejected, now_s - history.refused_s <= RATE_WINDOW_S
         newest = history.found[history.cause] if lately else None
+        return Source(
+            rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,
+            clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
+            frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
+            rejected=rejected,
+            cause=history.cause if lately else "",
+            refused="" if newest is None else newest.why,
+            advice="" if newest is None else newest.what_to_do,
+        )
+
+    def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
+        index = SOURCES.index(source)
         seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
         age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
         stale_ms = 0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
         silent_ms = settings.arm.silent_ms if source == "arm" else stale_ms
         late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
-        return Source(
-            rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,
+        return msgspec.structs.replace(
+            self._stream(source, now_s, controller.intake),
             age_ms=age_ms,
             fresh=age_ms is not None and age_ms < silent_ms,
-            clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
             late_ms=None if late is None else round(late[0], 1),
             late_95_ms=None if late is None else round(late[1], 1),
-            frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
-            rejected=rejected,
-            cause=history.cause if lately else "",
-            refused="" if newest is None else newest.why,
-            advice="" if newest is None else newest.what_to_do,
             contested=round(float(state["contested"][index]), 3),
             apart_mm=self._apart_mm(source, state, now_s),
             scatter_mm=None
@@ -140,8 +162,7 @@ class InputMonitor:
         if arrivals is None:
             return ""
         if arrivals.count == arrivals.malformed:
-            why = f"; what arrived is malformed: {arrivals.why}" if arrivals.why else ""
-            return f"the clutch has not been heard yet{why}"
+            return "the clutch has not been heard yet"
         silent_ms = self._settings.hands.clutch_stale_ms
         is_silent = 0 < state["clutch_until_tick"] <= state["tick"]
         return f"the clutch was last heard as pressed, and then not for {silent_ms:g} ms" if is_silent else ""
@@ -150,7 +171,7 @@ class InputMonitor:
         """Lines for the log: the first rejection of each cause at once, then counts."""
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
-            history, name = self._histories[source], SOURCE_NAMES[source]
+            history, name = self._histories[source], SOURCE_NAMES.get(source, source)
             logged, found = history.logged, history.found
             if now.apart_mm and not history.is_apart_logged:
                 history.is_apart_logged = True

@@ -5,7 +5,7 @@ the bench, and images of other programs.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import zenoh
 from zenoh.handlers import RingChannel
@@ -14,6 +14,7 @@ from service.contract import channels
 from service.contract.images import image_in
 from service.contract.messages import WireError
 from service.contract.requests import encode_json
+from service.daemon.cell_streams import Arrivals
 from service.scribe.scribe import Scribe
 from service.settings.config import Settings
 
@@ -23,7 +24,8 @@ WAITING_IMAGES = 32  # of each key between two polls; beyond it, the oldest are 
 
 class SideStream:
     """A subscriber that passes the newest messages on one key, and their times [ns], to `take`, and
-    each new WireError of it to `say`. Between two polls, `waiting` messages are kept.
+    counts them in `arrivals`, also those of which `take` raises WireError. Between two polls,
+    `waiting` messages are kept.
     """
 
     def __init__(
@@ -31,31 +33,34 @@ class SideStream:
         session: zenoh.Session,
         key: str,
         take: Callable[[bytes, int], object],
-        say: Callable[[str], None],
+        arrivals: Arrivals,
         *,
         waiting: int = 1,
     ) -> None:
         self._subscriber = session.declare_subscriber(key, RingChannel(waiting))
-        self._key, self._take, self._say, self._waiting, self._error = key, take, say, waiting, ""
+        self._take, self._arrivals, self._waiting = take, arrivals, waiting
 
     def poll(self, now_ns: int) -> None:
         """Pass on the messages that arrived since the last call, with the time now [ns]."""
         for _ in range(self._waiting):
             if (sample := self._subscriber.try_recv()) is None:
                 return
-            before, self._error = self._error, ""
             try:
                 self._take(sample.payload.to_bytes(), now_ns)
+                self._arrivals.count += 1
             except WireError as error:
-                self._error = str(error)
-                if self._error != before:
-                    self._say(f"a message on {self._key} is not recorded: {error}")
+                self._arrivals.refuse(str(error))
+
+
+def side_keys(settings: Settings) -> list[str]:
+    """The channel of a cell's objects, and the keys of images in `[recording] also`."""
+    return [OBJECTS_KEY, *settings.recording.also]
 
 
 def side_streams(
-    session: zenoh.Session, settings: Settings, scribe: Scribe, say: Callable[[str], None]
+    session: zenoh.Session, settings: Settings, scribe: Scribe, arrivals: Mapping[str, Arrivals]
 ) -> list[SideStream]:
-    """The streams of a cell's objects, and of the images on the keys of `[recording] also`."""
+    """The streams on `side_keys`, counted in `arrivals`."""
 
     def note_objects(payload: bytes, now_ns: int) -> None:
         found = channels.BY_KEY[OBJECTS_KEY].codec.decode(payload)
@@ -64,6 +69,9 @@ def side_streams(
     def record_image(key: str, payload: bytes, now_ns: int) -> None:
         scribe.image(key, image_in(payload, now_ns), now_ns)
 
-    objects = SideStream(session, channels.key(settings.cell, OBJECTS_KEY), note_objects, say)
+    objects = SideStream(session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY])
     images = {key: functools.partial(record_image, key) for key in settings.recording.also}
-    return [objects, *(SideStream(session, key, take, say, waiting=WAITING_IMAGES) for key, take in images.items())]
+    return [
+        objects,
+        *(SideStream(session, key, take, arrivals[key], waiting=WAITING_IMAGES) for key, take in images.items()),
+    ]

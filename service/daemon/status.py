@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +36,7 @@ AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
 
 
 class CellStatus(NamedTuple):
-    """The newest frame, the controller and its state, the sources of input, and the last failure of
+    """The newest frame, the controller and its state, the streams of input, and the last failure of
     the service, from which a status is made.
     """
 
@@ -47,6 +49,7 @@ class CellStatus(NamedTuple):
     inside: Inside | None = None  # what an arm that is not ready is inside of
     busy: str = ""  # signs of a busy machine when the arm stopped
     clutch: str = ""  # the problem with the clutch's messages
+    streams: Mapping[str, Source] = MappingProxyType({})  # other input, by key
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
@@ -55,21 +58,24 @@ class CellStatus(NamedTuple):
         skill, (mode, reason) = self.controller.skill, outcome(frame)
         flags, seen_now = Flag(int(frame["flags"])), self.evidence()
         why = explained(Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now)
+        faulty = [(key, stream) for key, stream in self.streams.items() if stream.cause]
+        because = [f"what arrives on {key} is {stream.cause}: {stream.refused}" for key, stream in faulty]
         low, high = skill.demonstrated
         return Status(
             cell=settings.cell,
             mode=word(mode),
             reason=word(reason) if begun else "",
-            because=why.why,
-            remedy=why.what_to_do,
+            because="; ".join(filter(None, [why.why, *because])),
+            remedy="; ".join(filter(None, dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)]))),
             flags=tuple(map(word, flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
             residual_risk=skill.residual_risk,
             hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
             places=tuple(point.name for point in skill.via_points),
-            rejected=_by_cause(sources),
+            rejected=_by_cause({**sources, **self.streams}),
             sources=sources,
+            streams=dict(self.streams),
             frames=settings.tracker_frames,
             trackers={
                 frame: settings.hands_in(frame).base_from_tracker
@@ -203,11 +209,11 @@ def outcome(frame: Frame) -> tuple[Mode, Reason]:
 
 
 def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
-    """Rejected samples of all sources by cause; malformed ones by their key too."""
+    """Rejected messages of all streams by cause; malformed ones by their key too."""
     counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():
-            counts[f"{MALFORMED} {KEY_OF_SOURCE[name]}" if cause == MALFORMED else cause] += count
+            counts[f"{MALFORMED} {KEY_OF_SOURCE.get(name, name)}" if cause == MALFORMED else cause] += count
     return counts
 
 

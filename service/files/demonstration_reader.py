@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.contract import cdr
 from service.contract.channels import JOINTS, POSE, STRING, topic
-from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped
+from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, WireError
 from service.contract.requests import Hands, encode_json
 from service.core.frame import Vector
 from service.core.geometry import rotation
@@ -336,17 +336,21 @@ def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[
     return out
 
 
-def hand_samples(path: str | Path) -> list[tuple[int, str, bytes]]:
-    """Log time [ns], side and CDR bytes of every hand sample, in order of time.
+def hand_samples(
+    path: str | Path, *, say: Callable[[str], None] = lambda line: None
+) -> list[tuple[int, str, PoseStamped]]:
+    """Log time [ns], side and pose of every hand sample, in order of time.
 
     Reads demonstrations, recordings and other ROS 2 recordings. A file that was cut is read up to
-    its cut. Raises RecordingError.
+    its cut. Samples that are not readable are left out, and `say` is called with their number.
+    Raises RecordingError.
     """
     path = existing(path)
     messages = Messages(path)
     topics: dict[str, str] = {}  # by stream
     seen: set[str] = set()
-    samples: list[tuple[int, str, bytes]] = []
+    samples: list[tuple[int, str, PoseStamped]] = []
+    causes: list[str] = []
     for schema, channel, message in messages:
         seen.add(topic := channel.topic)
         name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
@@ -354,10 +358,18 @@ def hand_samples(path: str | Path) -> list[tuple[int, str, bytes]]:
             continue
         if topics.setdefault(name, topic) != topic:
             raise RecordingError(f"{path} has two streams of {name}: {topics[name]} and {topic}")
-        samples.append((message.log_time, name.removeprefix("hands/"), message.data))
+        try:
+            samples.append((message.log_time, name.removeprefix("hands/"), cdr.decode_pose(message.data)))
+        except WireError as error:
+            causes.append(f"{topic}: {error}")
     if messages.faults and not ends_early(path):
         raise RecordingError(f"{path} is damaged: {messages.faults[0]}")
     if not topics:
         lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
         raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")
+    if causes:
+        remark = f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: {causes[0]}"
+        if not samples:
+            raise RecordingError(remark)
+        say(remark)
     return sorted(samples, key=lambda sample: sample[0])

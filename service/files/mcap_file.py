@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_info
 from service.contract.explain import ExplainedError
 from service.contract.ros2msg import schema
 from service.core.frame import definitions
+from service.settings.file_content import LFS_POINTER, UnusableError, check_fetched
 from service.settings.whole_file import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
@@ -213,10 +214,22 @@ def existing(path: str | Path) -> Path:
         found = sorted(other.name for other in path.parent.glob("*.mcap"))
         names = f" Its folder has: {', '.join(found)}." if found else ""
         raise RecordingError(f"no recording {path}.{names}")
-    with path.open("rb") as stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"{path} is not an MCAP file")
+    if begin_of(path) != MCAP0_MAGIC:
+        raise RecordingError(f"{path} is not an MCAP file")
     return path
+
+
+def begin_of(path: Path) -> bytes:
+    """The first bytes of a recording, as many as MCAP0_MAGIC has. Raises RecordingError for a
+    pointer of Git LFS.
+    """
+    with path.open("rb") as stream:
+        begin = stream.read(len(LFS_POINTER))
+    try:
+        check_fetched(begin)
+    except UnusableError as error:
+        raise RecordingError(f"{path} is not a recording: {error}") from None
+    return begin[: len(MCAP0_MAGIC)]
 
 
 def ends_early(path: Path) -> bool:

@@ -70,7 +70,7 @@ class Messages:
 
     def __iter__(self) -> Iterator[Found]:
         with self.path.open("rb") as stream:
-            reading = _Reading(stream, self.faults)
+            self._reading = reading = _Reading(stream, self.faults)
             schemas: dict[int, Schema] = {}
             channels: dict[int, Channel] = {}
             unnamed = False
@@ -92,6 +92,11 @@ class Messages:
                 elif isinstance(record, Metadata):
                     self.metadata[record.name] = record.metadata
 
+    def refuse(self, topic: str, message: Message, error: Exception) -> None:
+        """Note as a fault that the newest message cannot be decoded."""
+        why = f"a message on {topic}: {error}"
+        self.faults.append(FileFault(False, self._reading.at, len(message.data), why))
+
 
 class _Reading:
     """One pass over a file."""
@@ -101,6 +106,7 @@ class _Reading:
         self._size = stream.seek(0, 2)
         self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None after damage
         self._chunked = False
+        self.at = 0  # first byte of the record that is read
         closing = self._size - len(MCAP0_MAGIC)
         self._closed = closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
         self._footer_at = closing - _FOOTER.size
@@ -130,6 +136,7 @@ class _Reading:
         """The records of the data section, with those in chunks one by one."""
         at = len(MCAP0_MAGIC)
         while True:
+            self.at = at
             end = None
             try:
                 opcode, end = self._head(at)

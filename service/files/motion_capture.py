@@ -6,6 +6,7 @@ Poses are in metres in the axes of the capture system; markers have no rotation.
 from __future__ import annotations
 
 import csv
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,9 @@ def read_motive(path: Path) -> Captured:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if any(row)]
+            begin = stream.readline()
+            separator = next((mark for mark in ";\t" if begin.startswith(f"Format Version{mark}")), ",")
+            rows = [row for row in csv.reader(itertools.chain([begin], stream), delimiter=separator) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path} is not a CSV file that can be read: {in_words(error, named=False)}") from None
     about = dict(zip(rows[0][::2], rows[0][1::2], strict=False)) if rows else {}
@@ -55,9 +58,12 @@ def read_motive(path: Path) -> Captured:
         if head[0] in POSED_TYPES and head[2:] in POSE_COLUMNS:
             columns.setdefault(head[1], {})[head[2:]] = i
     table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
+    numeric = [1, *(i for found in columns.values() for i in found.values())]  # others may hold text, as a time code
     for values, row in zip(table, rows[axes_at + 1 :], strict=True):
         try:
-            values[: len(row)] = [float(cell) if cell else np.nan for cell in row[: len(values)]]
+            for i in numeric:
+                if i < len(row) and row[i]:
+                    values[i] = float(row[i] if separator == "," else row[i].replace(",", "."))
         except ValueError as error:
             raise RecordingError(f"{path}: frame {row[0]}: {error}; numbers and empty cells needed") from None
     stamps, out = _stamps(path, table[:, 1]), Captured()

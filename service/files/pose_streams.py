@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterator
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -16,7 +18,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from service.contract import cdr
-from service.contract.channels import JOINTS, POSE, STRING
+from service.contract.channels import JOINTS, POSE, POSE_WITH_COVARIANCE, STRING, TRANSFORMS
 from service.contract.explain import InvalidError, in_words, validated
 from service.contract.joint_states import JointStates, measured
 from service.contract.messages import BASE, JointState, PoseStamped, WireError
@@ -24,13 +26,14 @@ from service.contract.printable import printable
 from service.contract.requests import Add, Hands, ViaPoint, decode_request
 from service.core.frame import Vector
 from service.core.intake.stage import UNIT_M
-from service.files.mcap_file import RecordingError, existing
+from service.files.mcap_file import RecordingError, begin_of, existing
 from service.files.mcap_reader import FileFault, Messages, full_name
 from service.files.motion_capture import CAPTURE_FRAME, Captured, read_c3d, read_motive
 from service.files.tool_poses import tool_poses
 from service.files.track import Track, clock_parts
 from service.settings.config import Settings
 
+Value = TypeVar("Value")
 TRACK_NAMES = ("left", "right", "tool")
 ENDINGS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 JOINT_STATES, GRIPPER_STATE, PLACES_TOPIC = "joints/state", "gripper/state", "places"
@@ -44,14 +47,11 @@ NOT_READ = {
     ),
 }
 MAX_MESSAGE_BYTES = 1 << 24  # limit of a message after decompression
-POSE_ARRAY, TF_MESSAGE = "geometry_msgs/msg/PoseArray", "tf2_msgs/msg/TFMessage"
-POSE_TYPES = (
-    POSE.type,
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    POSE_ARRAY,
-    TF_MESSAGE,
-)
+POSE_ARRAY, TF_MESSAGE = "geometry_msgs/msg/PoseArray", TRANSFORMS.type
+TRANSFORM, ODOMETRY = "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"
+POSE_TYPES = (POSE.type, POSE_WITH_COVARIANCE.type, TRANSFORM, POSE_ARRAY, TF_MESSAGE, ODOMETRY)
+NUMBERS_AFTER = {POSE_WITH_COVARIANCE.type: 36, ODOMETRY: 36 + 6 + 36}  # covariances, and a velocity
+_NUMBERS = {count: struct.Struct(f"<{count}d") for count in (7, *NUMBERS_AFTER.values())}
 
 
 class PoseTopic(NamedTuple):
@@ -72,7 +72,15 @@ class PoseTopic(NamedTuple):
         return printable(f"{self.topic}:{self.part}" if self.part else self.topic)
 
 
-Parts = tuple[list[int], list[int], list[tuple[float, ...]], str]
+class Parts(NamedTuple):
+    """The poses of one part of a topic: stamps [ns], times of recording [ns], poses, and all frames
+    of them.
+    """
+
+    stamps: list[int]
+    logged: list[int]
+    poses: list[tuple[float, ...]]
+    frames: list[str]
 
 
 class PoseRecording:
@@ -109,6 +117,7 @@ class PoseRecording:
     def _existing(self) -> Path:
         if not self.path.is_file():
             raise RecordingError(f"there is no file {self.path}")
+        begin_of(self.path)
         return self.path
 
     def _read_captured(self, captured: Captured) -> None:
@@ -117,7 +126,7 @@ class PoseRecording:
             topic, part = PoseTopic.parsed(name)
             self.topics[topic] = POSE.type
             rows = [tuple(row) for row in poses.tolist()]
-            self._read.setdefault(topic, {})[part] = (stamps, stamps, rows, CAPTURE_FRAME)
+            self._read.setdefault(topic, {})[part] = Parts(stamps, stamps, rows, [CAPTURE_FRAME])
 
     def _read_mcap(self) -> None:
         messages = Messages(existing(self.path))
@@ -127,9 +136,9 @@ class PoseRecording:
             if channel.message_encoding in ("cdr", "ros1") and kind in (*POSE_TYPES, JOINTS.type):
                 if channel.message_encoding == "ros1":
                     self._ros_1_topics.add(channel.topic)
-                self._raw.setdefault(channel.topic, []).append((message.log_time, self._whole(message.data)))
+                self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES_TOPIC}"):
-                self._read_places(self._whole(message.data))
+                self._read_places(message.data)
         self.faults = messages.faults
         about = messages.metadata.get("thirdhand", {})
         self.conducts = next((hands for hands in get_args(Hands) if hands == about.get("hands")), "both")
@@ -142,24 +151,9 @@ class PoseRecording:
                 self.unused.append(f"the settings in {self.path} are not valid: {in_words(error, named=False)}")
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
 
-    def _whole(self, data: bytes) -> bytes:
-        """The bytes of a message, decompressed if it was compressed on its own. Raises
-        RecordingError.
-        """
-        if not data.startswith(zstandard.FRAME_HEADER):
-            return data
-        try:
-            with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-                found: bytes = stream.read(MAX_MESSAGE_BYTES + 1)
-        except zstandard.ZstdError as error:
-            raise RecordingError(f"{self.path}: a message that cannot be decompressed: {error}") from None
-        if len(found) > MAX_MESSAGE_BYTES:
-            raise RecordingError(f"{self.path}: a message has more than {MAX_MESSAGE_BYTES} bytes after decompression")
-        return found
-
     def _read_places(self, data: bytes) -> None:
         try:
-            self.places = Add(decode_request(cdr.decode_string(data).encode(), tuple[ViaPoint, ...])).points
+            self.places = Add(decode_request(cdr.decode_string(_whole(data)).encode(), tuple[ViaPoint, ...])).points
         except (WireError, ValueError) as error:
             self.unused.append(f"the recorded {PLACES_TOPIC} are not readable and not used: {error}")
 
@@ -171,10 +165,19 @@ class PoseRecording:
             raise RecordingError(
                 f"{self.path} is a data set of LeRobot, whose columns do not name hands and tool. {FROM_ARRAYS}"
             )
-        if self.path.is_dir() and not (self.path / "metadata.yaml").exists() and any(self.path.glob("*.mcap")):
+        has_metadata = (self.path / "metadata.yaml").exists()
+        if self.path.is_dir() and not has_metadata and any(self.path.glob("*.mcap")):
             raise RecordingError(f"{self.path} is a folder without metadata.yaml: give its files, {self.path}/*.mcap")
+        files = [self._existing()] if not self.path.is_dir() else sorted(self.path.glob("*.db3"))
+        for file in (*files, *self.path.glob("*.mcap")):
+            begin_of(file)
+        is_killed = any(Path(f"{file}-wal").exists() for file in files)
         try:
             is_ros_1 = self.path.suffix == ".bag"
+            if files and not is_ros_1 and (is_killed or not has_metadata):
+                for file in files:
+                    self._read_sqlite(file)
+                return
             with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
                 self.topics = {one.topic: one.msgtype for one in bag.connections}
                 self._ros_1_topics = set(self.topics) if is_ros_1 else set()
@@ -182,42 +185,67 @@ class PoseRecording:
                 for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
                     self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
         except Exception as error:  # the exceptions of the bags' storages have no common base
-            missing = "" if self.path.exists() else " It does not exist."
-            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.{missing}") from None
+            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
 
-    def _decoded(self, topic: str, data: bytes, kind: str) -> Any:
-        if topic in self._ros_1_topics:
-            return _typestore("ROS1_NOETIC").deserialize_ros1(data, kind)
-        return cdr.decode_pose(data) if kind == POSE.type else _typestore("ROS2_HUMBLE").deserialize_cdr(data, kind)
+    def _read_sqlite(self, file: Path) -> None:
+        """Read a `.db3`, and what a recorder that was killed has left in its `-wal`."""
+        with contextlib.closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            kinds = dict(database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr'"))
+            self.topics |= kinds
+            for topic, logged_ns, data in database.execute(
+                "SELECT name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id ORDER BY timestamp"
+            ):
+                if kinds.get(topic) in (*POSE_TYPES, JOINTS.type):
+                    self._raw.setdefault(topic, []).append((logged_ns, bytes(data)))
+
+    def _decoded(self, topic: str, decode: Callable[[bytes], Value]) -> Iterator[tuple[int, Value]]:
+        """Time of recording [ns] and value of each message of a topic.
+
+        Messages of which `decode` raises WireError are left out, with a remark on their number and
+        the first cause. Raises RecordingError if no message is left.
+        """
+        raw = self._raw.get(topic, ())
+        causes: list[str] = []
+        for logged_ns, data in raw:
+            try:
+                whole = _whole(data)
+                value = decode(_of_ros_1(whole, self.topics[topic]) if topic in self._ros_1_topics else whole)
+            except WireError as error:
+                causes.append(str(error))
+            else:
+                yield logged_ns, value
+        if not causes:
+            return
+        remark = f"{topic}: {len(causes)} of {len(raw)} messages are not readable: {causes[0]}"
+        if len(causes) == len(raw):
+            raise RecordingError(f"{self.path}: {remark}")
+        if remark not in self.unused:
+            self.unused.append(remark)
 
     def tracks(self, topic: str) -> dict[str, Parts]:
-        """The streams of poses in a topic by part: stamps, times of recording [ns], poses, frame.
-
-        Raises RecordingError.
-        """
+        """The streams of poses in a topic by part. Raises RecordingError."""
         if topic in self._read:
             return self._read[topic]
-        kind = self.topics[topic]
-        out = self._read[topic] = dict[str, Parts]()
-        for logged_ns, data in self._raw.get(topic, ()):
-            try:
-                parts = _poses(kind, self._decoded(topic, data, kind))
-            except Exception as error:  # the deserialiser raises many kinds of exceptions
-                raise RecordingError(f"{self.path}: {topic}: a {kind} that is not readable: {error}") from None
-            for part, stamp_ns, frame, pose in parts:
-                stamps, logged, poses, _ = out.setdefault(part, ([], [], [], frame))
-                if frame != out[part][3]:
-                    raise RecordingError(
-                        f"{self.path}: {PoseTopic(topic, part)}: poses in frames {out[part][3]!r} and {frame!r}"
-                    )
-                stamps.append(stamp_ns or logged_ns)
+        out = dict[str, Parts]()
+        rejected: list[str] = []
+        for logged_ns, found in self._decoded(topic, functools.partial(_poses, self.topics[topic], rejected)):
+            for part, pose in found:
+                stamps, logged, poses, frames = out.setdefault(part, Parts([], [], [], []))
+                if pose.frame_id not in frames:
+                    frames.append(pose.frame_id)
+                stamps.append(pose.stamp_ns or logged_ns)
                 logged.append(logged_ns)
-                poses.append(pose)
+                poses.append(pose.position + pose.orientation)
+        if rejected:
+            self.unused.append(f"{topic}: {len(rejected)} transforms are not readable: {rejected[0]}")
+        self._read[topic] = out
         return out
 
     def track(self, name: str, source: PoseTopic, settings: Settings) -> Track:
         """One stream as arrays. Raises RecordingError."""
-        stamps, logged, rows, frame = self.tracks(source.topic)[source.part]
+        stamps, logged, rows, (frame, *others) = self.tracks(source.topic)[source.part]
+        if others:
+            raise RecordingError(f"{self.path}: {source}: poses in frames {frame!r} and {others[0]!r}; one needed")
         poses = np.array(rows, np.float64)
         if self.is_captured:  # `from_tracker` will multiply by the unit and apply the pose of the capture system
             poses[:, :3] /= UNIT_M[settings.hands.unit]
@@ -274,30 +302,23 @@ class PoseRecording:
         With `names`, these joints only, which may be spread over several messages. Raises
         RecordingError.
         """
-        states, found = JointStates(names, STATE_PARTS_TIMEOUT_S), False
-        for logged_ns, data in self._raw[topic]:
-            try:
-                message = self._joint_state(topic, data)
-                state = states.take(message, logged_ns / 1e9) if names else message
-            except WireError as error:
-                raise RecordingError(f"{self.path}: {topic}: {error}") from None
+        states = JointStates(names, STATE_PARTS_TIMEOUT_S)
+        is_found = False
+
+        def decode(data: bytes) -> JointState:
+            message = cdr.decode_joints(data)
+            if len(message.position) == len(message.names):
+                measured(message, tuple(name for name in names if name in message.names))
+            return message
+
+        for logged_ns, message in self._decoded(topic, decode):
+            state = states.take(message, logged_ns / 1e9) if names else message
             if state is not None:
-                found = True
+                is_found = True
                 position = measured(state, names)[0] if names else state.position
                 yield logged_ns, state.stamp_ns or logged_ns, position
-        if names and not found:
+        if names and not is_found:
             raise RecordingError(f"{self.path}: {topic}: no state of all joints {', '.join(names)}")
-
-    def _joint_state(self, topic: str, data: bytes) -> JointState:
-        """The joint state in a message. Raises WireError."""
-        if topic not in self._ros_1_topics:
-            return cdr.decode_joints(data)
-        try:
-            found = self._decoded(topic, data, JOINTS.type)
-        except Exception as error:  # the deserialiser raises many kinds of exceptions
-            raise WireError(f"a {JOINTS.type} that is not readable: {error}") from None
-        stamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
-        return JointState(stamp_ns, tuple(found.name), tuple(found.position.tolist()), ())
 
     def joint_topic(self, settings: Settings) -> str:
         """The topic with joint states of the arm's joints; empty if there are none or several."""
@@ -319,28 +340,50 @@ class PoseRecording:
                         yield PoseTopic(topic, part), len(stamps)
 
 
+def _whole(data: bytes) -> bytes:
+    """The bytes of a message, decompressed if it was compressed on its own. Raises WireError."""
+    if not data.startswith(zstandard.FRAME_HEADER):
+        return data
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            found: bytes = stream.read(MAX_MESSAGE_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise WireError(f"it cannot be decompressed: {error}") from None
+    if len(found) > MAX_MESSAGE_BYTES:
+        raise WireError(f"it has more than {MAX_MESSAGE_BYTES} bytes after decompression")
+    return found
+
+
 @functools.cache
-def _typestore(name: str) -> Any:
+def _typestore() -> Any:
     from rosbags.typesys import Stores, get_typestore  # its import is slow, and few recordings need it
 
-    return get_typestore(Stores[name])
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _poses(kind: str, message: Any) -> Iterator[tuple[str, int, str, tuple[float, ...]]]:
-    """Part, stamp [ns], frame, and pose x y z, quaternion x y z w, of each pose in a message."""
-    if isinstance(message, PoseStamped):
-        yield "", message.stamp_ns, message.frame_id, message.position + message.orientation
-        return
-    for i, one in enumerate(
-        message.transforms if kind == TF_MESSAGE else message.poses if kind == POSE_ARRAY else [message]
-    ):
-        header = message.header if kind == POSE_ARRAY else one.header
-        stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-        if kind == POSE_ARRAY:
-            at, turn, part = one.position, one.orientation, str(i)
-        elif kind == TF_MESSAGE or kind.endswith("TransformStamped"):
-            at, turn, part = one.transform.translation, one.transform.rotation, one.child_frame_id.strip("/")
-        else:
-            pose = one.pose.pose if kind.endswith("PoseWithCovarianceStamped") else one.pose
-            at, turn, part = pose.position, pose.orientation, ""
-        yield part, stamp_ns, header.frame_id.strip("/"), (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+def _of_ros_1(data: bytes, kind: str) -> bytes:
+    """The CDR bytes of a message of ROS 1. Raises WireError."""
+    try:
+        return bytes(_typestore().ros1_to_cdr(data, kind))
+    except Exception as error:  # the library raises many kinds of exceptions
+        raise WireError(f"a {kind} of ROS 1 that is not readable: {error}") from None
+
+
+def _poses(kind: str, rejected: list[str], data: bytes) -> list[tuple[str, PoseStamped]]:
+    """Part and pose of each pose in the CDR bytes of a message of POSE_TYPES. Mistakes of single
+    transforms are appended to `rejected`. Raises WireError.
+    """
+    if kind == TF_MESSAGE:
+        return cdr.decode_transforms(data, longest=MAX_MESSAGE_BYTES, rejected=rejected)
+    reader = cdr.Reader(data)
+    stamp_ns, frame = reader.header()
+    child = reader.string() if kind in (TRANSFORM, ODOMETRY) else ""
+    parts = list(map(str, range(reader.items()))) if kind == POSE_ARRAY else [child if kind == TRANSFORM else ""]
+    rows = [reader.unpack(_NUMBERS[7], 8) for _ in parts]
+    if kind in NUMBERS_AFTER:
+        reader.unpack(_NUMBERS[NUMBERS_AFTER[kind]], 8)
+    reader.end()
+    frame = frame if kind == POSE.type else frame.strip("/")
+    return [
+        (part.strip("/"), PoseStamped(stamp_ns, frame, row[:3], row[3:])) for part, row in zip(parts, rows, strict=True)
+    ]

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from service.contract.channels import BY_KEY
+from service.contract.cdr import encode_pose
 from service.contract.joint_states import measured
 from service.contract.messages import WireError
 from service.contract.records import Mode
@@ -178,13 +178,9 @@ def _of_take(
         remarks.append(f"{path.name} has no skill: {skill.name}, which is shipped, is used; --skill gives another")
     inboxes: dict[int, list[Event]] = {}
     begin_ns: int | None = None
-    for time_ns, side, payload in hand_samples(path):
+    for time_ns, side, pose in hand_samples(path, say=remarks.append):
         begin_ns = time_ns if begin_ns is None else begin_ns
-        kind = f"hands/{side}"
-        try:
-            event = Event(kind, payload, BY_KEY[kind].codec.decode(payload))
-        except WireError as error:
-            raise RecordingError(f"{path}: a hand's pose is not readable: {error}") from None
+        event = Event(f"hands/{side}", encode_pose(pose), pose)
         inboxes.setdefault(math.ceil((time_ns - begin_ns) / 1e9 * settings.rate_hz), []).append(event)
     whole = [Tick(i, tuple(inboxes.get(i, ()))) for i in range(max(inboxes) + 1)]
     made = tuple(_part(path, whole, part, settings.period_s))

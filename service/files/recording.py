@@ -303,7 +303,7 @@ class Recording:
         messages = Messages(self.path)
         whole = not self.checksums
         yield from steps(messages, self.settings, outputs=outputs, whole=whole)
-        self.faults = messages.faults
+        self.faults = [*messages.faults, *(fault for fault in self.faults if fault not in messages.faults)]
         self.truncated = any(fault.cut for fault in messages.faults)
 
     def unreported(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
@@ -320,12 +320,19 @@ class Recording:
                     yield channel.topic.lstrip("/"), decode_image(message.data), message.log_time
 
     def notes(self, *keys: str) -> Iterator[tuple[str, str, int]]:
-        """Key, text and time [ns] of the notes under these keys, in order; objects as JSON."""
+        """Key, text and time [ns] of the notes under these keys, in order; objects as JSON. Notes
+        that cannot be decoded are `faults`.
+        """
         topics = channels.keys_by_topic(self.settings.cell, keys)
-        for _, channel, message in Messages(self.path):
-            key = topics.get(channel.topic)
-            if key == OBJECTS_NOTE:
-                objects = channels.BY_KEY[key].codec.decode(message.data)
-                yield key, msgspec.json.encode(objects).decode(), message.log_time
-            elif key is not None:
-                yield key, cdr.decode_string(message.data), message.log_time
+        messages = Messages(self.path)
+        for _, channel, message in messages:
+            if (key := topics.get(channel.topic)) is None:
+                continue
+            try:
+                content = channels.BY_KEY[key].codec.decode(message.data) if key == OBJECTS_NOTE else None
+                text = cdr.decode_string(message.data) if content is None else msgspec.json.encode(content).decode()
+            except WireError as error:
+                messages.refuse(channel.topic, message, error)
+                self.faults.append(messages.faults[-1])
+            else:
+                yield key, text, message.log_time

@@ -13,7 +13,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from service.contract import channels
-from service.contract.messages import WireError
 from service.core.controller import Controller, outgoing, run
 from service.core.frame import Event, Frame, Tick, differences, encode
 from service.files.mcap_file import RecordingError, machine
@@ -148,7 +147,7 @@ class _Skills:
             if kind == "skill":
                 return Event(kind, payload, self.decoded(payload))
             return Event(kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None)
-        except (WireError, SkillError) as error:
+        except SkillError as error:
             raise RecordingError(f"an event of kind {kind!r} is not readable: {error}") from None
 
 

@@ -31,10 +31,9 @@ def skill_file(settings: Settings) -> Path:
 
 def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
-    from service.learning.skill_file import decoded  # its import is slow, and most commands do not need it
+    from service.learning.skill_file import skill_in  # its import is slow, and most commands do not need it
 
-    path = recordings() / SHIPPED_SKILL
-    return decoded(path.read_bytes(), origin=str(path))
+    return skill_in(recordings() / SHIPPED_SKILL)
 
 
 def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:

@@ -81,14 +81,18 @@ def checksum(frame: Frame, outputs: Outputs = (), state: Record | None = None) -
 def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool) -> Iterator[Step]:
     """Every complete tick in order, after the initial state if there is one.
 
-    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame.
-    Raises RecordingError for messages that cannot be decoded.
+    Without `outputs` only the inputs are read. If `whole`, each tick must have its frame. A message
+    that cannot be decoded is a fault of the file, and its tick is damaged. Raises RecordingError
+    for ticks that do not fit their messages, and for frames and states of another version, none of
+    which can be decoded.
     """
     names = channels.keys_by_topic(settings.cell, REPLAYED)
     joints = len(settings.joints.names)
     layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
     step: dict[str, Any] | None = None
     seen, damage = 0, ""
+    refused: set[str] = set()  # keys of which a message was not decoded
+    readable: set[str] = set()  # keys of which a message was decoded
 
     def finished() -> Iterator[Step]:
         """The step in progress, unless a part of it is damaged or cut."""
@@ -113,26 +117,48 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
             name = names.get(channel.topic)
             if name is None or (name in _RECORDS and not outputs):
                 continue
-            data = message.data
+            try:
+                value = _value(name, message.data, layouts)
+            except WireError as error:
+                if name in refused - readable and name in _RECORDS:
+                    raise
+                refused.add(name)
+                messages.refuse(channel.topic, message, error)
+                step = step if name == "tick" else None
+                continue
+            readable.add(name)
             if name == "tick":
                 yield from finished()
-                index, kinds, lost, recorded_sum = cdr.decode_tick(data)
+                index, kinds, lost, recorded_sum = value
                 step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
                 step["damage"], step["checksum"], damage = damage, recorded_sum, ""
             elif step is None:
                 if name == "state":
-                    alone = decode(data, layouts["state"])
-                    yield Step(int(alone["tick"]), state=alone, damage=damage)
+                    yield Step(int(value["tick"]), state=value, damage=damage)
                     damage = ""
             elif name in _RECORDS:
-                step[name] = decode(data, layouts[name])
+                step[name] = value
             elif name == "skill_in_force":
-                step["skill"] = cdr.decode_skill(data)
+                step["skill"] = value
             else:
-                step["events"].append((name, cdr.decode_skill(data) if name == "skill" else data))
+                step["events"].append((name, value))
         yield from finished()
     except WireError as error:
         raise RecordingError(f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
+
+
+def _value(name: str, data: bytes, layouts: dict[str, Any]) -> Any:
+    """The content of a message: of an event its bytes, which can be decoded. Raises WireError."""
+    channel = channels.BY_KEY[name]
+    if name == "tick":
+        return cdr.decode_tick(data)
+    if name in _RECORDS:
+        return decode(data, layouts[name])
+    if name in ("skill", "skill_in_force"):
+        return cdr.decode_skill(data)
+    if channel.direction == "in":
+        channel.codec.decode(data)
+    return data
 
 
 def _kind(number: int) -> str:

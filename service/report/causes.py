@@ -64,7 +64,7 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
     if rejected := ", ".join(f"{more[cause]} {word(cause)}" for cause in Cause if more[cause] > 0):
         yield f"rejected in the second before: {rejected}"
     for name, cause, refused in _refused(columns, int(frames["tick"][first]), tick):
-        yield f"{SOURCE_NAMES[name]}: rejected as {cause}: {refused}"
+        yield f"{SOURCE_NAMES.get(name, name)}: rejected as {cause}: {refused}"
     timing = columns.timing[(columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)]
     if len(timing):
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
@@ -82,7 +82,10 @@ def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, st
     """
     said = [one for one in columns.statuses if first <= one.tick <= last]
     newest = {
-        (name, source.cause): source.refused for one in said for name, source in one.sources.items() if source.refused
+        (name, source.cause): source.refused
+        for one in said
+        for name, source in (one.sources | one.streams).items()
+        if source.refused
     }
     return [(*of, refused) for of, refused in newest.items()]
 

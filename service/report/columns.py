@@ -66,6 +66,7 @@ class Said(msgspec.Struct, frozen=True):
     because: str = ""
     remedy: str = ""
     sources: dict[str, Source] = {}
+    streams: dict[str, Source] = {}
 
 
 @dataclass

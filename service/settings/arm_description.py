@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from service.contract.explain import in_words
-from service.settings.file_content import SettingsError
+from service.settings.file_content import SettingsError, UnusableError, content
 from service.settings.robot_xml import readable
 from service.settings.urdf import Shape, Urdf, UrdfError
 
 ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] assumed before the kinematics are known
-MAX_MB = 20  # a humanoid's URDF has 0.1 MB
+MAX_BYTES = 20_000_000  # a humanoid's URDF has 0.1 MB
 
 
 def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:
@@ -34,12 +34,10 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
 
 def _text(path: Path) -> str:
     """The text of a URDF. Raises OSError, UrdfError."""
-    if path.exists() and not path.is_file():
-        raise UrdfError(f"{path} is no file; a URDF needed")
-    if (size := path.stat().st_size) > MAX_MB * 1_000_000:
-        raise UrdfError(f"{path} has {size / 1e6:.0f} MB; up to {MAX_MB} accepted")
     try:
-        return readable(path.read_bytes())
+        return readable(content(path, MAX_BYTES))
+    except UnusableError as error:
+        raise UrdfError(f"{path}: {error}; a URDF needed") from None
     except ValueError as error:
         raise UrdfError(f"{path}: not a robot description: {error}") from None
 

@@ -18,6 +18,7 @@ else:
     import tomli as tomllib
 
 LARGEST_CONFIGURATION = 1_000_000  # [bytes]
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # begin of a file that stands for one of Git LFS
 MOST_DOTS = 1000  # in a line of TOML
 
 
@@ -36,7 +37,7 @@ class UnreadableError(SettingsError):
 def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> bytes:
     """The bytes of a regular file, or of a pipe if these are accepted.
 
-    Raises OSError, UnusableError.
+    Raises OSError, UnusableError, also for a pointer of Git LFS.
     """
     about = path.stat()
     is_file = stat.S_ISREG(about.st_mode)
@@ -48,7 +49,14 @@ def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> b
         data = file.read(largest_bytes + 1)
     if len(data) > largest_bytes:
         raise UnusableError(f"it has more than {largest_bytes} bytes")
+    check_fetched(data)
     return data
+
+
+def check_fetched(begin: bytes) -> None:
+    """Raise UnusableError if a file begins as a pointer of Git LFS does."""
+    if begin.startswith(LFS_POINTER):
+        raise UnusableError("it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches that")
 
 
 def text_in(path: Path, *, accepts_pipes: bool = False) -> str:

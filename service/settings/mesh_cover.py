@@ -12,15 +12,18 @@ import math
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.contract.explain import in_words
+from service.settings.file_content import content
 from service.settings.urdf import COVER, UrdfError
 
 Points = NDArray[np.float64]
+MAX_MESH_BYTES = 20_000_000  # of a collision mesh; a larger one takes gigabytes of memory
 END_DIGITS = 4  # a capsule's ends are rounded to 0.1 mm, and its radius is enlarged by 0.1 mm
 MIN_AXIS2_M2 = 1e-12  # added to a squared length, so that an axis of length 0 divides nothing by 0
 CAPSULE_CACHE = Path("~/.cache/thirdhand/capsules")  # files are named by a digest of mesh and scale
@@ -65,7 +68,7 @@ def _capsule(
         if factors.shape != (3,) or not np.isfinite(factors).all() or not factors.all():
             raise UrdfError(f"{what}: scale {scale!r} given; three finite numbers, none of them 0, needed")
         file = next(one for one in _candidates(name, urdf, packages) if one.is_file())
-        data = file.read_bytes()
+        data = content(file, MAX_MESH_BYTES)
         made_by = hashlib.sha256(Path(__file__).read_bytes())
         made_by.update(repr((file.suffix.lower(), factors.tolist())).encode() + data)
         if (known := _kept(made_by.hexdigest())) is None:
@@ -110,7 +113,7 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
         links = ", ".join(dict.fromkeys(lost.values()))
         what = f"{len(lost)} {kind} meshes of links {links} are not found, the first is {name}"
     tried = _candidates(name, urdf, packages)
-    if len(tried) == 1:
+    if not name.startswith(("package://", "model://")):
         return f"{what}: there is no {tried[0]}; put it there"
     rest = name.rpartition("://")[2]
     folders = ", ".join(str(one).removesuffix(rest) for one in tried if str(one).endswith(rest))
@@ -123,10 +126,14 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
 def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     """The paths at which the file of a mesh may be."""
     scheme, _, rest = name.rpartition("://")
+    rest = name.removeprefix("file:") if name.startswith("file:/") and not scheme else rest
+    rest = rest.removeprefix("localhost") if rest.startswith("localhost/") and scheme == "file" else rest
+    folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))  # of the URDF, and of a link's target
     if scheme not in ("package", "model"):
-        return [urdf.parent / rest]
+        return [folder / file for file in dict.fromkeys((rest, unquote(rest))) for folder in folders]
     package, _, inside = rest.partition("/")
-    above, named = urdf.absolute().parents, [Path(one).expanduser() for one in packages]
+    named = [Path(one).expanduser() for one in packages]
+    above = dict.fromkeys(parent for folder in folders for parent in (folder, *folder.parents))
     return [
         *(folder / inside for folder in (*above, *named) if folder.name == package),
         *(folder / package / inside for folder in (*above, *named)),

@@ -53,7 +53,7 @@ def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silenc
         status = daemon.until(is_held)
         assert status["because"] == "the clutch has not been heard yet"
         daemon.session.put("thirdhand/clutch", b"\0\1\0\0\7")
-        daemon.until(lambda s: s["because"].endswith("what arrived is malformed: a bool of 7; 0 or 1 needed"))
+        daemon.until(lambda s: s["because"].endswith("what arrives on clutch is malformed: a bool of 7; 0 or 1 needed"))
 
         pressed = switch(daemon)
         daemon.until(is_following)
@@ -66,7 +66,7 @@ def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silenc
             daemon.until(is_following)
             killed.kill()
         status = daemon.until(is_held)
-        assert status["because"] == "the clutch was last heard as pressed, and then not for 300 ms"
+        assert status["because"].startswith("the clutch was last heard as pressed, and then not for 300 ms")
         assert daemon.end() == 0
 
     (path,) = records.glob("*.mcap")

@@ -1,4 +1,4 @@
-"""Foreign images come to the scribe beside the loop; what is no image is told once."""
+"""Foreign images come to the scribe beside the loop; what is no image is counted."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import time
 import zenoh
 
 from service.contract.images import decode_image, image_in
+from service.daemon.cell_streams import Arrivals
 from service.daemon.side_streams import WAITING_IMAGES, SideStream
 from support.pictures import grey
 
 
-def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_images_are_passed_on_in_order_and_the_rest_is_counted(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
     near, far = sessions
     came: list[tuple[str, bytes]] = []
-    said: list[str] = []
+    arrivals = {key: Arrivals() for key in ("camera/front", "camera/side")}
 
     def pass_on(key: str, payload: bytes, now_ns: int) -> None:
         came.append((key, image_in(payload, now_ns)))
 
     streams = [
-        SideStream(near, key, functools.partial(pass_on, key), said.append, waiting=WAITING_IMAGES)
-        for key in ("camera/front", "camera/side")
+        SideStream(near, key, functools.partial(pass_on, key), counted, waiting=WAITING_IMAGES)
+        for key, counted in arrivals.items()
     ]
     sent = [("camera/front", grey(10)), ("camera/front", b"nonsense"), ("camera/front", b"nonsense")]
     sent += [("camera/front", grey(20)), ("camera/side", grey(30, kind="PNG")), ("camera/other", grey(40))]
@@ -38,5 +39,7 @@ def test_images_are_passed_on_in_order_and_the_rest_is_told_once(sessions: tuple
     assert [(key, decode_image(data).data) for key, data in came[:3]] == [
         (key, payload) for key, payload in sent[:-1] if payload != b"nonsense"
     ]
-    assert said == ["a message on camera/front is not recorded: an image that begins with 6e 6f 6e 73 65 6e 73 65; "
-                    "JPEG or PNG needed"]  # fmt: skip
+    front, side = arrivals.values()
+    assert front.why == "an image that begins with 6e 6f 6e 73 65 6e 73 65; JPEG or PNG needed"
+    assert front.count >= front.malformed + 2
+    assert (front.malformed >= 2, side.malformed) == (True, 0)

@@ -156,7 +156,7 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
 def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(tmp_path: Path) -> None:
     told = write(tmp_path / "a.mcap", 60)
     wanted = [
-        (at_ns(tick.index), event.kind[6:], event.payload)
+        (at_ns(tick.index), event.kind[6:], cdr.decode_pose(event.payload))
         for tick, *_ in told
         for event in tick.inbox
         if event.kind[:5] == "hands"

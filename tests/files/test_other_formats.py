@@ -20,12 +20,15 @@ from rosbags.typesys import Stores, get_typestore
 
 from service.contract import cdr
 from service.contract.channels import POSE
+from service.contract.explain import ExplainedError
 from service.contract.messages import PoseStamped
 from service.contract.ros2msg import schema
 from service.files.demonstration_reader import read_demonstration
 from service.files.mcap_file import RecordingError
 from service.files.pose_streams import PoseTopic
 from service.learning.demonstration import Demonstration
+from service.learning.skill_file import skill_in
+from service.settings.arm_description import description
 from service.settings.config import HandSettings, Settings
 from support.circling import circling
 from support.paths import ROOT
@@ -107,6 +110,21 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
     return path
 
 
+@pytest.mark.parametrize(("separator", "time_code"), [(",", "15:26:01:12.02"), (",", ""), (";", None), ("\t", "x")])
+def test_motive_is_read_with_time_codes_and_as_a_spreadsheet_saves_it(
+    separator: str, time_code: str | None, take: Demonstration, tmp_path: Path
+) -> None:
+    path = motive(tmp_path / "a.csv", take)
+    rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    if time_code is not None:
+        for row in rows[2:]:
+            row.insert(2, "TimeCode" if row[0] == "Frame" else time_code if row[0] else "")
+    lines = [separator.join(cell.replace(".", "," if separator == ";" else ".") for cell in row) for row in rows]
+    (tmp_path / "b.csv").write_text("\n".join(lines), encoding="utf-8")
+    got, wanted = (read_demonstration(tmp_path / name, settings=CAPTURE) for name in ("b.csv", "a.csv"))
+    np.testing.assert_array_equal(got.left, wanted.left)
+
+
 def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstration, tmp_path: Path) -> None:
     path, said = motive(tmp_path / "a.csv", take), list[str]()
     got = read_demonstration(path, settings=CAPTURE, say=said.append)
@@ -182,6 +200,24 @@ def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demo
         (tmp_path / "a.c3d").write_bytes(data[: len(data) // 2] if "cut" in words else data)
         with pytest.raises(RecordingError, match=words):
             read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
+
+
+@pytest.mark.parametrize("name", "a.mcap a.csv a.c3d a.bag a.db3 bag/a.db3 a.npz a.urdf a.stl".split())
+def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n")
+    shape = '<link name="a"><collision><geometry><mesh filename="a.stl"/></geometry></collision></link>'
+    (tmp_path / "b.urdf").write_text(f"<robot>{shape}</robot>")
+    read: Callable[[], object] = {
+        ".npz": lambda: skill_in(path),
+        ".urdf": lambda: description(path),
+        ".stl": lambda: description(tmp_path / "b.urdf"),
+    }.get(path.suffix, lambda: read_demonstration(path.parent if "/" in name else path))
+    with pytest.raises(
+        ExplainedError, match="it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches"
+    ):
+        read()
 
 
 def lerobot(path: Path) -> None:

@@ -4,8 +4,11 @@ and joint states, in a tracker's axes and unit, by clocks that differ.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
+import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +73,13 @@ def tree(stamp_ns: int, frame: str, **places: tuple[float, float, float]) -> Any
     return made("tf2_msgs/msg/TFMessage", transforms=found)
 
 
-def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+def bag(
+    path: Path,
+    topics: dict[str, list[Any]],
+    *,
+    plugin: StoragePlugin = StoragePlugin.SQLITE3,
+    little_endian: bool = True,
+) -> Path:
     """A bag with one message of each topic at each of STAMPS, in the order of time."""
     with Writer(path, version=9, storage_plugin=plugin) as writer:
         connections = {}
@@ -78,7 +87,7 @@ def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = Sto
             connections[topic] = writer.add_connection(topic, messages[0].__msgtype__, typestore=STORE)
         for i, stamp_ns in enumerate(STAMPS.tolist()):
             for topic, messages in topics.items():
-                data = STORE.serialize_cdr(messages[i], messages[i].__msgtype__)
+                data = STORE.serialize_cdr(messages[i], messages[i].__msgtype__, little_endian=little_endian)
                 writer.write(connections[topic], stamp_ns + 1_000_000, data)
     return path
 
@@ -101,6 +110,17 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         np.testing.assert_array_equal(got.stamps_ns, STAMPS)
         np.testing.assert_allclose(got.left[:, :2], np.column_stack([WAY, np.full(len(WAY), -0.3)]))
         np.testing.assert_allclose(got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)]))
+    if plugin is StoragePlugin.SQLITE3:
+        with contextlib.closing(sqlite3.connect(file)) as recorder:  # one that was killed, before its metadata
+            recorder.execute("PRAGMA journal_mode = WAL")
+            recorder.execute("DELETE FROM messages WHERE timestamp > ?", (int(STAMPS[20]),))
+            recorder.commit()
+            shutil.copytree(folder, killed := tmp_path / "killed")
+        (killed / "metadata.yaml").unlink()
+        assert (killed / f"{file.name}-wal").stat().st_size > 0
+        for path in (killed, killed / file.name):
+            assert len(read_demonstration(path, topics=sources).stamps_ns) == 20
+        path = file
     for given, words in (
         ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
         ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
@@ -112,6 +132,37 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
     ):
         with pytest.raises(RecordingError, match=words):
             read_demonstration(path, topics=given)
+
+
+def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
+    zero = made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    still = made("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    return made(
+        "nav_msgs/msg/Odometry",
+        header=header(stamp_ns, frame),
+        child_frame_id="hand",
+        pose=made("geometry_msgs/msg/PoseWithCovariance", pose=pose(*at), covariance=np.zeros(36)),
+        twist=made("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36)),
+    )
+
+
+def covered(stamp_ns: int, frame: str, *at: float) -> Any:
+    known = made("geometry_msgs/msg/PoseWithCovariance", pose=pose(*at), covariance=np.zeros(36))
+    return made("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp_ns, frame), pose=known)
+
+
+@pytest.mark.parametrize("make", [odometry, covered, stamped])
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_poses_of_trackers_and_big_endian_machines_are_read(make: Any, little_endian: bool, tmp_path: Path) -> None:
+    topics = {
+        "/left_hand": moving(make, "base", 0.3, 0.0),
+        "/right_hand": moving(make, "base", -0.3, 0.0),
+        "/tool": moving(stamped, "base", 0.5, 0.0),
+    }
+    got = read_demonstration(bag(tmp_path / "bag", topics, little_endian=little_endian))
+    np.testing.assert_array_equal(got.stamps_ns, STAMPS)
+    for side, x_m in (("left", 0.3), ("right", -0.3), ("tool", 0.5)):
+        np.testing.assert_allclose(getattr(got, side)[:, :3], np.column_stack([np.full(40, x_m), np.zeros(40), WAY]))
 
 
 def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:
@@ -182,7 +233,7 @@ def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count
 def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     (tmp_path / "a.db3").write_bytes(b"nothing")
     for path in (tmp_path, tmp_path / "a.db3", tmp_path / "b.bag"):
-        with pytest.raises(RecordingError, match=r"is not a bag that can be read: "):
+        with pytest.raises(RecordingError, match=r"is not a bag that can be read: |there is no file .*bag"):
             read_demonstration(path)
 
 

@@ -93,6 +93,12 @@ def described(name: str, scale: str = "") -> str:
     [
         ("meshes/arm.stl", "cell/meshes/arm.stl", ""),
         ("file://{folder}/arm.stl", "arm.stl", ""),
+        ("file:{folder}/S%C3%BCd%20Halle/arm.stl", "Süd Halle/arm.stl", ""),
+        ("file://localhost{folder}/arm.stl", "arm.stl", ""),
+        ("../a%20b.stl", "a b.stl", ""),
+        ("../a%20b.stl", "a%20b.stl", ""),
+        ("meshes/arm.stl", "linked/meshes/arm.stl", ""),  # the URDF is a link
+        ("package://linked/arm.stl", "linked/arm.stl", ""),
         ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),  # the folder above the URDF is the package
         ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
         ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
@@ -104,7 +110,10 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
     (folder / file).parent.mkdir(parents=True, exist_ok=True)
     points = box(60.0, 50.0, 300.0) + np.array((0.0, 0.0, 40.0))  # in millimetres
     (folder / file).write_bytes(stl(points))
-    (folder / "cell" / "arm.urdf").write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
+    urdf = folder / ("linked/urdf.xml" if "linked" in file else "cell/arm.urdf")
+    urdf.write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
+    if "linked" in file:
+        (folder / "cell" / "arm.urdf").symlink_to(urdf)
     own = Settings()
     lines = f"""
         [arm]

@@ -197,12 +197,16 @@ def test_what_others_accept_moves_as_the_plain_one(text: str | bytes, tmp_path: 
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
-    for path, said in ((Path("/dev/zero"), "is no file"), (tmp_path, "is no file"), (tmp_path / "x", "cannot read")):
+    for path, said in (
+        (Path("/dev/zero"), "is not a file; a URDF"),
+        (tmp_path, "a directory"),
+        (tmp_path / "x", "cannot read"),
+    ):
         with pytest.raises(SettingsError, match=said):
             description(path)
     with (tmp_path / "large.urdf").open("wb") as file:
         file.truncate(1_000_000_000)
-    with pytest.raises(SettingsError, match="has 1000 MB; up to 20 accepted"):
+    with pytest.raises(SettingsError, match="it has 1000000000 bytes, at most 20000000 accepted; a URDF needed"):
         description(tmp_path / "large.urdf")
 
 

@@ -92,7 +92,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     path = tmp_path / "a.mcap"
     taken.write(path)
     assert list(tmp_path.iterdir()) == [path]
-    assert sorted(payload for *_, payload in hand_samples(path)) == sorted(sent)
+    assert sorted(cdr.encode_pose(pose) for *_, pose in hand_samples(path)) == sorted(sent)
     got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)

@@ -17,7 +17,7 @@ from service.contract.messages import BASE
 from service.contract.records import SIDES
 from service.core.frame import Vector
 from service.files.demonstration_reader import in_metres, is_by_tracker
-from service.files.pose_streams import ENDINGS, JOINT_STATES, PoseRecording
+from service.files.pose_streams import ENDINGS, JOINT_STATES, PoseRecording, PoseTopic
 from service.files.track import Track
 from service.settings.config import HandSettings, Settings, robot_description
 from service.trackers.calibration.solver import (
@@ -84,11 +84,9 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
     hands: dict[str, Track] = {}
     for side in SIDES:
         for topic in recorded.topics:
-            if f"/{topic}".endswith(f"/{ENDINGS[side]}") and recorded.topics[topic] == channels.POSE.type:
-                stamps, logged, poses, frame = recorded.tracks(topic).get("", ([], [], [], ""))
-                if stamps:
-                    arrays = np.array(stamps, np.int64), np.array(logged, np.int64), np.array(poses)
-                    hands[side] = Track(ENDINGS[side], topic, *arrays, frame)
+            is_hand = f"/{topic}".endswith(f"/{ENDINGS[side]}") and recorded.topics[topic] == channels.POSE.type
+            if is_hand and "" in recorded.tracks(topic):
+                hands[side] = recorded.track(ENDINGS[side], PoseTopic(topic), settings)
     if not hands:
         raise CalibrationError(f"{path} has no hands: a topic ending in hands/left or hands/right needed")
     tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
