@@ -15,7 +15,10 @@ from service.client import publisher
 from service.contract import cdr, channels, ros2
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
+from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Record
+from service.core.intake.stage import UNIT_M
+from service.daemon.frozen_hand import FrozenHand
 from service.daemon.ros2_domain import Ros2Domain
 from service.settings.config import Settings
 
@@ -39,11 +42,11 @@ MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all n
 class Arrivals:
     """Statistics of the messages received on one channel. The loop writes, other threads read."""
 
-    __slots__ = ("_delays", "at_ns", "count", "malformed", "newest", "why")
+    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "why")
 
     def __init__(self) -> None:
         self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, arrival - stamp [ns]
-        self.count = self.malformed = self.at_ns = 0
+        self.count = self.malformed = self.frozen = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
 
@@ -116,6 +119,8 @@ class CellStreams:
         cell, domain = settings.cell, settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
+        self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
+        self._settings = settings
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [channel.key for channel in heard(settings)]
         keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
@@ -187,8 +192,12 @@ class CellStreams:
                     return None
                 if state is not message:
                     message, payload = state, cdr.encode_joints(state)
-            event = self.newest[suffix] = Event(suffix, payload, message)
             arrivals.take(message, at_ns)
+            hand = self._frozen.get(suffix)
+            if hand and hand.is_frozen(message, UNIT_M[self._settings.hands_in(message.frame_id).unit]):
+                arrivals.frozen += 1
+                return None
+            event = self.newest[suffix] = Event(suffix, payload, message)
             return event
         except WireError as error:
             arrivals.refuse(str(error))

@@ -202,7 +202,9 @@ def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demo
             read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
 
 
-@pytest.mark.parametrize("name", "a.mcap a.csv a.c3d a.bag a.db3 bag/a.db3 a.npz a.urdf a.stl".split())
+@pytest.mark.parametrize(
+    "name", ["a.mcap", "a.csv", "a.c3d", "a.bag", "a.db3", "bag/a.db3", "a.npz", "a.urdf", "a.stl"]
+)
 def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
