@@ -8,7 +8,7 @@ from service.contract.messages import PoseStamped
 
 FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
 TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
-REST_S = 0.1  # a pose repeated for so long is a rest
+EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
 LEAP_M = 0.02  # a hand that was lost appears farther away; one that rested goes on from where it was
 
 
@@ -33,7 +33,7 @@ class FrozenHand:
             self._repeated_ns = self._varies_since_ns = pose.stamp_ns
             lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
             return self._is_tracked and lasts_s >= FROZEN_S and 2 * self._leaps >= self._rests
-        if before is not None and self._repeated_ns - before.stamp_ns >= 1e9 * REST_S:
+        if before is not None and self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
             self._rests += 1
             self._leaps += unit_m * math.dist(pose.position, before.position) > LEAP_M
         if before is None or pose.stamp_ns < self._varies_since_ns:
