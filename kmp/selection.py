@@ -37,7 +37,7 @@ _AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with
 _SHORTER = 2.0 ** np.arange(1, 9)  # times the best ell, that are tried for it, up to the last of _ELLS
 _ROUNDED = 1 + 1e-9
 _PLACES = 9  # reference points at which the reach of a via-point is measured
-_RESOLVED = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
+_COARSEST = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
 _HELD_OUT = 200  # points of a demonstration that are predicted
 
 
@@ -274,7 +274,7 @@ def _check_scale(data: Sequence[tuple[Array, Array]], regularization: float, *, 
     widest = int(inputs.std(axis=0).argmax())
     deviation = float(inputs[:, widest].std())
     largest = float(np.abs(inputs[:, widest]).max())
-    coarse = float(np.spacing(largest)) / _RESOLVED
+    coarse = float(np.spacing(largest)) / _COARSEST
     least = float(np.sqrt(regularization))
     varies = f"demonstrations: the inputs deviate by {deviation:.3g} from their mean"
     if deviation < coarse and coarse > least:

@@ -12,7 +12,7 @@ from service.settings.robot_xml import readable
 from service.settings.urdf import Shape, Urdf, UrdfError
 
 ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] assumed before the kinematics are known
-MAX_BYTES = 20_000_000  # a humanoid's URDF has 0.1 MB
+MAX_URDF_BYTES = 20_000_000  # a humanoid's URDF has 0.1 MB
 
 
 def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:
@@ -35,7 +35,7 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
 def _text(path: Path) -> str:
     """The text of a URDF. Raises OSError, UrdfError."""
     try:
-        return readable(content(path, MAX_BYTES))
+        return readable(content(path, MAX_URDF_BYTES))
     except UnusableError as error:
         raise UrdfError(f"{path}: {error}; a URDF needed") from None
     except ValueError as error:

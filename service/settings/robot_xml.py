@@ -26,7 +26,7 @@ NUMERIC = {  # attributes with numbers by element, in addition to xyz and rpy
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
 }
 QUATERNION = "quat_xyzw"  # of URDF 1.1, read as the equal `rpy`
-ORIGIN = {"xyz", "rpy"}  # attributes of an <origin> that are read
+ORIGIN_ATTRIBUTES = {"xyz", "rpy"}  # attributes of an <origin> that are read
 MAX_NORM_ERROR = 1e-3  # of a quaternion
 MIN_COSINE = 1e-9  # of a pitch at which roll and yaw differ
 MACROS = "its macros are not expanded: make a URDF of it first, by `xacro arm.urdf.xacro > arm.urdf`"
@@ -144,8 +144,10 @@ def check_numbers(robot: Element) -> None:
     for part in (*robot.findall("link"), *robot.findall("joint")):
         for element in part.iter():
             for name in element.attrib:
-                if element.tag == "origin" and name not in ORIGIN:
-                    raise ValueError(f"{part.tag} {part.get('name', '')!r}: {unread('origin', name, ORIGIN)}")
+                if element.tag == "origin" and name not in ORIGIN_ATTRIBUTES:
+                    raise ValueError(
+                        f"{part.tag} {part.get('name', '')!r}: {unread('origin', name, ORIGIN_ATTRIBUTES)}"
+                    )
                 if name in ("xyz", "rpy") or name in NUMERIC.get(element.tag, ()):
                     try:
                         numbers(element, name, "")

@@ -25,7 +25,7 @@ def test_malformed_messages_of_every_stream_are_counted_and_named(tmp_path: Path
 
         def complete_status() -> Status | None:
             for key in keys.values():
-                daemon.session.put(key, b"\0\1\0\0")
+                daemon.session.put(key, bytes(100_000) if key.endswith("right") else b"\0\1\0\0")
             status = daemon.client.status()
             return status if all(f"malformed {key}" in status.rejected for key in keys) else None
 
