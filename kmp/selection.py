@@ -37,6 +37,7 @@ _AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with
 _SHORTER = 2.0 ** np.arange(1, 9)  # times the best ell, that are tried for it, up to the last of _ELLS
 _ROUNDED = 1 + 1e-9
 _PLACES = 9  # reference points at which the reach of a via-point is measured
+_COARSEST = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
 _HELD_OUT = 200  # points of a demonstration that are predicted
 
 
@@ -107,13 +108,18 @@ class _Recipe:
 
     def mixture(self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None) -> GaussianMixture:
         """The mixture of all samples, from that of a few more if it is known."""
-        return mixture_of(
-            np.concatenate([np.hstack(one) for one in data]),
-            components=self.components,
-            seed=self.seed,
-            regularization=self.regularization,
-            start=start,
-        )
+        try:
+            return mixture_of(
+                np.concatenate([np.hstack(one) for one in data]),
+                components=self.components,
+                seed=self.seed,
+                regularization=self.regularization,
+                start=start,
+            )
+        except ValueError as error:
+            if "singular" in str(error):
+                _check_scale(data, self.regularization, is_singular=True)
+            raise
 
     def reference(self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool) -> Fold:
         """The reference of all demonstrations, nothing held out."""
@@ -204,7 +210,8 @@ def learn(
     follows the data's units.
 
     Raises ValueError if shapes do not agree, a number is not finite, a parameter is out of its
-    range, or there are too few samples for the components, or demonstrations for a choice.
+    range, the unit or origin of the inputs does not suit the regularization, or there are too few
+    samples for the components, or demonstrations for a choice.
     """
     data = checked_demonstrations(demonstrations)
     for name, value in (("lambda_mean", lambda_mean), ("lambda_covariance", lambda_covariance)):
@@ -221,6 +228,7 @@ def learn(
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
     recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1)
     mixture = recipe.mixture(data)
+    _check_scale(data, regularization)
     shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
     plain = np.nan
@@ -256,6 +264,28 @@ def learn(
     assert lambda_mean is not None, "given or chosen"
     order = sorted(scores, key=_best_first)
     return Learned(full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), plain)
+
+
+def _check_scale(data: Sequence[tuple[Array, Array]], regularization: float, *, is_singular: bool = False) -> None:
+    """Raise ValueError for inputs that vary too little for the regularization [unit^2], or for the
+    precision of numbers of their size; and if a mixture is singular, for those that vary too much.
+    """
+    inputs = np.concatenate([s for s, _ in data])
+    widest = int(inputs.std(axis=0).argmax())
+    deviation = float(inputs[:, widest].std())
+    largest = float(np.abs(inputs[:, widest]).max())
+    coarse = float(np.spacing(largest)) / _COARSEST
+    least = float(np.sqrt(regularization))
+    varies = f"demonstrations: the inputs deviate by {deviation:.3g} from their mean"
+    if deviation < coarse and coarse > least:
+        raise ValueError(f"{varies}, which is too little at {largest:.3g}: subtract the begin of each demonstration.")
+    if 0.0 < deviation < least:
+        needed = f"at least {least:.3g}, the root of the regularization, needed"
+        raise ValueError(f"{varies}, {needed}: give them in a smaller unit.")
+    if is_singular and np.finfo(float).eps * deviation**2 > regularization:
+        raise ValueError(
+            f"{varies}, too much for a regularization of {regularization:g}: give seconds, not nanoseconds."
+        )
 
 
 def _variances(inputs: Array) -> Array:

@@ -209,7 +209,7 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"posture = {list(arm.posture)}  # {rad} the tool over the table, pointing down and forward\n"
         'start = "held"  # after every start the arm waits for `thirdhand resume`\n'
         "\n"
-        f"# A guess, from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
+        f"# The URDF's own, else a guess from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
         "# Take the values of the maker's data sheet if you have it; begin with a tenth on a real arm.\n"
         "[joints]\n"
         f"{velocity}"

@@ -25,12 +25,15 @@ def rates(text: str, moving: Sequence[UrdfJoint]) -> tuple[list[float], list[flo
     """A guess of the joints' accelerations [rad/s²] and jerks [rad/s³], and True if the URDF has
     masses and efforts.
 
-    acceleration = velocity / RISE_S, reduced if the efforts are small for the masses.
+    acceleration = velocity / RISE_S, reduced if the efforts are small for the masses. Values of
+    the URDF itself are taken instead.
     """
     wanted = np.array([min(_known(joint.velocity) / RISE_S, MAX_ACCELERATION) for joint in moving])
     share = _torque_share(text, moving, wanted)
-    acceleration = wanted * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
-    jerk = np.minimum(JERK_RATE * acceleration, MAX_JERK)
+    guess = wanted * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
+    given = np.array([(joint.acceleration, joint.jerk) for joint in moving])
+    acceleration = np.where(np.isfinite(given[:, 0]), given[:, 0], guess)
+    jerk = np.where(np.isfinite(given[:, 1]), given[:, 1], np.minimum(JERK_RATE * acceleration, MAX_JERK))
     return [float(f"{a:.3g}") for a in acceleration], [float(f"{j:.3g}") for j in jerk], share is not None
 
 

@@ -36,22 +36,10 @@ _STAMPED = 12  # bytes of header and stamp
 _MOST_LAYOUTS = 16
 MAX_BYTES = 8192  # bounds the time in which the loop reads a message
 LONGEST_TRANSFORMS = 32768  # bytes of a TFMessage: of about 300 transforms
-# CDR and CDR2 by the number with which a message begins: byte order, largest alignment [bytes].
-# CDR2 has the number of RTPS, which implementations of DDS write, or that of XTypes.
-_PLAIN = {
-    b"\x00\x00": (">", 8),
-    b"\x00\x01": ("<", 8),
-    b"\x00\x06": (">", 4),
-    b"\x00\x07": ("<", 4),
-    b"\x00\x10": (">", 4),
-    b"\x00\x11": ("<", 4),
-}
-_REFUSED = {
-    **dict.fromkeys((b"\x00\x02", b"\x00\x03"), "PL_CDR"),
-    b"\x00\x04": "XML",
-    **dict.fromkeys((b"\x00\x08", b"\x00\x09", b"\x00\x14", b"\x00\x15"), "DELIMITED_CDR2"),
-    **dict.fromkeys((b"\x00\x0a", b"\x00\x0b", b"\x00\x12", b"\x00\x13"), "PL_CDR2"),
-}
+# By half the number with which a message begins; odd numbers are little endian. CDR2 has the number
+# of RTPS, which implementations of DDS write, or that of XTypes.
+_ENCODINGS = {0: "CDR", 1: "PL_CDR", 2: "XML", 3: "CDR2", 4: "DELIMITED_CDR2", 5: "PL_CDR2"}
+_ENCODINGS |= {8: "CDR2", 9: "PL_CDR2", 10: "DELIMITED_CDR2"}
 
 
 def _stamp(stamp_ns: int) -> tuple[int, int]:
@@ -257,11 +245,13 @@ class Reader:
     def __init__(self, data: bytes, most: int | None = None) -> None:
         if most is not None and len(data) > most:
             raise WireError(f"a message of {len(data)} bytes, at most {most} accepted")
-        if data[:2] not in _PLAIN or len(data) < 4:
-            encoding = f"encoding {_REFUSED[data[:2]]}, " if data[:2] in _REFUSED else ""
-            raise WireError(f"{encoding}header {data[:4].hex(' ') or 'missing'}; plain CDR or CDR2 needed")
-        order, self._max_align = _PLAIN[data[:2]]
-        self._is_big_endian = order == ">"
+        number = data[1] if len(data) >= 4 and not data[0] else MAX_BYTES
+        encoding = _ENCODINGS.get(number >> 1, "")
+        if encoding not in ("CDR", "CDR2"):
+            named = f"encoding {encoding}, " if encoding else ""
+            raise WireError(f"{named}header {data[:4].hex(' ') or 'missing'}; plain CDR or CDR2 needed")
+        self._is_big_endian = not number & 1
+        self._max_align = 8 if encoding == "CDR" else 4
         self._data = data
         self._at = 4
 

@@ -85,7 +85,7 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
     joints.setdefault("kinds", [joint.kind for joint in moving])
-    for name in ("lower", "upper", "velocity"):
+    for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
         if all(math.isfinite(getattr(joint, name)) for joint in moving):
             joints.setdefault(name, [getattr(joint, name) for joint in moving])
     wanted = (
@@ -128,6 +128,8 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
             ("lower", joint.lower, math.inf),
             ("upper", -math.inf, joint.upper),
             ("velocity", 0, joint.velocity),
+            ("acceleration", 0, joint.acceleration),
+            ("jerk", 0, joint.jerk),
         ):
             given = getattr(joints, name)[i]
             if not low <= given <= high:

@@ -7,7 +7,7 @@ are ignored: they hold nothing that a URDF defines.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -25,6 +25,10 @@ NUMERIC = {  # attributes with numbers by element, in addition to xyz and rpy
     "mass": ("value",),
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
 }
+QUATERNION = "quat_xyzw"  # of URDF 1.1, read as the equal `rpy`
+ORIGIN_ATTRIBUTES = {"xyz", "rpy"}  # attributes of an <origin> that are read
+MAX_NORM_ERROR = 1e-3  # of a quaternion
+MIN_COSINE = 1e-9  # of a pitch at which roll and yaw differ
 MACROS = "its macros are not expanded: make a URDF of it first, by `xacro arm.urdf.xacro > arm.urdf`"
 
 
@@ -54,8 +58,13 @@ def element_of(text: str | bytes) -> Element:
             raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
         if foreign or ":" in tag:
             foreign += 1
-        else:
-            builder.start(tag, {name: value for name, value in attributes.items() if ":" not in name})
+            return
+        plain = {name: value for name, value in attributes.items() if ":" not in name}
+        if tag == "origin" and QUATERNION in plain:
+            if "rpy" in plain:
+                raise ValueError(f"line {parser.CurrentLineNumber}: <origin> has rpy and {QUATERNION}; one needed")
+            plain["rpy"] = _rpy(Element(tag, {QUATERNION: plain.pop(QUATERNION)}))
+        builder.start(tag, plain)
 
     def end(tag: str) -> None:
         nonlocal foreign
@@ -77,17 +86,34 @@ def element_of(text: str | bytes) -> Element:
     return builder.close()
 
 
+def _rpy(origin: Element) -> str:
+    """Roll, pitch and yaw of an origin's quaternion. Raises ValueError."""
+    quaternion = numbers(origin, QUATERNION, "")
+    norm = math.hypot(*quaternion)
+    if len(quaternion) != 4 or abs(norm - 1.0) > MAX_NORM_ERROR:
+        raise ValueError(f"<origin {QUATERNION}={origin.get(QUATERNION)!r}>: a quaternion x y z w of norm 1 needed")
+    x, y, z, w = (number / norm for number in quaternion)
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    cosine = math.hypot(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z))
+    pitch = math.atan2(2.0 * (w * y - z * x), cosine)
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    if cosine < MIN_COSINE:  # roll and yaw turn about the same axis
+        roll = 0.0
+        yaw = math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
+    return f"{roll!r} {pitch!r} {yaw!r}"
+
+
 def readable(data: bytes) -> str:
-    """The text of a file in a form that every XML reader accepts. A file with undeclared prefixes,
-    or in an encoding other than UTF-8, is rewritten. Raises ValueError.
+    """The text of a file in a form that every reader of URDF accepts. A file with undeclared
+    prefixes or quaternions, or in an encoding other than UTF-8, is rewritten. Raises ValueError.
     """
     robot = element_of(data)
     try:
         text = data.decode("utf-8-sig")
         expat.ParserCreate("utf-8", " ").Parse(text, True)
     except (UnicodeDecodeError, expat.ExpatError):
-        return ElementTree.tostring(robot, encoding="unicode")
-    return text
+        text = QUATERNION
+    return ElementTree.tostring(robot, encoding="unicode") if QUATERNION in text else text
 
 
 def numbers(element: Element | None, name: str, default: str) -> tuple[float, ...]:
@@ -112,15 +138,26 @@ def three(element: Element | None, name: str, default: str) -> tuple[float, floa
 
 
 def check_numbers(robot: Element) -> None:
-    """Reject numbers of links and joints that are not finite or too large. Raises ValueError."""
+    """Reject numbers of links and joints that are not finite or too large, and attributes of their
+    origins that are not read. Raises ValueError.
+    """
     for part in (*robot.findall("link"), *robot.findall("joint")):
         for element in part.iter():
             for name in element.attrib:
+                if element.tag == "origin" and name not in ORIGIN_ATTRIBUTES:
+                    raise ValueError(
+                        f"{part.tag} {part.get('name', '')!r}: {unread('origin', name, ORIGIN_ATTRIBUTES)}"
+                    )
                 if name in ("xyz", "rpy") or name in NUMERIC.get(element.tag, ()):
                     try:
                         numbers(element, name, "")
                     except ValueError as error:
                         raise ValueError(f"{part.tag} {part.get('name', '')!r}: {error}") from None
+
+
+def unread(tag: str, name: str, accepted: Iterable[str]) -> str:
+    """The message about an attribute that would be ignored."""
+    return f"<{tag} {name}=...> is not read; {', '.join(sorted(accepted))} accepted"
 
 
 def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]]) -> str:

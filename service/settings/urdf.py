@@ -9,7 +9,7 @@ from typing import NamedTuple
 from service.contract.explain import ExplainedError, did_you_mean
 from service.contract.messages import Quaternion, Transform, Vector3
 from service.settings.link_tree import root_of
-from service.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three
+from service.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three, unread
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic")  # an arm's chain may have these
 CONTINUOUS_RAD = 6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise
@@ -35,6 +35,9 @@ class UrdfJoint(NamedTuple):
     upper: float
     velocity: float
     mimics: str = ""  # the joint whose motion it follows
+    acceleration: float = math.inf  # [rad/s², m/s²] inf: not given
+    jerk: float = math.inf  # [rad/s³, m/s³] inf: not given
+    mistake: str = ""  # the reason why it cannot be a joint of the chain
 
 
 class Shape(NamedTuple):
@@ -61,6 +64,8 @@ class Urdf:
             self.joints = tuple(_joint(element) for element in self._robot.findall("joint"))
             if self._robot.tag != "robot" or not self.joints:
                 raise ValueError("a <robot> with joints needed")
+            if (version := self._robot.get("version", "1.0")) not in VERSIONS:
+                raise ValueError(f"version {version!r}; {', '.join(VERSIONS)} accepted")
             self.root = root_of(links, self.joints)
             check_numbers(self._robot)
             self.shapes = tuple(
@@ -100,17 +105,22 @@ class Urdf:
         """The joints from the root to link `tip` that turn or slide, in order. Continuous joints
         get the limits ±CONTINUOUS_RAD, and an infinite velocity if the description has none.
 
-        Raises UrdfError for a joint of another kind, without limits, or that mimics another one.
+        Raises UrdfError for a joint of another kind, without limits, or that mimics another one,
+        and for more than MAX_MOVING joints.
         """
         moving = tuple(_limited(joint) for joint in self.chain(tip) if joint.kind != "fixed")
         for joint in moving:
-            mistake = _lack(joint)
+            mistake = joint.mistake or _lack(joint)
             if joint.kind not in JOINT_KINDS:
                 mistake = f"is {joint.kind}; {', '.join(JOINT_KINDS)} or fixed needed"
             elif joint.mimics:
                 mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
             if mistake:
                 raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
+        if len(moving) > MAX_MOVING:
+            raise UrdfError(
+                f"{self.origin}: {len(moving)} joints move before link {tip!r}; up to {MAX_MOVING} accepted"
+            )
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
         return moving
@@ -148,10 +158,13 @@ def _lack(joint: UrdfJoint) -> str:
         return "has the axis 0 0 0; a direction needed"
     if not is_continuous and not -MAX_JOINT_LIMIT <= joint.lower < joint.upper <= MAX_JOINT_LIMIT:
         given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
-        return f"{given}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit>"
+        return f"{given}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit> and soft limits"
     if not 0.0 < joint.velocity <= MAX_JOINT_LIMIT and not (is_continuous and joint.velocity == math.inf):
         given = f"has the velocity {_or_none(joint.velocity)}"
         return f"{given}; above 0, up to {MAX_JOINT_LIMIT:g} {unit}/s, needed in its <limit>"
+    if not min(joint.acceleration, joint.jerk) > 0.0:
+        given = f"has the acceleration {joint.acceleration:g} and the jerk {joint.jerk:g}"
+        return f"{given}; numbers above 0 needed in its <limit>"
     return ""
 
 
@@ -162,6 +175,11 @@ def _or_none(number: float) -> str:
 def _joint(element: Element) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
+    soft = element.find("safety_controller") if kind != "continuous" else None
+    soft_lower, soft_upper = (_limit(soft, f"soft_{side}_limit") for side in ("lower", "upper"))
+    if soft_lower == soft_upper == 0.0:  # as if they were not given
+        soft_lower = soft_upper = math.nan
+    acceleration, deceleration, jerk = (_limit(limit, name) for name in ("acceleration", "deceleration", "jerk"))
     try:
         x, y, z = three(element.find("axis"), "xyz", "1 0 0")
         norm = math.hypot(x, y, z) or 1.0  # a joint with the axis 0 0 0 cannot move: `movable` rejects it
@@ -173,13 +191,32 @@ def _joint(element: Element) -> UrdfJoint:
             three(origin, "xyz", "0 0 0"),
             _turn(origin),
             (x / norm, y / norm, z / norm),
-            _limit(limit, "lower"),
-            _limit(limit, "upper"),
+            max(filter(_is_given, (_limit(limit, "lower"), soft_lower)), default=math.nan),
+            min(filter(_is_given, (_limit(limit, "upper"), soft_upper)), default=math.nan),
             _limit(limit, "velocity"),
             "" if mimic is None else mimic.get("joint", "another joint"),
+            min(filter(_is_given, (acceleration, deceleration)), default=math.inf),
+            jerk if _is_given(jerk) else math.inf,
+            _mistake(element),
         )
     except ValueError as error:
         raise ValueError(f"joint {name!r}: {error}") from None
+
+
+def _is_given(number: float) -> bool:
+    return not math.isnan(number)
+
+
+def _mistake(joint: Element) -> str:
+    """The attribute of an axis or of limits that would be ignored; empty without one."""
+    for tag, accepted in ATTRIBUTES.items():
+        for element in joint.findall(tag):
+            for name in element.attrib:
+                if name not in accepted:
+                    return f"cannot be read: {unread(tag, name, accepted)}"
+                if name in OPTIONAL and math.isnan(_limit(element, name)):
+                    return f"has <{tag} {name}={element.get(name)!r}>; a number needed"
+    return ""
 
 
 def _limit(limit: Element | None, which: str) -> float:
@@ -193,6 +230,14 @@ def _limit(limit: Element | None, which: str) -> float:
 COVER = "covered_by"  # our own attribute of a mesh with its capsule; other readers ignore it
 SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
 SIZE_COUNTS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}  # numbers in the attributes of SIZES
+VERSIONS = ("1", "1.0", "1.1", "1.2")
+ATTRIBUTES = {  # that are read, of joints of the chain
+    "axis": {"xyz"},
+    "limit": {"lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk"},
+    "safety_controller": {"soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"},
+}
+OPTIONAL = ("acceleration", "deceleration", "jerk", "soft_lower_limit", "soft_upper_limit")
+MAX_MOVING = 32  # joints before the tool; arms have 7, humanoids 12 with their torso
 MAX_JOINT_LIMIT = 1000.0  # [rad, rad/s, m, m/s] larger limits are rejected as mistakes
 MAX_SHAPES = 500  # an arm with a hand has 30
 

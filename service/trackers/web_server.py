@@ -53,15 +53,24 @@ class Address(NamedTuple):
 
 
 class ServerCertificate(NamedTuple):
-    """A certificate and key, loaded, and the name or address that the certificate is for."""
+    """A certificate and key, loaded, the name or address under which the page is opened, and all
+    that the certificate names, such as `*.lab.example`.
+    """
 
     context: ssl.SSLContext
     name: str
+    names: tuple[str, ...]
+
+    def is_for(self, host: str) -> bool:
+        """True if the certificate names a host, or one level above it by a wildcard (RFC 6125)."""
+        first, _, domain = host.partition(".")
+        return host in self.names or bool(first and domain and f"*.{domain}" in self.names)
 
 
 def server_certificate(name: str, folder: Path) -> ServerCertificate:
     """A self-signed certificate for a host name or address, made by `openssl` at the first call and
-    kept in a folder, so that a browser warns only once. Raises ExplainedError.
+    kept in a folder, so that a browser warns only once. Raises ExplainedError, also for a kept
+    certificate that does not name the host.
     """
     name = name.lower()
     if not re.fullmatch(r"[\w.:-]+", name, re.ASCII):
@@ -74,17 +83,39 @@ def server_certificate(name: str, folder: Path) -> ServerCertificate:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with whole(file) as part:
                 part.touch(mode=0o600)
-                part.write_bytes(_self_signed(name))
+                part.write_bytes(self_signed(name))
         context.load_cert_chain(file)
+        names = _names_in(file)
     except FileNotFoundError:
         raise ExplainedError("no program `openssl`, which makes the page's certificate: install it") from None
     except (OSError, subprocess.CalledProcessError) as error:  # an SSLError too
         words = error.stderr.decode().strip() if isinstance(error, subprocess.CalledProcessError) else in_words(error)
         raise ExplainedError(f"no certificate for {name} in {file}: {words}; delete the file for a new one") from None
-    return ServerCertificate(context, name)
+    found = ServerCertificate(context, name, names)
+    if not found.is_for(_same_address(name)):
+        raise ExplainedError(
+            f"--https {name}: the certificate in {file} is for {', '.join(names) or 'no host'}; one of these needed, "
+            "with any word for *; or delete the file for a new one"
+        )
+    return found
 
 
-def _self_signed(name: str) -> bytes:
+def _names_in(file: Path) -> tuple[str, ...]:
+    """The hosts and addresses that a certificate names."""
+    command = ["openssl", "x509", "-in", str(file), "-noout", "-ext", "subjectAltName"]
+    text = subprocess.run(command, check=True, capture_output=True).stdout.decode()
+    return tuple(map(_same_address, re.findall(r"(?:DNS|IP Address):([^,\s]+)", text)))
+
+
+def _same_address(name: str) -> str:
+    """A name in small letters, an address in its shortest form."""
+    try:
+        return str(ipaddress.ip_address(name))
+    except ValueError:
+        return name.lower()
+
+
+def self_signed(name: str) -> bytes:
     """A new key and its certificate for a host name or address, in PEM."""
     try:
         subject = f"IP:{ipaddress.ip_address(name)}"
@@ -212,7 +243,7 @@ class WebServer:
             name = (urlsplit(f"//{host}").hostname or "").lower()
             if not re.fullmatch(r"[\w.:\[\]-]+", host):
                 return True
-            if name in ("localhost", self._host) or (self._certificate and name == self._certificate.name):
+            if name in ("localhost", self._host) or (self._certificate and self._certificate.is_for(name)):
                 return False
             return not ipaddress.ip_address(name)
         except ValueError:

@@ -5,7 +5,6 @@ by an error that says where.
 from __future__ import annotations
 
 import base64
-import contextlib
 import json
 import math
 import re
@@ -210,7 +209,8 @@ COVARIANCE = cdr.encode_pose_with_covariance(
     messages.PoseWithCovarianceStamped(7, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 36)
 )
 TRANSFORMS = cdr.encode_transforms(7, [messages.Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))] * 3)
-OBJECT = messages.SceneObject("box", "box", "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (1.0,) * 3, (1.0,) * 4)
+BOX = messages.SceneObject("box", "box", "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (1.0,) * 3, (1.0,) * 4)
+OBJECTS = channels.OBJECTS.encode(7, [BOX])
 MESSAGES = [
     (POSE, cdr.decode_pose),
     (JOINTS, cdr.decode_joints),
@@ -220,62 +220,30 @@ MESSAGES = [
 
 
 # By the Python package of Cyclone DDS 11.0.1, final types, `serialize(use_version_2=True)`.
-CDR2 = [
-    (
-        "AAcAAAEAAAACAAAABQAAAGJhc2UAAAAAAAAAAAAA8D8AAAAAAAAAQAAAAAAAAAhAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA8D8=",
-        "AAYAAAAAAAEAAAACAAAABWJhc2UAAAAAP/AAAAAAAABAAAAAAAAAAEAIAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAP/AAAAAAAAA=",
-        cdr.decode_pose,
-        cdr.encode_pose(messages.PoseStamped(1_000_000_002, "base", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))),
-    ),
-    (
-        "AAcAAAEAAAACAAAABQAAAGJhc2UAAAAAFAAAAAIAAAACAAAAYQAAAAQAAABiY2QAAgAAAAAAAAAAAPA/AAAAAAAAAEAAAAAAAgAAAAAAAAAAAAhAAA"
-        "AAAAAAEEA=",
-        "AAYAAAAAAAEAAAACAAAABWJhc2UAAAAAAAAAFAAAAAIAAAACYQAAAAAAAARiY2QAAAAAAj/wAAAAAAAAQAAAAAAAAAAAAAAAAAAAAkAIAAAAAAAAQB"
-        "AAAAAAAAA=",
-        cdr.decode_joints,
-        cdr.encode_joints(messages.JointState(1_000_000_002, ("a", "bcd"), (1.0, 2.0), (), (3.0, 4.0), "base")),
-    ),
-    (
-        "AAcAALQAAAACAAAAAQAAAAIAAAAFAAAAYmFzZQAAAAAFAAAAdG9vbAAAAAAAAAAAAADwPwAAAAAAAABAAAAAAAAACEAAAAAAAAAAAAAAAAAAAAAAAA"
-        "AAAAAAAAAAAAAAAADwPwEAAAACAAAABQAAAGJhc2UAAAAABQAAAHRvb2wAAAAAAAAAAAAA8D8AAAAAAAAAQAAAAAAAAAhAAAAAAAAAAAAAAAAAAAAA"
-        "AAAAAAAAAAAAAAAAAAAA8D8=",
-        "AAYAAAAAALQAAAACAAAAAQAAAAIAAAAFYmFzZQAAAAAAAAAFdG9vbAAAAAA/8AAAAAAAAEAAAAAAAAAAQAgAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
-        "AAAAAAAAA/8AAAAAAAAAAAAAEAAAACAAAABWJhc2UAAAAAAAAABXRvb2wAAAAAP/AAAAAAAABAAAAAAAAAAEAIAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
-        "AAAAAAAAAAAAP/AAAAAAAAA=",
-        cdr.decode_transforms,
-        cdr.encode_transforms(
-            1_000_000_002, [messages.Transform("base", "tool", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))] * 2
-        ),
-    ),
-]
+CDR2 = {
+    b"\x07\x11": "AAcAAAEAAAACAAAABQAAAGJhc2UAAAAAFAAAAAIAAAACAAAAYQAAAAQAAABiY2QAAgAAAAAAAAAAAPA/AAAAAAAAAEA"
+    "AAAAAAgAAAAAAAAAAAAhAAAAAAAAAEEA=",
+    b"\x06\x10": "AAYAAAAAAAEAAAACAAAABWJhc2UAAAAAAAAAFAAAAAIAAAACYQAAAAAAAARiY2QAAAAAAj/wAAAAAAAAQAAAAAAAAAA"
+    "AAAAAAAAAAkAIAAAAAAAAQBAAAAAAAAA=",
+}
 
 
-@pytest.mark.parametrize(("little", "big", "decode", "plain"), CDR2)
-def test_cdr2_is_read_in_both_byte_orders_with_any_options(little: str, big: str, decode: Any, plain: bytes) -> None:
-    for data, numbers in ((base64.b64decode(little), b"\x07\x11"), (base64.b64decode(big), b"\x06\x10")):
-        for number in numbers:
-            for padding in range(4):
-                options = bytes([0xFF, 0xFC | padding])
-                assert decode(bytes([0, number]) + options + data[4:] + bytes(padding)) == decode(plain)
+@pytest.mark.parametrize("numbers", CDR2)
+def test_cdr2_is_read_in_both_byte_orders_with_any_options(numbers: bytes) -> None:
+    state = messages.JointState(1_000_000_002, ("a", "bcd"), (1.0, 2.0), (), (3.0, 4.0), "base")
+    data = base64.b64decode(CDR2[numbers])[4:]
+    for number in numbers:
+        for padding in range(4):
+            header = bytes([0, number, 0xFF, 0xFC | padding])
+            assert cdr.decode_joints(header + data + bytes(padding)) == state
 
 
-@pytest.mark.parametrize(
-    ("kind", "data", "decode"),
-    [
-        (channels.POSE.type, POSE, cdr.decode_pose),
-        (channels.JOINTS.type, JOINTS, cdr.decode_joints),
-        (channels.POSE_WITH_COVARIANCE.type, COVARIANCE, cdr.decode_pose_with_covariance),
-        (channels.TRANSFORMS.type, TRANSFORMS, cdr.decode_transforms),
-        (channels.OBJECTS.type, channels.OBJECTS.encode(7, [OBJECT] * 1), channels.OBJECTS.decode),
-        (channels.STRING.type, cdr.encode_string("tête"), cdr.decode_string),
-        (channels.BOOL.type, cdr.encode_bool(True), cdr.decode_bool),
-    ],
-)
-def test_messages_of_a_big_endian_machine_are_read(kind: str, data: bytes, decode: Any) -> None:
-    typestore = get_typestore(Stores.ROS2_JAZZY)  # of which a MarkerArray is that of the service
-    big = bytes(typestore.serialize_cdr(typestore.deserialize_cdr(data, kind), kind, little_endian=False))
-    assert big[:2] == b"\0\0"
-    assert decode(big) == decode(data)
+@pytest.mark.parametrize("codec", [channels.POSE, channels.JOINTS, channels.TRANSFORMS, channels.OBJECTS])
+def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec) -> None:
+    data = {channels.POSE: POSE, channels.JOINTS: JOINTS, channels.TRANSFORMS: TRANSFORMS}.get(codec) or OBJECTS
+    store = get_typestore(Stores.ROS2_JAZZY)  # its MarkerArray is that of the service
+    big = store.serialize_cdr(store.deserialize_cdr(data, codec.type), codec.type, little_endian=False)
+    assert codec.decode(bytes(big)) == codec.decode(data)
 
 
 @pytest.mark.parametrize(("data", "decode"), MESSAGES)
@@ -292,27 +260,15 @@ def test_a_message_may_be_padded_to_four_bytes_and_no_further(data: bytes, decod
         decode(data + bytes(4))
 
 
-@given(st.sampled_from(MESSAGES), st.data())
-def test_no_bytes_raise_anything_but_a_wire_error(message: Any, data: st.DataObject) -> None:
-    damaged = bytearray(message[0])
-    for place, value in data.draw(
-        st.lists(st.tuples(st.integers(0, len(damaged) - 1), st.integers(0, 255)), max_size=6)
-    ):
-        damaged[place] = value
-    with contextlib.suppress(messages.WireError):
-        message[1](bytes(damaged))
-
-
 @pytest.mark.parametrize(
     ("data", "error"),
     [
         (b"", "header missing; plain CDR or CDR2 needed"),
         (b"\0\1", "header 00 01; plain CDR or CDR2 needed"),
-        (b"\0\5\0\0" + POSE[4:], "header 00 05 00 00; plain CDR or CDR2 needed"),
-        *((bytes([0, i, 0, 0]) + POSE[4:], "encoding PL_CDR, header 00 0") for i in (2, 3)),
+        *((bytes([0, i]) + POSE[2:], "encoding PL_CDR, header 00 0") for i in (2, 3)),
         (b"\0\4\0\0<pose/>", "encoding XML, header 00 04 00 00; plain CDR or CDR2 needed"),
-        *((bytes([0, i, 0, 0]) + POSE[4:], "encoding DELIMITED_CDR2, header 00 ") for i in (8, 9, 0x14, 0x15)),
-        *((bytes([0, i, 0, 0]) + POSE[4:], "encoding PL_CDR2, header 00 ") for i in (0xA, 0xB, 0x12, 0x13)),
+        *((bytes([0, i]) + POSE[2:], "encoding DELIMITED_CDR2, header 00 ") for i in (8, 9, 0x14, 0x15)),
+        *((bytes([0, i]) + POSE[2:], "encoding PL_CDR2, header 00 ") for i in (0xA, 0xB, 0x12, 0x13)),
         (POSE[:12] + b"\xff\xff\xff\x7f" + POSE[16:], "a length of 2147483647 with "),
         (POSE[:16] + b"\xff\xfe\0\0\0" + POSE[21:], "a string that is not UTF-8"),
         (POSE[:-1], "bytes end before byte"),

@@ -114,12 +114,10 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
 def test_motive_is_read_with_time_codes_and_as_a_spreadsheet_saves_it(
     separator: str, time_code: str | None, take: Demonstration, tmp_path: Path
 ) -> None:
-    path = motive(tmp_path / "a.csv", take)
-    rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    if time_code is not None:
-        for row in rows[2:]:
-            row.insert(2, "TimeCode" if row[0] == "Frame" else time_code if row[0] else "")
-    lines = [separator.join(cell.replace(".", "," if separator == ";" else ".") for cell in row) for row in rows]
+    rows = list(csv.reader(motive(tmp_path / "a.csv", take).read_text(encoding="utf-8").splitlines()))
+    for row in rows[2:]:
+        row[2:2] = [] if time_code is None else ["TimeCode" if row[0] == "Frame" else time_code if row[0] else ""]
+    lines = [separator.join(row).replace(*(".," if separator == ";" else "..")) for row in rows]
     (tmp_path / "b.csv").write_text("\n".join(lines), encoding="utf-8")
     got, wanted = (read_demonstration(tmp_path / name, settings=CAPTURE) for name in ("b.csv", "a.csv"))
     np.testing.assert_array_equal(got.left, wanted.left)
@@ -202,9 +200,10 @@ def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demo
             read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
 
 
-@pytest.mark.parametrize(
-    "name", ["a.mcap", "a.csv", "a.c3d", "a.bag", "a.db3", "bag/a.db3", "a.npz", "a.urdf", "a.stl"]
-)
+POINTERS = ["a.mcap", "a.csv", "a.c3d", "a.bag", "a.db3", "bag/a.db3", "a.npz", "a.urdf", "a.stl"]
+
+
+@pytest.mark.parametrize("name", POINTERS)
 def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)

@@ -136,6 +136,14 @@ def test_what_cannot_be_done_is_refused_with_what_could():
         kmp.learn([], components=1, seed=0)
     with pytest.raises(ValueError, match=r"demonstrations\[1\] outputs: shape \(80, 3\) given, \(80, 2\) needed"):
         chosen([*one, (np.zeros((80, 2)), np.zeros((80, 3)))])
+    for scale, begin, words in (
+        (1e9, 1.76e18, "give seconds"),
+        (1.0, 1.76e18, "subtract"),
+        (1e-9, 0.0, "smaller unit"),
+    ):
+        times = begin + scale * np.linspace(0, 2, 80)[:, None]
+        with pytest.raises(ValueError, match=f"the inputs deviate by .*{words}"):
+            chosen([(times, outputs) for _, outputs in driven_by_hands(count=3)])
     with pytest.raises(ValueError, match="160 samples given for 1000 components"):
         chosen(driven_by_hands(count=2), components=1000)
     for name in ("lambda_mean", "lambda_covariance"):

@@ -7,10 +7,16 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from service.arms.rates import rates
 from service.core.arm.stage import Arm
+from service.settings.arm_description import completed
 from service.settings.config import load, parse, robot_description
 from service.settings.file_content import SettingsError
+from service.settings.robot_xml import readable
 from service.settings.urdf import Urdf, UrdfError, multiply
 from sim.scene import Scene
 from support.arms import MODELS, cell_of, toml_of, urdf_of
@@ -76,6 +82,33 @@ BARE = (
 )
 
 
+LIMITED = BARE.format("revolute").replace(
+    "</joint>",
+    '<limit lower="-2" upper="2" velocity="3" effort="1" acceleration="7" deceleration="5" jerk="9"/>'
+    '<safety_controller k_velocity="1" soft_lower_limit="-1" soft_upper_limit="1.5"/></joint>',
+)
+CHAIN = '<robot name="r"><link name="l0"/>{}</robot>'.format("".join(
+    f'<link name="{link}"/><joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="{link}"/></joint>'
+    for i, link in enumerate([*(f"l{i}" for i in range(1, 33)), "tool_plate"])
+)).replace("</joint>", '<limit velocity="1"/></joint>')  # fmt: skip
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1) | st.just((0, 1, 0, 1)))
+def test_quaternions_limits_and_rates_of_newer_urdfs_are_those_of_every_reader(quaternion: tuple[float, ...]) -> None:
+    turn = np.array(quaternion) / np.linalg.norm(quaternion)
+    origin = f'<origin xyz="1 0 0" quat_xyzw="{" ".join(map(repr, turn.tolist()))}"/><axis'
+    text = readable(LIMITED.replace("<axis", origin).encode())
+    assert "quat_xyzw" not in text
+    (joint,) = Urdf(text).movable("tool_plate")
+    assert abs(np.dot(joint.rotation, turn)) == pytest.approx(1.0, abs=1e-12)
+    placed = pin.buildModelFromXML(Urdf(text).kinematics(["a"])).jointPlacements[1].rotation
+    np.testing.assert_allclose(placed, Rotation.from_quat(turn).as_matrix(), atol=1e-8)
+    assert (joint.lower, joint.upper, joint.acceleration, joint.jerk) == (-1.0, 1.5, 5.0, 9.0)
+    assert rates(text, [joint])[:2] == ([5.0], [9.0])
+    given = completed({"arm": {"plate": "tool_plate", "posture": [0.0]}}, Urdf(text))["joints"]
+    assert (given["lower"], given["acceleration"], given["jerk"]) == ([-1.0], [5.0], [9.0])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -94,6 +127,20 @@ BARE = (
             BARE.format("continuous").replace("<axis", '<limit velocity="0"/><axis'),
             "joint 'a' has the velocity 0; above 0, up to 1000 rad/s, needed",
         ),
+        (URDF.replace("<robot ", '<robot version="2.0" '), "version '2.0'; 1, 1.0, 1.1, 1.2 accepted"),
+        (
+            BARE.format("fixed").replace("<axis", '<origin quaternion="0 0 0 1"/><axis'),
+            "<origin quaternion=...> is not",
+        ),
+        (LIMITED.replace('xyz="1 0 0"', 'xyz="1 0 0" frame="base"'), "cannot be read: <axis frame=...> is not read"),
+        (LIMITED.replace('jerk="9"', 'snap="9"'), "cannot be read: <limit snap=...> is not read; acceleration, "),
+        (LIMITED.replace('jerk="9"', 'jerk="-9"'), "has the acceleration 5 and the jerk -9; numbers above 0 needed"),
+        (LIMITED.replace('limit="1.5"', 'limit="high"'), "has <safety_controller soft_upper_limit='high'>; a number"),
+        (
+            LIMITED.replace("<axis", '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/><axis'),
+            "has rpy and quat_xyzw; one needed",
+        ),
+        (CHAIN, "33 joints move before link 'tool_plate'; up to 32 accepted"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_words(text: str, message: str) -> None:

@@ -20,6 +20,7 @@ import zenoh
 
 from service.client import Client, endpoints, open_session
 from service.contract import cdr
+from service.contract.explain import ExplainedError
 from service.contract.incidents import ORDERS
 from service.trackers import browser_hands, cell_view, web_server
 from service.trackers.cell_view import Latest, carried_out
@@ -54,6 +55,23 @@ def test_what_is_refused_is_answered_in_words(name: str) -> None:
             writer.close()
 
     with page_of_hands() as (page, _):
+        asyncio.run(scenario())
+
+
+def test_a_page_answers_to_all_names_of_its_certificate(tmp_path: Path) -> None:
+    (tmp_path / "a.pem").write_bytes(web_server.self_signed("*.Lab.example"))
+    with pytest.raises(ExplainedError, match=r"--https a: the certificate in .* is for \*.lab.example; one of"):
+        server_certificate("a", tmp_path)
+    (tmp_path / "a.pem").rename(tmp_path / "cell.lab.example.pem")
+    certificate = server_certificate("cell.lab.example", tmp_path)
+
+    async def scenario() -> None:
+        async with serving_page(page) as at, aiohttp.ClientSession() as session:
+            for host in ("x.LAB.example", "lab.example", "x.y.lab.example", "other"):
+                answer = await session.get(f"https://{at}/", headers={"Host": host}, ssl=False)
+                assert (FOREIGN in await answer.text()) == (host != "x.LAB.example"), host
+
+    with page_of_hands(certificate=certificate) as (page, _):
         asyncio.run(scenario())
 
 
