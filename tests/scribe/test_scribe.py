@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from service.contract.images import CompressedImage, encode_image
@@ -24,7 +25,8 @@ from service.core.frame import Event, Tick, encode
 from service.files.recording import Recording
 from service.process import child
 from service.process.child import Child, Progress
-from service.scribe.protocol import pack, unpack
+from service.scribe.process import ScribeProcess
+from service.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, unpack
 from service.scribe.scribe import Scribe
 from service.settings.config import RecordingSettings, Settings
 from support.pictures import grey
@@ -213,6 +215,50 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
     assert [step.tick for step in rest] == list(range(start.tick + 1, told))
 
 
+def test_ticks_are_reported_with_the_write_that_has_them_on_disk(tmp_path: Path) -> None:
+    """A scribe that is killed while it catches up has lost only ticks that are not in its file."""
+    ours, source = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    setup = ScribeSetup(SETTINGS, state_after(-1).tobytes(), str(tmp_path), None, None, 1)
+    with ours, source:
+        process = ScribeProcess(setup, SKILL, source)
+        (path,) = tmp_path.glob("*.mcap")
+        sizes_bytes = {path.stat().st_size}
+        for count, (tick, frame, timing) in enumerate(ticks(2000), 1):
+            skills = [event.payload for event in tick.inbox if event.kind == "skill"]
+            process.take(pack(tick, frame, timing, state=None, lost=0, with_skill=False), skills)
+            if (size_bytes := path.stat().st_size) in sizes_bytes:
+                continue
+            sizes_bytes.add(size_bytes)
+            with suppress(BlockingIOError):
+                while True:
+                    report = msgspec.json.decode(ours.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT), type=ScribeReport)
+            assert report.kept == count
+        assert len(sizes_bytes) > 5
+        process.close()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("is_killed", [True, False])
+def test_the_ticks_lost_at_the_end_of_a_scribe_that_is_behind_are_those_not_on_disk(
+    tmp_path: Path, is_killed: bool
+) -> None:
+    """Thousands of ticks wait, and more reports come than the socket holds unless they are read.
+    One chunk may be on disk whose report a kill prevents.
+    """
+    count, chunk = 12_000, 60
+    with scribe(msgspec.structs.replace(SETTINGS, rate_hz=1000), folder=tmp_path) as one:
+        tell(one, count)
+        (path,) = tmp_path.glob("*.mcap")
+        until(lambda: path.stat().st_size > 1_000_000)
+        if is_killed:
+            os.kill(one.status()["pid"], signal.SIGKILL)
+        words = one.close(60)
+    kept = sum(step.frame is not None for step in Recording.open(path).steps())
+    assert (kept < count) is is_killed
+    lost = int(words.split()[0]) if words else 0
+    assert count - kept <= lost <= count - kept + chunk * is_killed
+
+
 SLOW = """
 import socket, time
 def run(channel):
@@ -337,7 +383,7 @@ def _is_dead(pid: int) -> bool:
 def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(tmp_path: Path, place: str) -> None:
     with scribe(recording=Path(place), live_port=0) as one:
         tell(one, 100)
-        until(lambda: one.supervise() or one.status()["live"] is not None)
+        until(lambda: one.supervise() or one.status()["live"])
         status = one.status()
     assert any(place in error and ("No space left" in error or "File exists" in error) for error in status["errors"])
     assert status["recording"] is None
