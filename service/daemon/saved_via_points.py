@@ -25,7 +25,6 @@ from service.learning.skill_file import SkillError
 from service.settings.config import Settings, robot_description
 from service.settings.file_content import UnusableError
 from service.settings.urdf import Urdf
-from service.settings.whole_file import whole
 
 log = logging.getLogger("thirdhand")
 Made = TypeVar("Made")
@@ -129,14 +128,18 @@ class SavedViaPoints:
 
     @contextlib.contextmanager
     def _replacing(self, path: Path, content: bytes) -> Iterator[None]:
-        with contextlib.ExitStack() as replacement:
+        part = path.with_suffix(".new")
+        try:
             try:
                 self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-                part = replacement.enter_context(whole(path))
-                with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
             except OSError as error:
                 raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
             yield
+            part.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink()

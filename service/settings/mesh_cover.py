@@ -9,7 +9,7 @@ import functools
 import hashlib
 import io
 import math
-import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from service.contract.explain import in_words
 from service.settings.urdf import COVER, UrdfError
-from service.settings.user_folder import user_folder
 
 Points = NDArray[np.float64]
 END_DIGITS = 4  # a capsule's ends are rounded to 0.1 mm, and its radius is enlarged by 0.1 mm
 MIN_AXIS2_M2 = 1e-12  # added to a squared length, so that an axis of length 0 divides nothing by 0
+CAPSULE_CACHE = Path("~/.cache/thirdhand/capsules")  # files are named by a digest of mesh and scale
 EVALUATIONS = 100  # the cost is evaluated this often for each principal axis
 SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))  # first steps: two tilts, two offsets / size
 RADII = np.linspace(1.0, 1.5, 12)  # tried radii / smallest radius that holds all points
@@ -160,15 +160,12 @@ def _unit_m(collada: bytes) -> float:
     return 1.0
 
 
-def _cache() -> Path:
-    """The folder of capsules, whose files are named by a digest of mesh and scale."""
-    return user_folder("cache") / "capsules"
-
-
 def _kept(name: str) -> tuple[float, ...] | None:
     """A cached capsule; None if there is no such file, or it does not hold a capsule."""
-    with contextlib.suppress(OSError, ValueError):
-        found = tuple(float(number) for number in (_cache() / name).read_text(encoding="ascii").split())
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
+        found = tuple(
+            float(number) for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()
+        )
         if len(found) == 7 and all(map(math.isfinite, found)) and found[6] > 0.0:
             return found
     return None
@@ -176,15 +173,13 @@ def _kept(name: str) -> tuple[float, ...] | None:
 
 def _keep(name: str, capsule: tuple[float, ...]) -> None:
     """Cache a capsule. If the folder is not writable, it is computed again each time."""
-    with contextlib.suppress(OSError):
-        folder = _cache()
+    with contextlib.suppress(OSError, RuntimeError):
+        folder = CAPSULE_CACHE.expanduser()
         folder.mkdir(parents=True, exist_ok=True)
-        part = folder / f"{name}.{os.getpid()}"
-        try:
-            part.write_text(" ".join(map(repr, map(float, capsule))), encoding="ascii")
-            part.replace(folder / name)
-        finally:
-            part.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as part:
+            file = Path(part, name)
+            file.write_text(" ".join(map(repr, map(float, capsule))), encoding="ascii")
+            file.replace(folder / name)
 
 
 def capsule_around(points: Points) -> tuple[float, ...]:

@@ -88,7 +88,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedVia
 def test_a_disk_that_takes_nothing_is_left_with_no_part_of_a_file(
     saved: SavedViaPoints, skill: Skill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
     taught = adapted(skill, POINTS, tolerance=0.03)
     keep(saved, taught)
     before = [path for path in tmp_path.rglob("*") if path.is_file()]
