@@ -25,8 +25,7 @@ from service.core.frame import Event, Tick, encode
 from service.files.recording import Recording
 from service.process import child
 from service.process.child import Child, Progress
-from service.scribe.process import ScribeProcess
-from service.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, unpack
+from service.scribe.protocol import pack, unpack
 from service.scribe.scribe import Scribe
 from service.settings.config import RecordingSettings, Settings
 from support.pictures import grey
@@ -213,28 +212,6 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
     assert kept == list(range(100))
     assert start.lost == start.tick - 100 == status["lost"]
     assert [step.tick for step in rest] == list(range(start.tick + 1, told))
-
-
-def test_ticks_are_reported_with_the_write_that_has_them_on_disk(tmp_path: Path) -> None:
-    """A scribe that is killed while it catches up has lost only ticks that are not in its file."""
-    ours, source = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    setup = ScribeSetup(SETTINGS, state_after(-1).tobytes(), str(tmp_path), None, None, 1)
-    with ours, source:
-        process = ScribeProcess(setup, SKILL, source)
-        (path,) = tmp_path.glob("*.mcap")
-        sizes_bytes = {path.stat().st_size}
-        for count, (tick, frame, timing) in enumerate(ticks(2000), 1):
-            skills = [event.payload for event in tick.inbox if event.kind == "skill"]
-            process.take(pack(tick, frame, timing, state=None, lost=0, with_skill=False), skills)
-            if (size_bytes := path.stat().st_size) in sizes_bytes:
-                continue
-            sizes_bytes.add(size_bytes)
-            with suppress(BlockingIOError):
-                while True:
-                    report = msgspec.json.decode(ours.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT), type=ScribeReport)
-            assert report.kept == count
-        assert len(sizes_bytes) > 5
-        process.close()
 
 
 @pytest.mark.thorough
