@@ -13,6 +13,7 @@ author = copyright = "the thirdhand authors"  # noqa: A001  (Sphinx calls it so)
 extensions = ["myst_parser"]
 source_suffix = {".md": "markdown"}
 myst_heading_anchors = 3
+smartquotes_action = "qe"  # quotes and ellipses; dashes would change the names of options
 html_theme = "furo"
 html_title = "thirdhand"
 html_show_sphinx = False

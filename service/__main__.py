@@ -11,7 +11,7 @@ from service.process import one_blas_thread  # noqa: F401
 # isort: split
 import sys
 
-from service.process import interrupt
+from service.process import interrupt, output
 
 __all__ = ["main"]
 
@@ -19,6 +19,7 @@ __all__ = ["main"]
 def main() -> int:
     """The exit code of the command that the command line names."""
     interrupt.watch()
+    output.accept_all_characters()
     from service.cli.main import main as run  # takes a while, and may be interrupted
 
     code = run()

@@ -22,7 +22,7 @@ from service.contract.explain import in_words
 from service.contract.printable import printable_lines
 from service.daemon.launch import ENGINES, LaunchError, engine_of
 from service.files.shipped import ARMS, cell_of
-from service.process import interrupt
+from service.process import interrupt, output
 from service.settings.file_content import SettingsError, UnreadableError
 from sim.scene import Scene, SceneError
 from sim.script import Clock, HandScript, ScriptPause
@@ -114,6 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
     from sim.engines import world_of
     from sim.network import BenchError, Dropout, Live, RunReport, run
     from sim.observed_world import ObservedWorld
+    from sim.parts import before_others
     from sim.tracked_hands import TrackedHands
 
     world = ObservedWorld if args.hands_only else world_of(args.engine)
@@ -168,6 +169,7 @@ def main(arguments: list[str] | None = None) -> int:
             script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
+        before_others()
         own = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
         session = own or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -187,4 +189,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 if __name__ == "__main__":
     interrupt.watch()
+    output.accept_all_characters()
     sys.exit(main())

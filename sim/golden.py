@@ -32,6 +32,7 @@ from service.files.steps import checksum
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.via_points import adapted
 from service.settings.config import Settings, robot_description
+from service.settings.whole_file import whole
 from sim.bench import Bench
 from sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from sim.scene import Scene
@@ -180,9 +181,8 @@ def refresh(path: Path) -> dict[str, float]:
         before = [step.frame for step in old.steps(whole=False) if step.frame is not None]
     except RecordingError:  # frames or states had another layout, and cannot be compared
         before = []
-    beside = path.with_suffix(".new")
-    frames = record(beside, old.settings, decoded(old.skill, origin=str(path)), ticks(old))
-    beside.replace(path)
+    with whole(path) as part:
+        frames = record(part, old.settings, decoded(old.skill, origin=str(path)), ticks(old))
     now = {int(frame["tick"]): frame for frame in frames}
     checksums = Recording.open(path).checksums
     changed = sum(checksums.get(tick) != was for tick, was in old.checksums.items())

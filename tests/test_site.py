@@ -208,4 +208,6 @@ def test_a_site_is_built_of_all_pages_without_a_warning(tmp_path: Path) -> None:
     front = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     for page in DOCS.glob("*.md"):
         assert (tmp_path / "site" / f"{page.stem}.html").exists()
+        html = (tmp_path / "site" / f"{page.stem}.html").read_text(encoding="utf-8")
+        assert not re.search("[\u2013\u2014](json|mouse|web|output|each|live|[a-z]+-[a-z]+)\\b", html), page  # options
         assert f'href="{page.stem}.html"' in front or page.stem == "index", f"{page.stem} is not in the navigation"

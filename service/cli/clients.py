@@ -15,6 +15,9 @@ from service.client import Client
 from service.contract.incidents import in_brief, what_to_do
 from service.contract.records import SIDES
 from service.contract.requests import Correction
+from service.process.progress import progress
+
+WAITING = "waiting for the daemon's answer"
 
 
 def via_points(args: argparse.Namespace) -> int:
@@ -24,7 +27,7 @@ def via_points(args: argparse.Namespace) -> int:
         request["names"] = args.names
     elif args.action == "add":
         request = _add(args)
-    with reached(args) as session:
+    with reached(args) as session, progress(WAITING):
         client = Client(session, args.cell)
         before = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
         reply = client.ask("via_points", request)
@@ -111,5 +114,5 @@ resume = reset = hold
 
 def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
     """The reply to a request as received. Raises UnreachableError, RefusedError."""
-    with reached(args) as session:
+    with reached(args) as session, progress(WAITING):
         return Client(session, args.cell).ask(suffix, request)

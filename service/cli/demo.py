@@ -21,7 +21,7 @@ import zenoh
 from service.cli.hands import invite
 from service.cli.usage import UsageError
 from service.cli.web_address import page_served, web_address
-from service.client import Client, Tracker, no_room_to_brake, open_session
+from service.client import Client, Tracker, UnreachableError, no_room_to_brake, open_session
 from service.contract.explain import ExplainedError, in_words
 from service.contract.requests import Add, Status, decode_request
 from service.daemon.launch import engine_of, launched, played
@@ -37,7 +37,7 @@ DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
 DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
 TOO_BUSY = "too-busy"  # folder in --output of what such attempts recorded
-MOUSE_RATE_HZ = 100  # at 500 Hz, a browser that draws without a GPU leaves two cores too little for the arm
+SLOW_RATE_HZ = 100  # at 500 Hz, a browser without a GPU, or a compiler, leaves two cores too little for the arm
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
@@ -62,15 +62,26 @@ def demo(args: argparse.Namespace) -> int:
     if args.open and args.mouse is None:
         raise UsageError("--open opens the page of --mouse; --mouse needed with it")
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
-    rate_hz = MOUSE_RATE_HZ if page and args.rate is None and args.arm in ARMS else args.rate
+    busy_rate_hz = SLOW_RATE_HZ if args.rate is None and args.arm in ARMS else args.rate
+    rate_hz = busy_rate_hz if page else args.rate
     for left in reversed(range(DEMO_ATTEMPTS)):
-        report = run(args, rate_hz, page)
-        if page or report["success"] or report["missing"] or not report["busy"] or not left:
-            break
-        say(f"the task failed on a machine that was too busy, {report['busy']}: it is tried again")
+        before = set(args.output.glob("*.mcap"))
+        try:
+            report = run(args, rate_hz, page)
+        except UnreachableError as error:
+            if page or not left:
+                raise
+            reason = in_words(error)
+        else:
+            if page or report["success"] or report["missing"] or not report["busy"] or not left:
+                break
+            reason = f"the task failed on a machine that was too busy, {report['busy']}"
+        rate_hz = busy_rate_hz
+        say(f"{reason}: it is tried again" + f" at {rate_hz} Hz" * (rate_hz is not None))
         aside = args.output / TOO_BUSY
         aside.mkdir(exist_ok=True)
-        shutil.move(report["recording"], aside)
+        for recording in set(args.output.glob("*.mcap")) - before:
+            shutil.move(recording, aside)
     report["rrd"] = _drawn(Path(report["recording"]))
     print(json.dumps(report, indent=2) if args.json else text(report))
     return exit_code(report)

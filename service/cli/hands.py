@@ -9,7 +9,6 @@ import re
 import secrets
 import string
 import webbrowser
-from pathlib import Path
 
 from service.cli.usage import UsageError, reached
 from service.cli.web_address import serve_page, web_address
@@ -17,6 +16,7 @@ from service.client import Client, Tracker
 from service.contract.explain import ExplainedError, in_words
 from service.process.progress import say
 from service.settings.network import is_local
+from service.settings.user_folder import user_folder
 from service.trackers.cell_view import Latest
 from service.trackers.hands_page import HandsPage, HeadsetPage
 from service.trackers.mouse_page import MousePage
@@ -24,8 +24,7 @@ from service.trackers.pinch import Pinches
 from service.trackers.web_server import Address, server_certificate
 
 ORDER_TIMEOUT_S = 5.0  # a page waits for the answer to its order for this long
-STATE = Path("~/.local/state/thirdhand")  # the user's files of pages
-TOKEN_FILE = STATE / "page-token"  # kept over restarts: open pages then connect again
+TOKEN_FILE = "page-token"  # in the user's folder: open pages connect again after a restart
 TOKEN_LETTERS = string.ascii_lowercase + string.digits
 TOKEN_LENGTH = 12  # 62 bits, and few enough to type on a headset
 
@@ -52,7 +51,7 @@ def _camera(args: argparse.Namespace) -> int:
 
 def _web(args: argparse.Namespace) -> int:
     listen = web_address("--listen", args.listen)
-    certificate = server_certificate(args.https, STATE.expanduser()) if args.https else None
+    certificate = server_certificate(args.https, user_folder("state")) if args.https else None
     if certificate is None and args.web and not is_local(f"tcp/{listen}"):
         raise UsageError(
             f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: --https NAME with the "
@@ -103,14 +102,14 @@ def _token() -> str:
     """The token of this user's pages, from a private file; a new one if that cannot be kept."""
     new = "".join(secrets.choice(TOKEN_LETTERS) for _ in range(TOKEN_LENGTH))
     try:
-        path = TOKEN_FILE.expanduser()
+        path = user_folder("state") / TOKEN_FILE
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             private = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with open(private, "w", encoding="utf-8") as file:
                 file.write(new)
         found = path.read_text(encoding="utf-8").strip()
-    except (OSError, RuntimeError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         say(f"the token of this start is not kept ({in_words(error)}): open pages need the new address")
         return new
     if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", found):

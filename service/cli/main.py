@@ -21,7 +21,7 @@ from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.records import SIDES
 from service.contract.requests import TOLERANCE_M, ViaPoint
 from service.learning.residual_risk import OPTION
-from service.process import interrupt
+from service.process import foreign_modules, interrupt
 from service.process.progress import say
 from service.settings.file_content import SettingsError, UnreadableError
 
@@ -436,9 +436,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if "reaches" in args and not vars(args).get("config"):
             args.cell = reaching(args).cell
-        run = getattr(importlib.import_module(f"service.{module}"), function)
-        with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
-            return int(run(args))
+        with foreign_modules.named():
+            run = getattr(importlib.import_module(f"service.{module}"), function)
+            with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
+                return int(run(args))
     except (UsageError, SettingsError) as error:
         say(f"thirdhand {args.command}: {in_file(str(error))}")
         return 1 if isinstance(error, UnreadableError) else 2

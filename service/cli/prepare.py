@@ -12,7 +12,7 @@ from service.settings.config import Settings
 
 
 def prepare(args: argparse.Namespace) -> int:
-    """Compile and cache the functions of a cell's loop; exit code 0. Raises SkillError."""
+    """Compile and cache the functions of a cell; exit code 0. Raises SkillError."""
     settings = settings_of(args)
     print(compiled_for(settings, skill_path(settings, args)), flush=True)
     return 0
@@ -23,7 +23,7 @@ def compiled_for(settings: Settings, skill: Path) -> str:
     begun_s, joints = time.monotonic(), len(settings.joints.names)
     compiled: set[str] = set()
     with progress(f"compiling for an arm with {joints} joints, a minute or more", unit="functions") as show:
-        from service.daemon.compilation import compile_loop  # slow imports
+        from service.daemon.compilation import compile_cell  # slow imports
         from service.daemon.skill_worker import skill_of
 
         def report(function: str, is_ready: bool) -> None:
@@ -31,5 +31,5 @@ def compiled_for(settings: Settings, skill: Path) -> str:
             show(len(compiled))
 
         skill_of(skill)  # raises what is wrong with it
-        compile_loop(settings, skill, report)
+        compile_cell(settings, skill, report)
     return f"{joints} joints: {len(compiled)} functions compiled in {time.monotonic() - begun_s:.0f} s"

@@ -19,7 +19,7 @@ from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import CLEAR, printable_lines
 from service.daemon.start import starting
 from service.files.shipped import cell_of, skill_file
-from service.process import child
+from service.process import child, foreign_modules
 from service.process.priority import ahead_of_others
 from service.settings.config import Settings, converted
 from service.settings.file_content import SettingsError, UnreadableError
@@ -37,7 +37,8 @@ def serve(args: argparse.Namespace) -> int:
     handler.setFormatter(JsonFormatter() if args.log == "json" else PrintableFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
-        return _run(args)
+        with foreign_modules.named():
+            return _run(args)
     except Exception as error:
         if args.log != "json":
             raise

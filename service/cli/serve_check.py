@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import errno
+import importlib
 import os
+import platform
 import shutil
 import socket
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from service.contract.channels import tcp_address
 from service.contract.explain import ExplainedError, in_file, in_words
 from service.contract.printable import printable
 from service.daemon.single_instance import allow_descriptors, holder_of, state_folder
-from service.process import bytecode
+from service.process import bytecode, foreign_modules
 from service.scribe.paths import MB, existing_folder
 from service.settings.config import Files, Settings, robot_description, urdf_path
 from service.settings.network import Network, is_local
@@ -38,7 +40,7 @@ def check(args: argparse.Namespace) -> int:
     def is_met(what: str, examine: Callable[..., str], *given: Any) -> bool:
         try:
             level, text = "ok", examine(*given)
-        except (ExplainedError, OSError, ValueError) as error:
+        except (ExplainedError, ImportError, OSError, ValueError) as error:
             level, text = "wrong", "; ".join(in_file(in_words(error)).splitlines())
         print(f"{level:<5}  {what:<14} {printable(text)}", flush=True)
         return level == "ok"
@@ -47,9 +49,10 @@ def check(args: argparse.Namespace) -> int:
         return 1
     files, network, live = settings.files, settings.network, [f"tcp/127.0.0.1:{args.live}"] * bool(args.live)
     conditions: list[tuple[Any, ...]] = [
+        ("imports", _imports),
         ("arm", _arm, settings),
         ("skill", _skill, settings, skill_path(settings, args)),
-        ("state", _folder, state_folder(settings)),
+        ("state", lambda: _folder(state_folder(settings))),
         ("descriptors", lambda: f"{allow_descriptors()} open files"),
         *[("recordings", _folder, Path(files.record)), ("disk", _disk, files)] * bool(files.record),
         *[("certificates", _certificates, network)] * bool(network.certificate or network.zenoh_config),
@@ -60,6 +63,13 @@ def check(args: argparse.Namespace) -> int:
     if uncompiled := bytecode.missing():
         print(f"note   {'bytecode':<14} {printable(uncompiled)}", flush=True)
     return int(is_wrong)
+
+
+def _imports() -> str:
+    """Import what a start imports."""
+    with foreign_modules.named():
+        importlib.import_module("service.daemon.daemon")
+    return f"Python {platform.python_version()} has all that a daemon imports"
 
 
 def _arm(settings: Settings) -> str:

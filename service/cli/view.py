@@ -52,16 +52,14 @@ BAR_TINT = 40  # maximum difference of colour channels in the grey title bar
 NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
 FRESH_S = 1.0  # the age of a live view's picture is printed if it is larger
 FRESH_TIMEOUT_S = 10.0
+STARTING_POLL_S = 0.2
 
 
 def view(args: argparse.Namespace) -> int:
     """Show files or a live view; the viewer's exit code, or 0 once a picture is written."""
     check_usage(args)
     if args.files == ["live"]:
-        now = ask(args, "status")
-        say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
-        if not (url := now["scribe"].get("live")):
-            raise UsageError("this daemon serves no live view; start it with --live PORT")
+        url = _live(args)
         return _serve(args, url) if args.web is not None else _show([url], args)
     paths = [Path(name) for name in args.files]
     kinds = [_kind(path) for path in paths]
@@ -74,10 +72,28 @@ def view(args: argparse.Namespace) -> int:
         for i, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
             drawings.append(str(path))
             if kind != RRD_MAGIC:
-                drawings[i] = str(Path(folder) / str(i) / f"{path.stem}.rrd")
+                own_folder = Path(folder, str(i))
+                own_folder.mkdir()
+                drawings[i] = str(own_folder / f"{path.stem}.rrd")
                 with progress(f"drawing {path.name}", total=Recording.open(path).ticks()) as done:
                     convert(path, drawings[i], say=say, progress=done)
         return _show(drawings, args)
+
+
+def _live(args: argparse.Namespace) -> str:
+    """The address of a daemon's live view, which is waited for while it starts. Raises UsageError
+    for a daemon without one.
+    """
+    now = ask(args, "status")
+    say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
+    with progress("the live view is starting"):
+        while now["scribe"].get("live") == "":
+            clock.sleep(STARTING_POLL_S)
+            now = ask(args, "status")
+    if url := now["scribe"].get("live"):
+        return str(url)
+    errors = "; ".join(error for error in now["scribe"]["errors"] if "live view" in error)
+    raise UsageError(errors or "this daemon serves no live view; start it with --live PORT")
 
 
 def _kind(path: Path) -> bytes:

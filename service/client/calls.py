@@ -22,7 +22,7 @@ from service.client.session import (
 from service.contract import channels, requests
 from service.contract.messages import Vector3
 from service.contract.printable import printable_lines
-from service.contract.requests import Reply, Status, ViaPoint, ViaPointInForce
+from service.contract.requests import ANSWER_TIMEOUT_S, Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
 QUERIES = 2  # queries within the time of one request, if it may be repeated
@@ -43,7 +43,7 @@ class Client:
     UncertainError, a subclass of UnreachableError: they may have been carried out.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from service.client.session import open_session
 from service.contract.channels import ENDPOINT, CellName, lacking
 from service.contract.explain import InvalidError, in_words, validated
 from service.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
+from service.settings.user_folder import HomelessError, user_folder
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
 
@@ -88,12 +90,10 @@ def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
 
 def _file() -> Path | None:
     """The client's file, if there is one."""
-    try:
-        folder = Path(os.environ.get("XDG_CONFIG_HOME") or "").expanduser()
-        path = (folder if folder.is_absolute() else Path.home() / ".config") / "thirdhand" / "client.toml"
-    except RuntimeError:  # the user has no home folder
-        return None
-    return path if path.exists() else None
+    with contextlib.suppress(HomelessError):
+        path = user_folder("config") / "client.toml"
+        return path if path.exists() else None
+    return None
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from service.client.streams import (
 )
 from service.contract import cdr, markers
 from service.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
-from service.contract.requests import NORM_TOLERANCE, Reply, ViaPoint
+from service.contract.requests import ANSWER_TIMEOUT_S, NORM_TOLERANCE, Reply, ViaPoint
 
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
 FORMS = {  # by the largest count of numbers
@@ -68,7 +68,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
     would reject, and UnreachableError if nobody listens.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = 30.0) -> None:
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
         super().__init__(session, cell, timeout_s=timeout_s)
         self._publishers: dict[str, zenoh.Publisher] = {}
 

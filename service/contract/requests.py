@@ -15,6 +15,7 @@ from service.contract.records import GONE_S, SIDES
 
 _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 _NO_NAME = {"accepted": "a name of up to 64 letters, digits, spaces and . _ -"}
+ANSWER_TIMEOUT_S = 30.0  # every request is answered within this time of its arrival
 STARTING = "starting: "  # begins every answer of a daemon that is not ready yet
 NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
 MAX_REACH_M = 0.4  # hands farther away than this are not examined for the reach of a correction

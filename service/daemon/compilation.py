@@ -1,5 +1,5 @@
-"""Compilation of the loop's functions by two processes. The compiler's memory, 600 MB, ends with
-them.
+"""Compilation of the functions of a cell by two processes: of its loop, its requests, and the
+commands beside it. The compiler's memory, 600 MB, ends with them.
 """
 
 from __future__ import annotations
@@ -12,10 +12,14 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from numba.core import event
 
+from service.arms.playback import Playback
 from service.core.warm_up import rehearse_intake, rehearse_motion, warm_up
-from service.daemon.skill_worker import skill_of
+from service.daemon.skill_worker import has_posture_of, skill_of
+from service.learning import rehearsal
+from service.learning.reach import beyond_m
 from service.process import child
 from service.process.priority import ahead_of_others
 from service.settings.config import Settings, robot_description
@@ -51,8 +55,8 @@ def _name(event: event.Event) -> str:
     return f"{function.__module__}.{function.__name__}"
 
 
-def compile_loop(settings: Settings, skill: Path, report: Callable[[str, bool], object]) -> None:
-    """Compile what the loop of a cell calls with the skill in a file, and wait for it.
+def compile_cell(settings: Settings, skill: Path, report: Callable[[str, bool], object]) -> None:
+    """Compile what a cell calls with the skill in a file, and wait for it.
 
     `report(function, is_ready)` is called where a compilation begins and where it ends. What a
     process that fails has not compiled is compiled by whoever calls it.
@@ -88,7 +92,8 @@ def _received(channel: socket.socket) -> str:
 
 def run(channel: socket.socket) -> None:
     """Compile in a child: the first compiles the intake, the second the motion of the arm, which
-    each take a third of the time; then the first compiles the rest.
+    each take a third of the time; then the first compiles the rest of the loop, and the second what
+    is called beside it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     child.end_with_parent()
@@ -105,3 +110,13 @@ def run(channel: socket.socket) -> None:
             warm_up(settings, skill_of(skill).for_loop(), urdf=urdf)
         else:
             rehearse_motion(settings, urdf)
+            rehearsal.rehearse()
+            _rehearse_beside(settings, skill)
+
+
+def _rehearse_beside(settings: Settings, path: Path) -> None:
+    """Call what the start, requests and an arm's driver call and the loop does not."""
+    skill, posture = skill_of(path), np.array(settings.arm.posture)
+    has_posture_of(settings, posture, skill.tool_positions[0], skill.orientation, skill.hands[0].reshape(2, 3))
+    beyond_m(settings, skill.tool_positions[:1])
+    Playback(settings.joints, posture, period_s=settings.period_s)

@@ -38,10 +38,11 @@ from service.daemon.clock import (
     ask_for_real_time,
     run_beside_real_time,
 )
-from service.daemon.compilation import NotCompiledError, compile_loop
+from service.daemon.compilation import NotCompiledError, compile_cell
 from service.daemon.input_monitor import InputMonitor
 from service.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from service.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
+from service.daemon.own_answers import OwnAnswers
 from service.daemon.queryables import Queryables
 from service.daemon.saved_stage import SavedStage
 from service.daemon.saved_via_points import SavedViaPoints
@@ -128,6 +129,8 @@ class Daemon:
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
         self._start, self._is_open = start, False
+        is_watched = start.systemd.ping_every_s and self.endpoints
+        self._own_answers = OwnAnswers(settings, self.endpoints[0]) if is_watched else None
         self._queryables = Queryables(
             settings,
             stored,
@@ -185,6 +188,8 @@ class Daemon:
             self._start.systemd.notify("STOPPING=1", "STATUS=closing its files")
             gc.unfreeze()
             self._status.close()
+            if self._own_answers is not None:
+                self._own_answers.close()
             if reporter is not None:
                 reporter.join(2)
             self._queryables.close()
@@ -312,6 +317,8 @@ class Daemon:
                 self._queryables.open(self._session)
                 announce(self)
                 self._start.systemd.notify("READY=1")
+                if self._own_answers is not None:
+                    supervised_thread.start("thread of own requests", self._own_answers.ask, self.note)
 
     def _report(self, announce: Callable[[Daemon], None]) -> None:
         """Publish the status, log changes, and supervise the scribe ten times a second. A status is
@@ -337,7 +344,8 @@ class Daemon:
             except OSError as error:
                 errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
-            self._start.systemd.progressed(status.tick)
+            if self._own_answers is None or not self._own_answers.is_deaf():
+                self._start.systemd.progressed(status.tick)
             self._clock.between_ticks()
             if is_due:
                 due_s = time.monotonic() + STATUS_S
@@ -490,7 +498,7 @@ def serve(
                     skill = rehearsed(settings, skill_path, start)
             except NotCompiledError:
                 start.stage("compilation")
-                compile_loop(settings, skill_path, start.note)
+                compile_cell(settings, skill_path, start.note)
                 with start.counting(may_compile=True):
                     skill = rehearsed(settings, skill_path, start)
         start.stage("loop")

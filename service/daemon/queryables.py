@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -67,7 +68,17 @@ TOGETHER = (*ORDER_KEYS, "status")  # all waiting requests on one of these keys 
 COMPUTED = "teaching"  # name of the queue of requests for which the skill worker computes
 
 
-Received = tuple[str, zenoh.Query, int]  # a key, the query on it, the number of holds that were received until then
+class Received(NamedTuple):
+    """A query on a key, the number of holds that were received until then, and its arrival
+    (time.monotonic() [s]).
+    """
+
+    suffix: str
+    query: zenoh.Query
+    holds: int
+    received_s: float
+
+
 Order = Callable[[str, str], Reply | RequestError]  # executes hold, resume or reset, by the one of a name
 
 
@@ -97,10 +108,9 @@ class RequestQueue:
         try:
             self._waiting.put_nowait(request)
         except queue.Full:
-            _, query, _ = request
-            with query:
+            with request.query:
                 refusal = f"busy: {self._most} {self._name} requests are waiting; try again later"
-                query.reply_err(refusal.encode(), encoding=TEXT)
+                request.query.reply_err(refusal.encode(), encoding=TEXT)
 
     def close(self) -> None:
         """Answer the waiting requests and end the thread."""
@@ -187,7 +197,7 @@ class Queryables:
                     local.is_prioritised = True
                     run_beside_real_time()
                 self.inbox.holds_received += suffix == "hold"
-                request = suffix, query, self.inbox.holds_received
+                request = Received(suffix, query, self.inbox.holds_received, time.monotonic())
                 if self._is_list(suffix, query):
                     self._reply_together([request])
                 else:
@@ -216,14 +226,16 @@ class Queryables:
     def _reply_together(self, requests: Sequence[Received]) -> None:
         """Reply to requests that wait together; equal orders pass through the loop once."""
         order_once, status_once = functools.cache(self._order), functools.cache(self._status)
-        for suffix, query, holds in requests:
+        for request in requests:
             # Resumes that a hold separates are different orders.
-            order = functools.partial(order_once, holds if suffix == "resume" else 0)
-            self._reply(suffix, query, order, status_once)
+            order = functools.partial(order_once, request.holds if request.suffix == "resume" else 0)
+            self._reply(request, order, status_once)
 
-    def _reply(self, suffix: str, query: zenoh.Query, order: Order, status: Requested) -> None:
+    def _reply(self, received: Received, order: Order, status: Requested) -> None:
+        suffix, query = received.suffix, received.query
         key = channels.key(self._settings.cell, suffix)
-        with query:  # its end shows the client that there are no more replies
+        # The query's end shows the client that there are no more replies.
+        with query, self._skill_worker.due(received.received_s):
             try:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 if suffix == "status":
@@ -314,15 +326,12 @@ class Queryables:
         before = self._skill
         points = in_force(skill)
         self._adoptable = {before.digest: self._adoptable[before.digest], skill.digest: (skill, points)}
-        draft = self._saved.draft(skill)  # written first, because via-points that cannot be saved are not adopted
+        adoption = Event("skill", skill.file, skill.for_loop())
         try:
-            adoption = Event("skill", skill.file, skill.for_loop())
-            frame = self.inbox.send(adoption, *events, check=check).wait()
-            draft.replace(self._saved.path(skill))
+            with self._saved.replacing(skill):  # written first, because via-points that cannot be saved are not adopted
+                frame = self.inbox.send(adoption, *events, check=check).wait()
         except OSError as error:  # the skill is in force already
             remark = f"{remark} the via-points end at a restart: they cannot be saved ({in_words(error)})".strip()
-        finally:
-            draft.unlink(missing_ok=True)
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
         remarks = filter(None, (remark, risk, found.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))

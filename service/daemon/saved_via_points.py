@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
 import os
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,7 +93,8 @@ class SavedViaPoints:
         digest = hashlib.blake2b(self.path(skill).name.encode() + content, digest_size=6).hexdigest()
         aside = self._folder / f"out-of-reach-{digest}.json"
         try:
-            self._written(content).replace(aside)
+            with self._replacing(aside, content):
+                pass
             where = f"are set aside: once the arm reaches them, teach them by thirdhand via-points add --file {aside}"
         except (OSError, SkillError) as error:
             where = (
@@ -114,24 +115,31 @@ class SavedViaPoints:
             return None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
 
-    def draft(self, skill: Skill) -> Path:
-        """A temporary file on disk with this skill's via-points, to replace the old file. Raises
-        SkillError.
+    def replacing(self, skill: Skill) -> contextlib.AbstractContextManager[None]:
+        """A context in which this skill's via-points are on disk. They replace the saved ones at
+        its end, unless it raises. Raises SkillError if they cannot be written, OSError at its end.
         """
         request = None
         if skill.via_points:
             request = {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
         saved = {"skill": skill.name, "learned_from": skill.learned_from, "arm": self._arm, "request": request}
-        return self._written(json.dumps(saved | {"checksum": _checksum(saved)}, indent=1).encode())
+        content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
+        return self._replacing(self.path(skill), content.encode())
 
-    def _written(self, content: bytes) -> Path:
-        """A temporary file on disk with this content. Raises SkillError."""
+    @contextlib.contextmanager
+    def _replacing(self, path: Path, content: bytes) -> Iterator[None]:
+        part = path.with_suffix(".new")
         try:
-            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".new", delete=False) as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
-        return Path(file.name)
+            try:
+                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError as error:
+                raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
+            yield
+            part.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink()

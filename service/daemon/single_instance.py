@@ -22,6 +22,7 @@ from service.contract import channels
 from service.contract.explain import ExplainedError
 from service.settings.config import Settings
 from service.settings.file_content import content
+from service.settings.user_folder import HomelessError, user_folder
 
 MAX_SESSIONS = 64
 LEAST_DESCRIPTORS, MAX_DESCRIPTORS = 256, 65536  # with fewer, Zenoh ends while the daemon runs on, deaf
@@ -44,8 +45,11 @@ log = logging.getLogger("thirdhand")
 
 
 def state_folder(settings: Settings) -> Path:
-    """The folder of the files that a cell keeps over a restart."""
-    return Path(settings.files.state).expanduser() / settings.cell
+    """The folder of the files that a cell keeps over a restart. Raises ExplainedError."""
+    try:
+        return (Path(settings.files.state) if settings.files.state else user_folder("state")) / settings.cell
+    except HomelessError as error:
+        raise ExplainedError(f"no folder for the cell's state: {error}, or [files] state") from None
 
 
 class OccupiedError(ExplainedError, RuntimeError):

@@ -7,6 +7,7 @@ neither copies nor solves anything.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import pickle
@@ -15,11 +16,11 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from service.contract.requests import ToolLimits, ViaPoint
+from service.contract.requests import ANSWER_TIMEOUT_S, ToolLimits, ViaPoint
 from service.core.frame import Vector
 from service.core.tool_limits import limits_of_task, path_of
 from service.core.way_out import WayOut
@@ -30,9 +31,10 @@ from service.process import child
 from service.settings.config import Settings, robot_description
 
 MODULE = "service.daemon.skill_worker"
-WORK_TIMEOUT_S = 25.0  # shorter than a client's timeout
+WORK_TIMEOUT_S = ANSWER_TIMEOUT_S - 5.0  # the rest is for the tick that takes a request, and for the status
 HUNG_S = 5.0  # the process hangs if it makes no progress for this time
 WORKER_POLL_S = 0.1
+BUSY = "the skill worker was busy with earlier requests; nothing was changed, try again"
 STILL_STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
 Computed = TypeVar("Computed")
 
@@ -40,11 +42,13 @@ Computed = TypeVar("Computed")
 class SkillWorker:
     """The control process's end of the skill worker.
 
-    Methods may be called from any thread; the worker processes one request at a time.
+    Methods may be called from any thread; the worker processes one request at a time. Their time
+    counts from the call, or within `due` from the arrival of what a client requested.
     """
 
     def __init__(self) -> None:
         self._busy = threading.Lock()
+        self._due = threading.local()
         self._child: child.Child | None = None
 
     def start(self) -> child.Child:
@@ -53,6 +57,17 @@ class SkillWorker:
             self._end()
             self._child = child.start("skill worker", MODULE, socket.SOCK_STREAM)
         return self._child
+
+    @contextlib.contextmanager
+    def due(self, received_s: float) -> Iterator[None]:
+        """A context in which all calls of this thread together end within WORK_TIMEOUT_S after
+        `received_s` (time.monotonic() [s]).
+        """
+        self._due.end_s = received_s + WORK_TIMEOUT_S
+        try:
+            yield
+        finally:
+            del self._due.end_s
 
     def load(self, path: Path, *, timeout_s: float = WORK_TIMEOUT_S) -> StoredSkill:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
@@ -70,10 +85,13 @@ class SkillWorker:
 
     def compute(self, work: Callable[..., Computed], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Computed:
         """The value of `work(*arguments)` in the worker, for a function of a module. Raises
-        SkillError, also after `timeout_s` [s].
+        SkillError, also after `timeout_s` [s], the wait for earlier calls included.
         """
-        with self._busy:
-            working, end_s = self.start(), time.monotonic() + timeout_s
+        end_s = min(time.monotonic() + timeout_s, getattr(self._due, "end_s", math.inf))
+        if not self._busy.acquire(timeout=max(0.0, end_s - time.monotonic())):
+            raise SkillError(BUSY)
+        try:
+            working = self.start()
             progress = child.Progress(working)
             try:
                 while not working.has_begun(WORKER_POLL_S):
@@ -89,7 +107,7 @@ class SkillWorker:
                     if progress.is_hung(HUNG_S, busy_s=math.inf):
                         raise TimeoutError(f"made no progress for {HUNG_S:g} s")
                     if time.monotonic() > end_s:
-                        raise TimeoutError(f"did not answer within {timeout_s:g} s")
+                        raise TimeoutError("did not answer in time")
                 answer: Computed | str = _receive(working.socket)
             except TimeoutError as error:
                 self._end()
@@ -97,6 +115,8 @@ class SkillWorker:
             except (OSError, EOFError):
                 self._end()
                 raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
+        finally:
+            self._busy.release()
         if isinstance(answer, str):
             raise SkillError(answer)
         return answer

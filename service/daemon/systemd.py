@@ -17,7 +17,7 @@ class Systemd:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         watchdog_us = environment.get("WATCHDOG_USEC", "")
         is_for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        self._ping_every_s = int(watchdog_us) / 2e6 if is_for_us and watchdog_us.isdecimal() else 0.0
+        self.ping_every_s = int(watchdog_us) / 2e6 if is_for_us and watchdog_us.isdecimal() else 0.0
         self._pinged_tick, self._ping_s = -1, 0.0
 
     def notify(self, *assignments: str) -> None:
@@ -32,6 +32,6 @@ class Systemd:
         ping: so a loop that stands still is noticed. Call it more often than that.
         """
         now_s = time.monotonic()
-        if self._ping_every_s and tick > self._pinged_tick and now_s >= self._ping_s + self._ping_every_s:
+        if self.ping_every_s and tick > self._pinged_tick and now_s >= self._ping_s + self.ping_every_s:
             self._pinged_tick, self._ping_s = tick, now_s
             self.notify("WATCHDOG=1")

@@ -171,8 +171,7 @@ class Divided:
             self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
         )
         hands = np.hstack([hands, self.turns(late_s)])
-        found = np.empty((len(hands), 4))
-        along_all(hands, rested, labels, stages, found)
+        found = covered(hands, rested, labels, stages)
         along, off = found[:, :2], found[:, 2:]
         begins, way = stages["tool"][labels], stages["tool_way"][labels]
         square = (way**2).sum(axis=1)
@@ -300,11 +299,17 @@ def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -
         recognise(out[t], moving[t], periods_s, stages, FIRST_STAGE_ODDS)
 
 
-@compiled
-def along_all(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """Write the shares of the stages (T,) that hands (T, 6 or more) with this stillness (T, 2) have
-    covered, and their distances from the segments [m], to `out` (T, 4).
+def covered(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records) -> Vector:
+    """Shares of the stages (T,) that hands (T, 6 or more) with this stillness (T, 2) have covered,
+    and their distances from the segments [m]: (T, 4).
     """
+    out = np.empty((len(hands), 4))
+    _cover(np.ascontiguousarray(hands), np.ascontiguousarray(stillness), labels, stages, out)
+    return out
+
+
+@compiled
+def _cover(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
     for t in range(len(hands)):
         stage = stages[labels[t]]
         out[t, 0], out[t, 1] = along_both(hands[t], stillness[t], stage)

@@ -64,7 +64,7 @@ class LiveView:
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
-        self.url: str | None = None
+        self.url: str | None = ""  # the address; empty while the view starts, None once it has failed
         self.problems: list[str] = []
         self.left_out = 0  # number of frames and images
         self.is_paused = True
@@ -173,7 +173,6 @@ class ScribeProcess:
                 self._reported_left_out = live.left_out
                 self._errors.append(f"the live view is too slow: {live.left_out} frames and images were left out")
         segments = self._segments
-        self._reported_kept = segments.kept
         report = ScribeReport(
             state=segments.state,
             recording=None if segments.path is None else str(segments.path),
@@ -189,16 +188,12 @@ class ScribeProcess:
         with contextlib.suppress(OSError):
             self._source.send(msgspec.json.encode(report), socket.MSG_DONTWAIT)
             self._errors.clear()
-
-    def report_kept(self) -> None:
-        """Send a report if more ticks are on disk, because unreported ones count as lost if this
-        process dies.
-        """
-        if self._segments.kept != self._reported_kept:
-            self.report()
+            self._reported_kept = report.kept
 
     def take(self, message: bytes, skills: list[bytes]) -> None:
-        """Write one message, and pass it to the live view."""
+        """Write one message, and pass it to the live view. Ticks that are on disk with it are
+        reported at once, because unreported ones count as lost if this process dies.
+        """
         received = unpack(message, skills, joints=self._joints)
         live = self._live
         if isinstance(received, Note):
@@ -213,6 +208,8 @@ class ScribeProcess:
                 live.image(received)
             return
         missing = self._segments.write(received)
+        if self._segments.kept != self._reported_kept:
+            self.report()
         if live is None:
             return
         if missing:
@@ -301,7 +298,6 @@ def _work(source: socket.socket) -> None:
         scribe.catch_up(len(waiting))
         while waiting and time.monotonic() - now < FLUSH_S / 2:
             scribe.take(*waiting.popleft())
-        scribe.report_kept()
         if now - flushed > FLUSH_S:
             scribe.flush()
             flushed = now

@@ -35,7 +35,7 @@ NOT_RECORDED = "ticks are not recorded"
 HUNG_AFTER_S = 5.0  # a scribe that reports twice a second hangs if it made no progress for this time
 CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
 MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
-REPORTED = ("recording", "live", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
+REPORTED = ("recording", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
 MAX_SENDS_PER_TICK = 8  # waiting ticks are sent faster than new ones arrive
 
 
@@ -251,6 +251,7 @@ class Scribe:
             "restarts": self._restarts,
             "errors": list(self._errors),
             **{name: getattr(report, name) for name in REPORTED},
+            "live": None if self._live_port is None else report.live if alive else "",  # empty: it is starting
         }
 
     def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> str:
@@ -263,6 +264,7 @@ class Scribe:
             running.send_signal(signal.SIGCONT)  # it may have been stopped
             end, is_shut = time.monotonic() + timeout_s, False
             while running.poll() is None:
+                self._listen()  # else reports fill the socket, and the last one is left out
                 self._drain()
                 if not is_shut and not self._queue:
                     is_shut = True

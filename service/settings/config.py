@@ -286,7 +286,7 @@ class Files(Section, frozen=True):
     """The skill, folders of via-points and recordings, and the limits of recordings."""
 
     skill: str = ""  # the skill's file, beside which are the others that clients ask for; empty: the shipped one
-    state: str = "~/.local/state/thirdhand"  # a folder; via-points are stored there over a restart
+    state: str = ""  # a folder for via-points over a restart; empty: thirdhand in $XDG_STATE_HOME or ~/.local/state
     record: str = ""  # a folder; empty: nothing is recorded
     segment_mb: Annotated[float, msgspec.Meta(ge=0.01)] = (
         200.0  # at this size a recording ends and the next begins, without a gap

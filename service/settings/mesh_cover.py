@@ -183,9 +183,10 @@ def _keep(name: str, capsule: tuple[float, ...]) -> None:
     with contextlib.suppress(OSError, RuntimeError):
         folder = CAPSULE_CACHE.expanduser()
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as new:
-            new.write(" ".join(map(repr, map(float, capsule))))
-        Path(new.name).replace(folder / name)
+        with tempfile.TemporaryDirectory(dir=folder) as part:
+            file = Path(part, name)
+            file.write_text(" ".join(map(repr, map(float, capsule))), encoding="ascii")
+            file.replace(folder / name)
 
 
 def capsule_around(points: Points) -> tuple[float, ...]:

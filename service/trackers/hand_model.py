@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from service.contract.explain import ExplainedError, in_words
+from service.settings.user_folder import user_folder
 
 PACKAGE = "mediapipe==0.10.21"
 PLATFORM = ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11")  # the networks are the same for all
@@ -45,8 +46,7 @@ def hand_model(given: Path | None, say: Callable[[str], object]) -> Path:
         raise HandModelError(f"{given}: there is no such file; a hand_landmarker.task or the wheel of {PACKAGE} needed")
     if given is not None and given.suffix != ".whl":
         return given
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thirdhand"
-    model = cache / "hand_landmarker-0.10.21.task"
+    model = user_folder("cache") / "hand_landmarker-0.10.21.task"
     if given is not None:
         return _made(model, given)
     if not model.exists():

@@ -19,9 +19,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, TOO_BUSY, exit_code, text
+from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, SLOW_RATE_HZ, TOO_BUSY, exit_code, text
 from service.cli.main import main
-from service.client import Client, Tracker, open_session
+from service.client import Client, Tracker, UnreachableError, open_session
 from service.contract.records import Mode, Reason
 from service.daemon.launch import launched, played
 from service.files.recording import Recording
@@ -178,6 +178,7 @@ def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | No
 
 BUSY = "the bench paused for 118 ms"
 HELD = report_of(None, "the arm held", None)
+SILENT = report_of(None, None, None) | {"busy": "nobody answers"}
 
 
 @pytest.mark.parametrize(
@@ -185,6 +186,7 @@ HELD = report_of(None, "the arm held", None)
     [
         ([HELD | {"busy": BUSY}, report_of(None, None, None)], 2, 0),
         ([HELD | {"busy": BUSY}] * 4, 3, 1),
+        ([SILENT, report_of(None, None, None)], 2, 0),
         ([HELD], 1, 1),
         ([report_of(None, None, None, missing="1 of 9000 ticks are not recorded") | {"busy": BUSY}], 1, 1),
     ],
@@ -200,9 +202,14 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     made = [report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)]
     left = iter(made)
 
-    def run(*_: Any, **__: Any) -> dict[str, Any]:
+    rates_hz: list[int | None] = []
+
+    def run(_: Any, rate_hz: int | None, page: Any) -> dict[str, Any]:
         report = next(left)
+        rates_hz.append(rate_hz)
         Path(report["recording"]).touch()
+        if report["busy"] == SILENT["busy"]:
+            raise UnreachableError(report["busy"])
         return report
 
     monkeypatch.setattr("service.cli.demo.run", run)
@@ -211,7 +218,8 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     assert [path.name for path in tmp_path.glob("*.*")] == [f"{runs - 1}.mcap"]
     assert len(list((tmp_path / TOO_BUSY).glob("*"))) == runs - 1
     said = capsys.readouterr()
-    assert said.err.count(f"{BUSY}: it is tried again") == runs - 1
+    assert said.err.count(": it is tried again at 100 Hz") == runs - 1
+    assert rates_hz == [None, *[SLOW_RATE_HZ] * (runs - 1)]
     assert said.err.count("there is no drawing: ") == 1  # the recordings are empty
     assert f"thirdhand view {tmp_path}/{runs - 1}.mcap" in said.out
 

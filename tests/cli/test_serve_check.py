@@ -69,6 +69,7 @@ def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_pat
     assert list(found) == [
         *(
             "ok configuration",
+            "ok imports",
             "ok arm",
             "ok skill",
             "ok state",

@@ -25,7 +25,7 @@ from service.cli.view import FRESH_S, screenshot
 from service.daemon.launch import free_port
 from service.settings import palette
 from support import chromium
-from support.cell import Daemon, Tracker, serving
+from support.cell import Daemon, Tracker, serving, told
 from support.paths import ROOT
 
 TIMEOUT_S = 90
@@ -200,3 +200,15 @@ def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_s
         pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
     for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, palette.ARM_BODY):
         assert (np.abs(pixels - colour).max(axis=1) < 12).sum() > 100
+
+
+@pytest.mark.thorough
+def test_a_live_view_that_starts_is_waited_for_and_one_that_does_not_exist_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    for options, code, words in ((("--live", "0"), 1, "there is no screen"), ((), 2, "start it with --live PORT")):
+        with serving(tmp_path, "--joints", "assumed", *options) as daemon:
+            done = told("view", "live", "--connect", daemon.endpoint)
+        assert (done.returncode, words in done.stderr) == (code, True), done.stderr

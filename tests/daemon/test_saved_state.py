@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import re
+import resource
 import stat
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 
 from service.cli.usage import added_in
 from service.client import RefusedError
+from service.contract.requests import RequestError
 from service.core.skill.skill import Skill
 from service.daemon.saved_stage import MAX_RESTART_S, SavedStage
 from service.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
@@ -24,11 +26,18 @@ from service.daemon.saved_via_points import SavedViaPoints
 from service.daemon.single_instance import state_folder
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted
+from service.settings import mesh_cover
 from service.settings.config import WAM, Files, Settings, converted
 from sim.scene import Scene
 from support.cell import serving
 
 POINTS = Scene().via_points()
+
+
+def keep(saved: SavedViaPoints, skill: Skill) -> None:
+    """Save the via-points of a skill."""
+    with saved.replacing(skill):
+        pass
 
 
 @pytest.fixture
@@ -38,14 +47,14 @@ def saved(tmp_path: Path) -> SavedViaPoints:
 
 def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
     assert saved.read(skill) is None
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     assert saved.read(skill) == (POINTS, 0.03)
-    saved.draft(skill).replace(saved.path(skill))
+    keep(saved, skill)
     assert saved.read(skill) == ((), skill.tolerance)
 
 
 def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     other = replace(skill, learned_from="other demonstrations")
     assert saved.read(other) is None
     saved.path(skill).rename(saved.path(other))
@@ -55,25 +64,56 @@ def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill:
 def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
     other = replace(skill, learned_from="other demonstrations")
     for one, count in ((skill, 2), (other, 1)):
-        saved.draft(adapted(one, POINTS[:count], tolerance=0.03)).replace(saved.path(one))
+        keep(saved, adapted(one, POINTS[:count], tolerance=0.03))
     assert saved.read(skill) == (POINTS[:2], 0.03)
     assert saved.read(other) == (POINTS[:1], 0.03)
 
 
 def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
     for count in (1, 2, 3):
-        saved.draft(adapted(skill, POINTS[:count], tolerance=0.03)).replace(saved.path(skill))
+        keep(saved, adapted(skill, POINTS[:count], tolerance=0.03))
         assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
         assert len(json.loads(saved.path(skill).read_text())["request"]["points"]) == count
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
-    saved.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS[:1], tolerance=0.03))
     before = saved.path(skill).read_bytes()
     with pytest.raises(TypeError, match="not JSON serializable"):
-        saved.draft(replace(skill, name=3j)).replace(saved.path(skill))  # type: ignore[arg-type]
+        keep(saved, replace(skill, name=3j))  # type: ignore[arg-type]
     assert saved.path(skill).read_bytes() == before
     assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
+
+
+def test_a_disk_that_takes_nothing_is_left_with_no_part_of_a_file(
+    saved: SavedViaPoints, skill: Skill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
+    taught = adapted(skill, POINTS, tolerance=0.03)
+    keep(saved, taught)
+    before = [path for path in tmp_path.rglob("*") if path.is_file()]
+    unreached = SavedViaPoints(saved._settings, lambda _, tools: np.ones(len(tools)))  # noqa: SLF001
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))  # each write fails, as on a full disk
+    try:
+        with pytest.raises(SkillError, match="cannot save via-points"):
+            keep(saved, taught)
+        unreached.read(skill)
+        assert "they cannot be set aside" in unreached.remark
+        with pytest.raises(OSError, match="File too large"):
+            SavedStage(saved._settings).keep(skill, (POINTS[0].name, POINTS[1].name), 1.0)  # noqa: SLF001
+        mesh_cover._keep("capsule", (1.0,) * 7)  # noqa: SLF001
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == before
+
+
+def test_via_points_that_are_refused_leave_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
+    keep(saved, skill)
+    before = saved.path(skill).read_bytes()
+    with pytest.raises(RequestError), saved.replacing(adapted(skill, POINTS, tolerance=0.03)):
+        raise RequestError("the hold ended")
+    assert [file.read_bytes() for file in saved.path(skill).parent.iterdir()] == [before]
 
 
 @pytest.mark.parametrize(
@@ -112,7 +152,7 @@ def test_via_points_that_this_skill_cannot_go_through_are_set_aside(
     def refuse(*_: object) -> str:
         raise SkillError("they would bend it too much")
 
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     assert saved.restored(skill, refuse, "as learned") == "as learned"
     assert "they would bend it too much" in caplog.text
     assert [file.suffix for file in saved.path(skill).parent.iterdir()] == [".damaged"]
@@ -120,7 +160,7 @@ def test_via_points_that_this_skill_cannot_go_through_are_set_aside(
 
 def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedViaPoints, skill: Skill) -> None:
     random = Random(1)
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     whole = saved.path(skill).read_bytes()
     for _ in range(1000):
         damaged = bytearray(whole)
@@ -132,7 +172,7 @@ def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedVia
 def test_a_file_that_somebody_edited_is_set_aside(
     saved: SavedViaPoints, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     whole = saved.path(skill).read_text()
     for text, why in ((whole.replace("0.03", "0.04"), "was edited"), (whole.replace("checksum", "sum"), "checksum")):
         saved.path(skill).write_text(text)
@@ -164,16 +204,16 @@ def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
     saved: SavedViaPoints, skill: Skill, tmp_path: Path
 ) -> None:
     other = SavedViaPoints(another_arm(tmp_path, ("0.55", "0.65")))
-    saved.draft(adapted(skill, POINTS[:2], tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS[:2], tolerance=0.03))
     assert other.read(skill) is None
-    other.draft(adapted(skill, POINTS[:1], tolerance=0.03)).replace(other.path(skill))
+    keep(other, adapted(skill, POINTS[:1], tolerance=0.03))
     assert (saved.read(skill), other.read(skill)) == ((POINTS[:2], 0.03), (POINTS[:1], 0.03))
     other.path(skill).replace(saved.path(skill))  # nor by the file's name
     assert saved.read(skill) is None
 
 
 def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: Skill, tmp_path: Path) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)
 
 
@@ -181,7 +221,7 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
     saved: SavedViaPoints, skill: Skill, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Whatever the change leaves in reach is in force; and all once the arm is as it was."""
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     tools, settings = np.array([point.tool for point in POINTS]), Settings(cell="lab/bench2")
     for min_x in (0.0, *(np.sort(tools[:, 0])[[0, 1, 2]] + 0.01)):
         reach = msgspec.structs.replace(settings.reach, min_x=float(min_x))
@@ -214,14 +254,14 @@ def test_via_points_out_of_reach_that_cannot_be_set_aside_stay_where_they_are(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    saved.draft(adapted(skill, POINTS, tolerance=0.03)).replace(saved.path(skill))
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
     reach = msgspec.structs.replace(Settings().reach, min_x=0.9)
     changed = Settings(cell="lab/bench2", files=Files(state=str(tmp_path)), reach=reach)
 
     def full(*_: object, **more: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("tempfile.NamedTemporaryFile", full)
+    monkeypatch.setattr("os.fsync", full)
     assert SavedViaPoints(changed).read(skill) == ((), 0.03)
     assert "cannot be set aside" in caplog.text
     assert "No space left" in caplog.text

@@ -4,18 +4,23 @@ that come back with their words.
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
+from service.client import Client
+from service.client.connection import Connection
+from service.contract.requests import ANSWER_TIMEOUT_S, ViaPoint
 from service.core.skill.skill import Skill
-from service.daemon.skill_worker import SkillWorker
+from service.daemon.request_inbox import ADOPTION_TIMEOUT_S
+from service.daemon.skill_worker import WORK_TIMEOUT_S, SkillWorker
 from service.learning.skill_file import SkillError
 from service.learning.via_points import adapted, in_force
 from service.process import child
@@ -150,7 +155,7 @@ def test_a_slow_workshop_is_waited_for_and_what_it_has_imported_stays(
         assert 1 < len(said) < 300  # each went on where the one before was
         assert "cannot read skill" in said[-1]
         first = process_of(worker)
-        with pytest.raises(SkillError, match=r"did not answer within 0\.0001 s; nothing was changed"):
+        with pytest.raises(SkillError, match="did not answer in time; nothing was changed"):
             worker.load(SOLDERING, timeout_s=0.0001)
         with pytest.raises(SkillError, match="cannot read skill"):  # a new one, which imports nothing
             worker.load(tmp_path / "nothing.npz", timeout_s=2.0)
@@ -178,3 +183,23 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
         assert process_of(worker) == slowed
     finally:
         worker.close()
+
+
+def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(skill_worker: SkillWorker) -> None:
+    """All calls for one request share its time, and wait for earlier requests within it."""
+    skill_worker.load(SOLDERING)
+    with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
+
+        def late(left_s: float) -> None:
+            with skill_worker.due(time.monotonic() - WORK_TIMEOUT_S + left_s):
+                skill_worker.load(SOLDERING)
+
+        for left_s in (0.2, -1.0):
+            begun_s = time.monotonic()
+            with pytest.raises(SkillError, match="busy with earlier requests; nothing was changed"):
+                pool.submit(late, left_s).result(20)
+            assert time.monotonic() - begun_s < 2.0
+    skill_worker.load(SOLDERING)
+    assert WORK_TIMEOUT_S + ADOPTION_TIMEOUT_S < ANSWER_TIMEOUT_S
+    for waiting in (Client, Connection):
+        assert inspect.signature(waiting).parameters["timeout_s"].default == ANSWER_TIMEOUT_S

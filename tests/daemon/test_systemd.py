@@ -101,6 +101,40 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
     assert {"STOPPING=1"} < set(manager.heard(1.0))
 
 
+DEAF = """
+import pathlib
+from service.daemon import own_answers, queryables
+
+class Deaf(queryables.RequestQueue):
+    def enqueue(self, request):
+        if not pathlib.Path({mark!r}).exists():
+            super().enqueue(request)
+
+queryables.RequestQueue = Deaf
+own_answers.DEAF_AFTER_S, own_answers.ASK_EVERY_S = 1.5, 0.3
+"""
+
+
+@pytest.mark.thorough
+def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(
+    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "mark"
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
+    with serving(tmp_path, "--joints", "assumed", before=DEAF.format(mark=str(mark))) as daemon:
+        for _ in range(10):  # more than two of its own requests
+            assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+        mark.touch()
+        while "WATCHDOG=1" in manager.heard(1.0, "WATCHDOG=1"):
+            pass
+        assert "WATCHDOG=1" not in manager.heard(8 * PING_S)
+        mark.unlink()
+        assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
+        assert daemon.end() == 0
+        assert daemon.log.read_text().count("the daemon has not answered on its own endpoint tcp/127.0.0.1:") == 1
+
+
 def engaged_by_resume(daemon: Daemon) -> None:
     """Check that the arm holds, with both hands in sight, until an operator's resume."""
     daemon.until(lambda now: len(now["hand_age_ms"]) == 2 and max(now["hand_age_ms"].values()) < 100)

@@ -38,7 +38,7 @@ from service.learning.division import (
     NEAR,
     Divided,
     Encoded,
-    along_all,
+    covered,
     encode,
     ordered,
     recognised,
@@ -287,8 +287,7 @@ class _Prediction(NamedTuple):
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
         belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
         errors = one.tool[::step] - placed.mean(hands, belief, tempos)
-        found = np.empty((len(hands), 4))
-        along_all(hands, np.ascontiguousarray(tempos[:, :2]), belief.argmax(axis=1), placed.stages, found)
+        found = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.stages)
         beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
         inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)

@@ -1,0 +1,105 @@
+"""After `thirdhand serve --prepare`, no request and no command compiles anything."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.daemon.skill_worker import SkillWorker, way_out_of
+from service.files.demonstration_reader import write_demonstration
+from service.files.shipped import shipped_skill
+from service.settings.config import Settings
+from sim.scene import Scene
+from sim.teach import visits
+from support.cell import Daemon, Tracker, serving, thirdhand
+from support.paths import RECORDINGS
+
+PLACES = Scene().via_points()
+TURNED = msgspec.structs.replace(PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03)
+TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
+PREPARE_S = 600.0
+
+
+def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Every request to a daemon, one of them in a hold for hands in a stage of its task."""
+    client = daemon.client
+    first, second = PLACES[:2]
+    yield "add", lambda: client.add(PLACES)
+    hands.left, hands.right = (
+        tuple((0.5 * (np.array(begin) + np.array(end))).tolist())
+        for begin, end in ((first.left, second.left), (first.right, second.right))
+    )
+    yield "stage", lambda: client.set_stage(first.name)
+    daemon.until(lambda status: status["mode"] == "follow", 60.0)
+    yield "hold", client.hold
+    x, y, z = daemon.until(lambda status: status["target_m"] is not None)["target_m"]
+    yield "correct", lambda: client.correct((x + 0.02, y, z + 0.02))
+    yield "undo", client.undo_correction
+    yield "resume", client.resume
+    yield "add turned", lambda: client.add([TURNED])
+    yield "list", client.places
+    yield "remove", lambda: client.remove(first.name)
+    yield "clear", client.clear
+    yield "reset", client.reset
+    yield "skill", lambda: client.load_skill("soldering")
+    yield "status", client.status
+
+
+def look_for_a_way_out() -> None:
+    """Compute what the skill worker computes for an arm that is stuck."""
+    skill, settings = shipped_skill(), Settings()
+    with contextlib.closing(SkillWorker()) as worker:
+        posture, hands = np.array(settings.arm.posture), skill.hands[0].reshape(2, 3)
+        worker.compute(way_out_of, settings, posture, skill.tool_positions[0], skill.orientation, hands)
+
+
+def commands_in(folder: Path) -> Iterator[str]:
+    """Every command that may compile; some read the files of those before them."""
+    visited = [folder / f"visit-{number}.mcap" for number in range(1, 7)]
+    for number, path in enumerate(visited, 1):
+        write_demonstration(path, visits(number))
+    first, second = (" ".join(map(str, paths)) for paths in (visited[:3], visited[3:]))
+    yield f"learn {TAKES} --output {folder}/plain.npz"
+    yield f"learn {first} --output {folder}/staged.npz"
+    yield f"learn --from {folder}/staged.npz {second} --output {folder}/refined.npz"
+    yield f"replay {RECORDINGS}/golden.mcap --output {folder}/whole.mcap"
+    yield f"report {folder}/whole.mcap"
+    yield f"tune {RECORDINGS}/golden.mcap --part 0 3"
+    yield "bench --seconds 0.5"
+    yield f"arm service/arms/wam.urdf --output {folder}/arm.toml"
+    yield f"demo --output {folder}/demo"
+
+
+@pytest.mark.timeout(1500)
+@pytest.mark.thorough
+def test_after_the_preparation_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, late = tmp_path / "cache", collections.defaultdict[str, set[str]](set)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    prepared = thirdhand("serve", "--prepare", timeout=PREPARE_S)
+    assert prepared.returncode == 0, prepared.stderr
+    cached = {path.name for path in cache.rglob("*.nbc")}
+    assert len(cached) > 200
+
+    def note(name: str) -> None:
+        found = {path.name for path in cache.rglob("*.nbc")} - cached
+        cached.update(found)
+        late[name] |= found
+
+    with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as hands:
+        note("start")
+        for name, ask in requests_of(daemon, hands):
+            ask()
+            note(name)
+    look_for_a_way_out()
+    note("way out")
+    for command in commands_in(tmp_path):
+        done = thirdhand(*command.split(), timeout=300)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
+        note(command)
+    assert {name: found for name, found in late.items() if found} == {}
