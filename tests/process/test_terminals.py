@@ -14,7 +14,6 @@ from support.paths import RECORDINGS, ROOT
 
 ENCODINGS = (
     {"PYTHONIOENCODING": "ascii"},
-    {"PYTHONIOENCODING": "latin-1"},
     {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
 )
 COMMANDS = {
