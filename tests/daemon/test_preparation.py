@@ -22,7 +22,6 @@ from support.paths import RECORDINGS
 PLACES = Scene().via_points()
 TURNED = msgspec.structs.replace(PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03)
 TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
-PREPARE_S = 600.0
 
 
 def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -76,7 +75,7 @@ def test_after_the_preparation_nothing_is_compiled(tmp_path: Path, monkeypatch: 
     cache = tmp_path / "cache"
     late: dict[str, set[str]] = {}
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
-    prepared = thirdhand("serve", "--prepare", timeout=PREPARE_S)
+    prepared = thirdhand("serve", "--prepare", timeout=600)
     assert prepared.returncode == 0, prepared.stderr
     cached = {path.name for path in cache.rglob("*.nbc")}
     assert len(cached) > 200
