@@ -7,8 +7,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
-
 from support.paths import RECORDINGS
 
 COUNTED = """
@@ -57,21 +55,6 @@ before = compiled_by(shipped_skill())
 assert main(["replay", sys.argv[1]]) in (0, None)
 assert since(before) == {}, since(before)
 """
-FROM_THE_SKILL_WORKER = """
-from service.daemon.skill_worker import SkillWorker, skill_of
-from sim.experiments.rehearsal import rehearse as played
-from sim.scene import Scene
-from sim.script import HandScript
-
-worker = SkillWorker()
-before = compiled_by(skill_of(Path(sys.argv[1])))  # as a daemon loads it
-loaded = worker.load(Path(sys.argv[1]), timeout_s=60.0)
-adapted = worker.adapt(loaded, Scene().via_points(), tolerance=0.05)
-worker.close()
-for skill in (loaded.for_loop(), adapted.for_loop()):
-    played(HandScript(Scene(), seed=1), lambda bench: skill, rate_hz=100)
-assert since(before) == {}, since(before)
-"""
 OF_ANOTHER_KIND = """
 from service.contract.requests import ViaPoint
 from service.daemon.skill_worker import skill_of
@@ -95,12 +78,6 @@ def done_in_a_process(script: str, *arguments: str) -> str:
 
 def test_a_rehearsal_leaves_nothing_to_compile() -> None:
     assert "identical" in done_in_a_process(REPLAYED, str(RECORDINGS / "golden.mcap"))
-
-
-@pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
-@pytest.mark.one_case
-def test_neither_does_a_skill_that_another_process_gave_back(file: str) -> None:
-    done_in_a_process(FROM_THE_SKILL_WORKER, str(RECORDINGS / file))
 
 
 def test_a_skill_of_another_kind_than_the_shipped_one_compiles_nothing_anew() -> None:

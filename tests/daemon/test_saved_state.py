@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -69,51 +68,34 @@ def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
     assert saved.read(other) == (POINTS[:1], 0.03)
 
 
-def test_writing_leaves_one_whole_file(saved: SavedViaPoints, skill: Skill) -> None:
-    for count in (1, 2, 3):
-        keep(saved, adapted(skill, POINTS[:count], tolerance=0.03))
-        assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
-        assert len(json.loads(saved.path(skill).read_text())["request"]["points"]) == count
+def files_in(folder: Path) -> dict[Path, bytes]:
+    """All files below a folder, with their contents."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
-    keep(saved, adapted(skill, POINTS[:1], tolerance=0.03))
-    before = saved.path(skill).read_bytes()
-    with pytest.raises(TypeError, match="not JSON serializable"):
-        keep(saved, replace(skill, name=3j))  # type: ignore[arg-type]
-    assert saved.path(skill).read_bytes() == before
-    assert [file.name for file in saved.path(skill).parent.iterdir()] == [saved.path(skill).name]
-
-
-def test_a_disk_that_takes_nothing_is_left_with_no_part_of_a_file(
-    saved: SavedViaPoints, skill: Skill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
+    saved: SavedViaPoints, settings: Settings, skill: Skill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
     taught = adapted(skill, POINTS, tolerance=0.03)
     keep(saved, taught)
-    before = [path for path in tmp_path.rglob("*") if path.is_file()]
-    unreached = SavedViaPoints(saved._settings, lambda _, tools: np.ones(len(tools)))  # noqa: SLF001
+    before = files_in(tmp_path)
+    with pytest.raises(RequestError), saved.replacing(skill):
+        raise RequestError("refused")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))  # each write fails, as on a full disk
     try:
         with pytest.raises(SkillError, match="cannot save via-points"):
-            keep(saved, taught)
-        unreached.read(skill)
-        assert "they cannot be set aside" in unreached.remark
+            keep(saved, skill)
+        unreached = SavedViaPoints(settings, lambda _, tools: np.ones(len(tools)))
+        assert unreached.read(skill) == ((), 0.03)
+        assert re.search("cannot be set aside .*File too large", unreached.remark)
         with pytest.raises(OSError, match="File too large"):
-            SavedStage(saved._settings).keep(skill, (POINTS[0].name, POINTS[1].name), 1.0)  # noqa: SLF001
+            SavedStage(settings).keep(skill, (POINTS[0].name, POINTS[1].name), 1.0)
         mesh_cover._keep("capsule", (1.0,) * 7)  # noqa: SLF001
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == before
-
-
-def test_via_points_that_are_refused_leave_the_old_file_and_nothing_else(saved: SavedViaPoints, skill: Skill) -> None:
-    keep(saved, skill)
-    before = saved.path(skill).read_bytes()
-    with pytest.raises(RequestError), saved.replacing(adapted(skill, POINTS, tolerance=0.03)):
-        raise RequestError("the hold ended")
-    assert [file.read_bytes() for file in saved.path(skill).parent.iterdir()] == [before]
+    assert files_in(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -244,27 +226,6 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
             assert stat.S_IMODE(aside.stat().st_mode) == 0o600
         caplog.clear()
     assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3  # none replaced another
-    assert saved.read(skill) == (POINTS, 0.03)
-
-
-def test_via_points_out_of_reach_that_cannot_be_set_aside_stay_where_they_are(
-    saved: SavedViaPoints,
-    skill: Skill,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    reach = msgspec.structs.replace(Settings().reach, min_x=0.9)
-    changed = Settings(cell="lab/bench2", files=Files(state=str(tmp_path)), reach=reach)
-
-    def full(*_: object, **more: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("os.fsync", full)
-    assert SavedViaPoints(changed).read(skill) == ((), 0.03)
-    assert "cannot be set aside" in caplog.text
-    assert "No space left" in caplog.text
     assert saved.read(skill) == (POINTS, 0.03)
 
 

@@ -186,8 +186,6 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
 
 
 def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(skill_worker: SkillWorker) -> None:
-    """All calls for one request share its time, and wait for earlier requests within it."""
-    skill_worker.load(SOLDERING)
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 
         def late(left_s: float) -> None:
@@ -195,11 +193,8 @@ def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(ski
                 skill_worker.load(SOLDERING)
 
         for left_s in (0.2, -1.0):
-            begun_s = time.monotonic()
             with pytest.raises(SkillError, match="busy with earlier requests; nothing was changed"):
-                pool.submit(late, left_s).result(20)
-            assert time.monotonic() - begun_s < 2.0
-    skill_worker.load(SOLDERING)
+                pool.submit(late, left_s).result(2.0)
     assert WORK_TIMEOUT_S + ADOPTION_TIMEOUT_S < ANSWER_TIMEOUT_S
     for waiting in (Client, Connection):
         assert inspect.signature(waiting).parameters["timeout_s"].default == ANSWER_TIMEOUT_S

@@ -126,9 +126,8 @@ def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(
         for _ in range(10):  # more than two of its own requests
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
         mark.touch()
-        while "WATCHDOG=1" in manager.heard(1.0, "WATCHDOG=1"):
+        while "WATCHDOG=1" in manager.heard(8 * PING_S, "WATCHDOG=1"):
             pass
-        assert "WATCHDOG=1" not in manager.heard(8 * PING_S)
         mark.unlink()
         assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
         assert daemon.end() == 0

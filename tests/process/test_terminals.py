@@ -14,7 +14,6 @@ from support.paths import RECORDINGS, ROOT
 
 ENCODINGS = (
     {"PYTHONIOENCODING": "ascii"},
-    {"PYTHONIOENCODING": "latin-1"},
     {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
 )
 COMMANDS = {
@@ -31,7 +30,7 @@ pwd.getpwuid = {}.__getitem__
 
 
 def run(command: str, *, before: str = "", folder: Path = ROOT, **variables: str) -> subprocess.CompletedProcess[str]:
-    """A command in a terminal with these variables, by its entry point."""
+    """A command in a terminal with these variables."""
     code = f"{before}\nimport sys\nfrom service.__main__ import main\nsys.exit(main())"
     path = os.pathsep.join(filter(None, (variables.pop("PYTHONPATH", ""), str(ROOT))))
     return subprocess.run(
