@@ -124,7 +124,7 @@ def bad() -> dict[str, bytes]:
 
 
 MALFORMED = (
-    cdr.encode_transforms(1, [of_left(parent="a" * 5000)]),
+    cdr.encode_transforms(1, [of_left(parent="a" * 9000)]),
     cdr.encode_transforms(1, [of_left()] + 400 * OTHERS[:1]),
     cdr.CDR_HEADER + b"\xff\xff\xff\xff" + b"left_wrist\0" * 9,
 )
