@@ -195,7 +195,7 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
             if seen.held_up_s is None:
                 found, closer = f"{found}: its clock stepped ahead", what_to_do(Condition.CLOCK_STEPPED)
             else:
-                found += f", which was held up for {lasting(1000 * seen.held_up_s)} on its way; the clock is right"
+                found += f", which arrived {lasting(1000 * seen.held_up_s)} late (its clock is right)"
                 closer = what_to_do(Condition.DELAYED)
         case Cause.JUMPED if (jump := seen.jump) is not None:
             found = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one sample to the next"

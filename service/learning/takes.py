@@ -74,6 +74,8 @@ def divided(
     of_others = [i for i, one in enumerate(refined) if one.demonstration.person not in known]
     earlier = [named[i] for i in of_others if i not in repeats]
     names, demonstrations = _columns([one for i, one in enumerate(named) if i not in {*repeats, *of_others}])
+    if not demonstrations:
+        raise SkillError("all demonstrations repeat those of the skill that is refined: there is nothing new to learn")
     if max(map(moved_m, demonstrations)) < LEAST_M:
         raise SkillError(
             f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"

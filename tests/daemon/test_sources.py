@@ -211,7 +211,7 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
     told_held, told_stepped = held.cell.status(1.0), stepped.cell.status(1.0)
     assert (told_held.rejected, told_stepped.rejected) == ({"ahead": 1}, {"ahead": 1})
     delayed, ahead = told_held.sources["right"], told_stepped.sources["right"]
-    assert delayed.refused.endswith("which was held up for 1.99 s on its way; the clock is right")
+    assert delayed.refused.endswith("which arrived 1.99 s late (its clock is right)")
     assert "find what holds them up: the network" in delayed.advice
     assert ahead.refused.endswith("after the newest accepted one: its clock stepped ahead")
     assert ahead.advice.startswith("correct the publisher's clock")

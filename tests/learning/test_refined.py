@@ -97,6 +97,8 @@ def test_what_cannot_be_refined_is_refused_with_the_remedy(others: StoredSkill) 
         learn(mine, refined=others, ell=4.0)
     with pytest.raises(SkillError, match=r"1 demonstration given .*again repeats take-0, and is left out"):
         learn([mine[0], stored_demonstrations(others)[0].demonstration], names=["mine", "again"], refined=others)
+    with pytest.raises(SkillError, match="all demonstrations repeat those of the skill that is refined"):
+        learn([one.demonstration for one in stored_demonstrations(others)], refined=others)
 
 
 def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:

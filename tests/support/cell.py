@@ -68,6 +68,7 @@ class Daemon:
         end = time.monotonic() + timeout_s
         while not what(status := self.client.ask("status")):
             assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
+            time.sleep(0.01)  # the daemon and what it works with need the processor too
         return status
 
 
