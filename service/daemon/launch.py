@@ -93,10 +93,12 @@ def launched(
     LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
+    given = settings or Settings()
+    followed = msgspec.structs.replace(given, arm=msgspec.structs.replace(given.arm, start="follow"))  # nobody resumes
     files = {"state": folder / "state", "record": record}
     config.write_text(
         "# A cell with a free port and its own files.\n"
-        f"{described(settings or Settings())}{network}[files]\n"
+        f"{described(followed)}{network}[files]\n"
         + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
     )
     command, environment = python(*program, "serve", "--config", str(config), *_end_with_this(), *arguments)

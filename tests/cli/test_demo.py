@@ -76,10 +76,12 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
 @timed
 @pytest.mark.timeout(330)
 def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
-    """Its URDF lies beside it, and both are named by a relative path."""
+    """Its URDF lies beside it, both are named by a relative path, and its arm would start held."""
     (tmp_path / "my").mkdir()
     for name in ("ur5.toml", "ur5.urdf"):
         (tmp_path / "my" / name).write_bytes(WAM.with_name(name).read_bytes())
+    cell = tmp_path / "my" / "ur5.toml"
+    cell.write_text(cell.read_text().replace("[arm]\n", '[arm]\nstart = "held"\n'))
     report = demonstrated("--arm", "my/ur5.toml", "--rate", "1000", "--output", "out", cwd=tmp_path)
     assert report["rate_hz"] == pytest.approx(1000, rel=0.05)
 
