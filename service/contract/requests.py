@@ -287,7 +287,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     hands: Hands = "both"  # hands that the skill follows
     places: tuple[str, ...]
     rejected: dict[str, int]
-    received: dict[str, int] = {}  # messages that the loop took, by channel; at most one in a tick, the newest
+    received: dict[str, int] = {}  # messages that arrived, by channel of each input
     hand_age_ms: dict[str, float]
     hand_distance_m: float  # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
     hand_limit_m_s: float  # smallest speed allowed toward a hand, over all parts of the arm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
@@ -17,14 +18,17 @@ from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Record
-from service.core.intake.stage import UNIT_M
-from service.daemon.frozen_hand import FrozenHand
 from service.daemon.ros2_domain import Ros2Domain
 from service.settings.config import Settings
 
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
+TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
+EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
+LEAP_STEPS = 5.0  # a hand that was lost appears this many steps away; one that rested goes on from where it was
+STEP_SHARE = 0.02  # of a new step in the mean: over 50 samples
 LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
@@ -101,6 +105,44 @@ class Arrivals:
         self.malformed += 1
 
 
+class FrozenHand:
+    """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
+
+    A program's hands rest exactly: if most rests so far ended without a leap, repeated poses are
+    accepted, as `learn` does in takes.
+    """
+
+    def __init__(self) -> None:
+        self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
+        self._step = 0.0  # mean distance between poses that differ, in the tracker's unit
+        self._repeated_ns = 0  # stamp of its newest repetition
+        self._varies_since_ns = 0  # stamp since which each sample differs from the one before
+        self._is_tracked = False
+        self._rests = self._leaps = 0
+
+    def is_frozen(self, pose: PoseStamped) -> bool:
+        """True if a sample repeats the pose of a lost hand."""
+        before = self._pose
+        if before is None:
+            self._varies_since_ns = pose.stamp_ns
+        elif (pose.position, pose.orientation) == (before.position, before.orientation):
+            self._repeated_ns = self._varies_since_ns = pose.stamp_ns
+            lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
+            return self._is_tracked and lasts_s >= FROZEN_S and 2 * self._leaps >= self._rests
+        else:
+            step = math.dist(pose.position, before.position)
+            if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
+                self._rests += 1
+                self._leaps += step > LEAP_STEPS * self._step
+            elif math.isfinite(step):
+                self._step += STEP_SHARE * (step - self._step)
+            self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)  # its clock may be set back
+            self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
+        self._pose = pose
+        self._repeated_ns = pose.stamp_ns
+        return False
+
+
 class CellStreams:
     """A cell's subscribers and publishers, also in the ROS 2 domain if its settings name one.
 
@@ -120,7 +162,6 @@ class CellStreams:
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
-        self._settings = settings
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [channel.key for channel in heard(settings)]
         keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
@@ -194,7 +235,7 @@ class CellStreams:
                     message, payload = state, cdr.encode_joints(state)
             arrivals.take(message, at_ns)
             hand = self._frozen.get(suffix)
-            if hand and hand.is_frozen(message, UNIT_M[self._settings.hands_in(message.frame_id).unit]):
+            if hand and hand.is_frozen(message):
                 arrivals.frozen += 1
                 return None
             event = self.newest[suffix] = Event(suffix, payload, message)

@@ -11,7 +11,7 @@ import pytest
 
 from service.contract.messages import PoseStamped
 from service.core.frame import Vector
-from service.daemon.frozen_hand import FROZEN_S, FrozenHand
+from service.daemon.cell_streams import FROZEN_S, FrozenHand
 from support.cell import LEFT, Tracker, serving
 
 TURNED = (0.0, 0.0, 0.0, 1.0)
@@ -25,7 +25,7 @@ def refused(positions: Vector, rate_hz: float, *, unit_m: float = 1.0) -> Vector
         PoseStamped(10**18 + round(1e9 * at_s), "base", tuple((at / unit_m).tolist()), TURNED)
         for at_s, at in zip(times, positions, strict=True)
     )
-    return times[[hand.is_frozen(pose, unit_m) for pose in poses]]
+    return times[[hand.is_frozen(pose) for pose in poses]]
 
 
 def measured(seconds: float, rate_hz: float, at: tuple[float, ...] = LEFT, seed: int = 0) -> Vector:

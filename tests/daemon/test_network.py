@@ -222,7 +222,7 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
     assert tuple(commands[-1].name) == JOINT_NAMES
     assert len(commands[-1].position) == len(commands[-1].velocity) == 7
     own = Client(lab.session, cell).status()
-    assert own.received.keys() == {"hands/left", "hands/right"}
+    assert own.received.keys() == {"hands/left", "hands/right", "objects"}
     assert own.rejected.keys() <= {"two_sources", "repeated", "older", "ahead"}
 
 
