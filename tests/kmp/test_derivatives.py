@@ -8,6 +8,7 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed, named_arrays
 from kmp.functionals import Functionals
 from kmp.kernel import between, variances
+from support.primitives import naive
 
 RANDOM = np.random.default_rng(0)
 S = RANDOM.normal(size=(60, 4))
@@ -79,25 +80,12 @@ def test_one_point_with_its_jacobian_says_what_thirteen_points_say():
     np.testing.assert_allclose(one.jacobian(queries[0]), nine.jacobian(queries[0]), atol=0.05)
 
 
-def naive(one, queries):
-    """Equations (8) and (9) and the covariance of IJRR 2019 for functionals, as they stand."""
-    known, n = one.inner.solution.database.functionals, len(one.inputs)
-    sigma = np.zeros((n, 3, n, 3))
-    sigma[np.arange(n), :, np.arange(n)] = one.reference.covariance
-    m = np.kron(between(one.kernel, known, known), np.eye(3)) + one.lambda_mean * sigma.reshape(3 * n, 3 * n)
-    k = np.kron(between(one.kernel, Functionals(queries), known), np.eye(3))
-    right = one.reference.mean - known.values[:, None] * one.prior_mean
-    mean = (k @ np.linalg.solve(m, right.ravel())).reshape(-1, 3) + one.prior_mean
-    left = np.eye(3 * len(queries)) - k @ np.linalg.solve(m, k.T)
-    blocks = [left[i : i + 3, i : i + 3] for i in range(0, len(left), 3)]
-    return mean, np.array(blocks) * len(one.base.inputs) / one.lambda_covariance
-
-
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
     one = taught(base(representation), deviation=0.1)
     queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
-    mean, covariance = naive(one, queries)
+    mean, joint = naive(one, queries)
+    covariance = np.array([joint[n, :, n] for n in range(len(queries))])
     found = one.predict(queries)
     np.testing.assert_allclose(found.mean, mean, atol=1e-8)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-8)
@@ -117,22 +105,6 @@ def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_w
     a, b = (one.predict(far) for one in (before, after))
     np.testing.assert_allclose(b.mean, a.mean, atol=1e-9)
     np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("representation", ["dense", "low_rank"])
-@pytest.mark.parametrize("kernel", ["one length", "a length an input"])
-def test_the_motion_of_one_query_is_that_of_finite_differences_compiled_or_not(representation, kernel, monkeypatch):
-    one, h = taught(base(representation, kernel)), 1e-4
-    s, v, a = PLACE[0] + 0.03, *RANDOM.normal(size=(2, 4))
-    behind, here, ahead = one.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
-    found, plain = one.predict_motion(s, v, a), one.inner.query.motion(s, v, a, covariance=True)
-    for motion in (found, plain):
-        np.testing.assert_allclose(motion.mean, here, atol=1e-9)
-        np.testing.assert_allclose(motion.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(motion.acceleration, (ahead - 2 * here + behind) / h**2, rtol=1e-3, atol=1e-3)
-    for compiled, other in zip(found, plain, strict=True):
-        np.testing.assert_allclose(compiled, other, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(one.curvature(s, v), found.curvature, atol=1e-9)
 
 
 @pytest.mark.parametrize("kernel", ["periodic", "velocity"])

@@ -145,6 +145,7 @@ def test_a_primitive_that_was_stored_or_pickled_predicts_and_is_adapted_as_befor
     desired = Gaussians(one.mean(place) + 0.01, [0.01 * np.eye(one.outputs)])
     for again in (stored.primitive, pickle.loads(pickle.dumps(one))):
         assert again.representation == one.representation
+        assert not again.weights.flags.writeable
         adapted = (primitive.adapt(place, desired, tolerance=0.01) for primitive in (again, one))
         for a, b in ((again, one), (again.base, one.base), tuple(adapted)):
             for many in (queries, queries[:1]):

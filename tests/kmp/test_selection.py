@@ -146,9 +146,6 @@ def test_what_cannot_be_done_is_refused_with_what_could():
             chosen([(times, outputs) for _, outputs in driven_by_hands(count=3)])
     with pytest.raises(ValueError, match="160 samples given for 1000 components"):
         chosen(driven_by_hands(count=2), components=1000)
-    for name in ("lambda_mean", "lambda_covariance"):
-        with pytest.raises(ValueError, match=f"{name} is 0, and must be finite and above 0"):
-            chosen(**{name: 0.0})
     alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
     assert np.isnan(alone.regression_rmse)
 
