@@ -73,7 +73,7 @@ def test_a_tool_is_off_by_its_whole_turn_or_by_where_it_points() -> None:
 def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> None:
     random = np.random.default_rng(3)
     inputs, zeta = random.normal(size=(12, 6)), 0.5 * random.normal(size=(12, 3))
-    reference = Gaussians(zeta, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
+    reference = Gaussians.of(zeta, deviation=0.01)
     primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.3), lambda_mean=1.0)
     auxiliary = random_rotations(1, 4)[0].as_quat()
     ours, kmp = LearnedOrientation(primitive, auxiliary), OrientationKMP(primitive, auxiliary)

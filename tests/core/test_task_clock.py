@@ -5,7 +5,6 @@ outlasts a round of a session.
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -23,10 +22,10 @@ from service.core.skill.task_clock import (
 )
 from service.learning.learn import learn
 from service.learning.methods.clock import Tempo, clock_of
-from service.learning.records import Figures
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+from service.learning.skill_file import StoredSkill, decoded
 from sim.experiments.people.left_out import judged, left_out, predicted_rounds
 from support.kinds import KINDS, learned, named, takes
+from support.skills import at_rest, figures_of
 
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)
@@ -139,7 +138,7 @@ def test_the_intake_finds_when_hands_begin_to_move() -> None:
 @pytest.mark.thorough
 def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
     skill = learn(takes(6, timetable=True))
-    figures = msgspec.json.decode(skill.figures, type=Figures)
+    figures = figures_of(skill)
     found = clock(skill)
     assert found is not None
     assert not found.waits
@@ -149,13 +148,13 @@ def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
     assert clock(learn(takes(6, timetable=False))) is None
     back = decoded(skill.file, origin="again")
     assert clock(back) == clock(skill)
-    hands, still = takes(1, timetable=True)[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
-    there = [one.predict(hands, still, still, clock=np.array([6.0, 1.0, 0.0])) for one in (skill, back)]
+    hands = takes(1, timetable=True)[0].hands[-1]
+    there = [at_rest(one, hands, clock=np.array([6.0, 1.0, 0.0])) for one in (skill, back)]
     np.testing.assert_array_equal(there[0].position, there[1].position)
-    early = skill.predict(hands, still, still, clock=np.array([3.0, 1.0, 0.0]))
+    early = at_rest(skill, hands, clock=np.array([3.0, 1.0, 0.0]))
     assert np.linalg.norm(there[0].position - early.position) > 0.15
-    moved = skill.predict(hands, still, still, clock=np.array([4.8, 1.0, 0.0]))
-    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.01, 0.01))
+    moved = at_rest(skill, hands, clock=np.array([4.8, 1.0, 0.0]))
+    behind, ahead = (at_rest(skill, hands, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.01, 0.01))
     np.testing.assert_allclose(moved.velocity, (ahead.position - behind.position) / 0.02, atol=2e-3)
 
 
@@ -163,7 +162,7 @@ def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
 def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     shown = named(6, timetable=True)
     skill = learn(shown)
-    figures = msgspec.json.decode(skill.figures, type=Figures)
+    figures = figures_of(skill)
     assert isinstance(skill.model, StagedKMP)
     assert skill.model.clock is not None
     assert not skill.model.clock.waits
@@ -173,11 +172,11 @@ def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
     back = decoded(skill.file, origin="again")
     assert isinstance(back.model, StagedKMP)
     assert back.model.clock == skill.model.clock
-    hands, still = shown[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
-    early, moving, late = (skill.predict(hands, still, still, clock=np.array([t, 1.0, 0.0])) for t in (3.0, 4.8, 7.0))
+    hands = shown[0].hands[-1]
+    early, moving, late = (at_rest(skill, hands, clock=np.array([t, 1.0, 0.0])) for t in (3.0, 4.8, 7.0))
     assert np.linalg.norm(late.position - shown[0].tool[-1, :3]) < 0.02
     assert np.linalg.norm(late.position - early.position) > 0.2
-    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.02, 0.02))
+    behind, ahead = (at_rest(skill, hands, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.02, 0.02))
     np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
 
 
@@ -203,10 +202,3 @@ def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
     assert seconds[199] == pytest.approx(1.9, abs=0.05)
     assert not any(seconds[200:300])
     assert seconds[-1] == pytest.approx(0.9, abs=0.05)
-
-
-def test_a_file_with_a_broken_clock_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    skill = learn(takes(6, timetable=True))
-    monkeypatch.setattr(TaskClock, "numbers", np.full(13, np.inf))
-    with pytest.raises(SkillError, match="task_clock"):
-        decoded(with_file(skill).file, origin="broken")

@@ -88,7 +88,7 @@ def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, toler
 def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation):
     inputs, reference = database()
     primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
-    points = Gaussians(np.zeros((80, 3)), np.tile(1e-4 * np.eye(3), (80, 1, 1)))
+    points = Gaussians.of(np.zeros((80, 3)), deviation=0.01)
     elsewhere = 40.0 + 3 * np.random.default_rng(0).normal(size=(80, 4))
     adapted = primitive.adapt(elsewhere, points, tolerance=0.1)
     assert len(adapted.inputs) == 110
@@ -118,7 +118,7 @@ def test_adapting_leaves_the_primitive_as_it_was():
 def test_a_via_point_that_is_missed_is_named_with_the_numbers():
     primitive = skill()
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
-    points = Gaussians([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], np.tile(1e-4 * np.eye(3), (3, 1, 1)))
+    points = Gaussians.of([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], deviation=0.01)
     says = r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell"
     with pytest.warns(ViaPointMissed, match=says) as told:
         adapted = primitive.adapt(near, points, tolerance=0)
@@ -130,5 +130,5 @@ def test_a_via_point_that_is_missed_is_named_with_the_numbers():
 def test_a_via_point_that_may_be_missed_or_is_missed_by_less_than_a_millimetre_is_not_named():
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
     for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
-        points = Gaussians([[0.0, 0, 0], [apart, 0, 0]], np.tile(std**2 * np.eye(3), (2, 1, 1)))
+        points = Gaussians.of([[0.0, 0, 0], [apart, 0, 0]], deviation=std)
         skill().adapt(near, points, tolerance=0)

@@ -80,7 +80,7 @@ def test_it_is_as_if_what_is_left_had_been_learned(kernel, representation, how):
 def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
     _, one, _ = both("a length an input", "dense", "fitted")
     where, wanted = one.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
-    exact = Gaussians(wanted, np.tile(1e-8 * np.eye(2), (2, 1, 1)))
+    exact = Gaussians.of(wanted, deviation=1e-4)
     through = one.adapt(where, exact, tolerance=0.0, directions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     np.testing.assert_allclose(through.mean(where[:1])[0], wanted[0], atol=1e-3)
     np.testing.assert_allclose(through.jacobian(where[0])[:, 0], wanted[1], atol=1e-3)

@@ -13,7 +13,7 @@ from support.primitives import naive
 RANDOM = np.random.default_rng(0)
 S = RANDOM.normal(size=(60, 4))
 TRUTH = lambda s: np.stack([np.sin(s[:, 0]), s[:, 1] * s[:, 2], np.cos(s[:, 3])], axis=1)  # noqa: E731
-REFERENCE = Gaussians(TRUTH(S), np.tile(1e-3 * np.eye(3), (60, 1, 1)))
+REFERENCE = Gaussians.of(TRUTH(S), deviation=0.03)
 PLACE = S[:1] + 0.1
 FOLLOW = np.eye(3, 4)[None]  # the output follows the first three inputs
 KERNELS = {
@@ -30,7 +30,7 @@ def base(representation="dense", kernel="a length an input", **options):
 
 
 def taught(one, deviation=1e-4):
-    desired = Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)])
+    desired = Gaussians.of(TRUTH(S[:1]), deviation=1e-4)
     return one.adapt(PLACE, desired, tolerance=0.3).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
 
 
@@ -67,13 +67,13 @@ def test_a_taught_jacobian_is_the_jacobian_there_and_the_place_is_still_met(repr
     step = 0.01 * RANDOM.normal(size=(5, 4))
     follows = TRUTH(S[:1]) + step @ FOLLOW[0].T
     np.testing.assert_allclose(one.mean(PLACE + step), follows, atol=1e-3)
-    bare = base(representation, kernel).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    bare = base(representation, kernel).adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
     assert np.abs(bare.mean(PLACE + step) - follows).max() > 4e-3
 
 
 def test_one_point_with_its_jacobian_says_what_thirteen_points_say():
     step = np.concatenate([np.zeros((1, 4)), 0.03 * np.eye(4), -0.03 * np.eye(4)])
-    around = Gaussians(TRUTH(S[:1]) + step @ FOLLOW[0].T, np.tile(1e-8 * np.eye(3), (9, 1, 1)))
+    around = Gaussians.of(TRUTH(S[:1]) + step @ FOLLOW[0].T, deviation=1e-4)
     nine, one = base().adapt(PLACE + step, around, tolerance=0.3), taught(base())
     queries = PLACE + 0.01 * RANDOM.normal(size=(20, 4))
     np.testing.assert_allclose(one.mean(queries), nine.mean(queries), atol=1e-3)
@@ -97,7 +97,7 @@ def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_was(representation):
-    before = base(representation).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    before = base(representation).adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
     after = taught(base(representation))
     near, far = PLACE + 0.05, np.full((1, 4), 9.0)
     a, b = (np.trace(one.predict(near).covariance[0]) for one in (before, after))
@@ -114,7 +114,7 @@ def test_over_time_a_derivative_can_be_taught_too(kernel):
     mean = np.hstack([np.sin(w * t), w * np.cos(w * t)])
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 1e-2]), (50, 1, 1)))
     one = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
-    wanted = Gaussians([[5.0, 2.0]], [1e-8 * np.eye(2)])
+    wanted = Gaussians.of([[5.0, 2.0]], deviation=1e-4)
     adapted, h = one.adapt([[0.6]], wanted, tolerance=0, directions=[[1.0]]), 1e-5
     ahead, behind = adapted.mean([[0.6 + h]]), adapted.mean([[0.6 - h]])
     np.testing.assert_allclose((ahead - behind) / (2 * h), wanted.mean, atol=1e-3)
@@ -125,7 +125,7 @@ def test_over_time_a_derivative_can_be_taught_too(kernel):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_velocity_is_a_derivative_along_the_inputs_velocity(representation):
-    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians([[0.1, 0.2, -0.3]], [1e-8 * np.eye(3)])
+    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
     one = base(representation).adapt(PLACE, wanted, tolerance=9.0, directions=v)
     np.testing.assert_allclose(one.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, wanted.mean[0], atol=1e-5)
     assert len(one.inputs) == 61  # no reference point gave way

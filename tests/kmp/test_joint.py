@@ -79,10 +79,10 @@ def test_jacobians_are_those_of_one_by_one(skill):
 def test_a_rhythmic_skill_has_no_seam(representation):
     phase = np.linspace(0, 2 * np.pi, 60, endpoint=False)[:, None]
     mean = np.hstack([np.sin(phase), np.cos(2 * phase)])
-    reference = Gaussians(mean, np.tile(1e-4 * np.eye(2), (60, 1, 1)))
+    reference = Gaussians.of(mean, deviation=0.01)
     kernel = PeriodicKernel(1.0, 2 * np.pi)
     one = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
-    via = one.adapt([[2 * np.pi - 0.02]], Gaussians([[0.2, 0.9]], [1e-8 * np.eye(2)]), tolerance=0.06)
+    via = one.adapt([[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06)
     assert list(via.inner.changes.replaced) == [0]  # the nearest round the circle
     a, b = np.zeros((1, 1)), np.full((1, 1), 2 * np.pi)
     for skill in (one, via):

@@ -52,7 +52,7 @@ def points(seed, count, std=1e-4, spread=0.05):
     random = np.random.default_rng(seed)
     inputs = tube(seed + 1, count)[0] + spread * random.normal(size=(count, 6))
     mean = 0.2 * random.normal(size=(count, 3))
-    return inputs, Gaussians(mean, np.tile(std**2 * np.eye(3), (count, 1, 1)))
+    return inputs, Gaussians.of(mean, deviation=std)
 
 
 def agree(dense, low, queries, within=1e-6):
@@ -164,7 +164,7 @@ def test_position_with_velocity_too():
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 2e-3, 0.1, 0.1]), (150, 1, 1)))
     dense, low = of_both(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1)
     agree(dense, low, t[::10] + 0.003, within=1e-5)
-    via = [[0.77]], Gaussians([[0.9, 0.0, 0.5, -2.0]], [1e-8 * np.eye(4)])
+    via = [[0.77]], Gaussians.of([[0.9, 0.0, 0.5, -2.0]], deviation=1e-4)
     dense, low = (one.adapt(*via, tolerance=0.01) for one in (dense, low))
     agree(dense, low, t[::10] + 0.003, within=1e-5)
     np.testing.assert_allclose(low.mean([[0.77]]), [[0.9, 0.0, 0.5, -2.0]], atol=1e-3)
@@ -298,7 +298,7 @@ def test_derivatives_of_values_and_rates_are_features_too(count, ell, rank):
         np.testing.assert_allclose(low.mean(t), dense.mean(t), atol=1e-9)
         again = named_arrays.from_arrays(named_arrays.to_arrays(low))
         assert np.array_equal(again.mean(queries), low.mean(queries))
-        via = [[0.77]], Gaussians([[2.0, 0.0]], [1e-3 * np.eye(2)])
+        via = [[0.77]], Gaussians.of([[2.0, 0.0]], deviation=0.03)
         a, b = (one.adapt(*via, tolerance=0.0, directions=[[1.0]]) for one in (dense, low))
         np.testing.assert_allclose(b.mean(t), a.mean(t), atol=1e-5)
 
@@ -306,9 +306,9 @@ def test_derivatives_of_values_and_rates_are_features_too(count, ell, rank):
 def test_as_many_via_points_with_rates_as_features_are_solved_anew():
     t = np.linspace(0, 2, 8)[:, None]
     mean = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t)])
-    reference = Gaussians(mean, np.tile(1e-3 * np.eye(2), (8, 1, 1)))
+    reference = Gaussians.of(mean, deviation=0.03)
     dense, low = of_both(t, reference, kernel=VelocityKernel(200.0), lambda_mean=0.1)
     s = np.linspace(0.05, 1.95, 240)[:, None]
-    wish = Gaussians(np.hstack([np.sin(3 * s), 3 * np.cos(3 * s)]), np.tile(1e-3 * np.eye(2), (240, 1, 1)))
+    wish = Gaussians.of(np.hstack([np.sin(3 * s), 3 * np.cos(3 * s)]), deviation=0.03)
     dense, low = (one.adapt(s, wish, tolerance=0.0) for one in (dense, low))
     np.testing.assert_allclose(low.mean(s), dense.mean(s), atol=1e-6)

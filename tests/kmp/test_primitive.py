@@ -314,7 +314,7 @@ def test_mean_and_covariance_have_nine_digits(lambda_covariance, ell, adapted):
     )
     queries = np.concatenate([inputs[::10] + 0.01, inputs[30:31] + 0.5, inputs[:1]])
     if adapted:
-        via = Gaussians(reference.mean[[20, 40]] + 0.05, np.tile(1e-8 * np.eye(3), (2, 1, 1)))
+        via = Gaussians.of(reference.mean[[20, 40]] + 0.05, deviation=1e-4)
         primitive = primitive.adapt(inputs[[20, 40]] + 0.01, via, tolerance=0.05)
         queries = np.concatenate([queries, primitive.via_inputs])
     check(primitive, queries)
@@ -328,7 +328,7 @@ def test_position_with_velocity_has_nine_digits(adapted):
     reference = Gaussians(mean, np.tile(np.diag([0.1, 0.2, 1.0, 1.0]), (50, 1, 1)))
     primitive = KMP.fit(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1)
     if adapted:
-        via = Gaussians([[3.0, 2.0, 0.0, 5.0]], [1e-6 * np.eye(4)])
+        via = Gaussians.of([[3.0, 2.0, 0.0, 5.0]], deviation=1e-3)
         primitive = primitive.adapt([[0.7]], via, tolerance=0.01)
     check(primitive, np.linspace(0.01, 2.2, 9)[:, None])
 

@@ -17,12 +17,13 @@ from service.learning.table import table
 from service.settings.config import Reach
 from sim.made_tasks import takes
 from support.paths import ROOT
+from support.skills import figures_of
 from support.taught_scene import demonstrated
 
 
 def judged(demonstrations: list[Demonstration], **options: object) -> Figures:
     """The figures of what is learned from these."""
-    return msgspec.json.decode(learn(demonstrations, points=80, **options).figures, type=Figures)  # type: ignore[arg-type]
+    return figures_of(learn(demonstrations, points=80, **options))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

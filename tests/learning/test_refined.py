@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,18 +14,14 @@ from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration, NamedDemonstration
 from service.learning.learn import learn
 from service.learning.methods.weights import chosen
-from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
 from service.learning.table import table
 from sim.made_tasks import takes
 from support.circling import circling
+from support.skills import figures_of
 
 HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
-
-
-def figures_of(skill: StoredSkill) -> Figures:
-    return msgspec.json.decode(skill.figures, type=Figures)
 
 
 def with_habit(one: Demonstration) -> Demonstration:

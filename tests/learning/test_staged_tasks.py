@@ -4,7 +4,6 @@ a place may be visited twice, and what its file may hold.
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import replace
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.skill import TURNS
 from service.core.skill.memory import turn_lag_s
@@ -31,6 +29,7 @@ from service.learning.via_points import adapted, in_force, warnings_of
 from sim.experiments.people.left_out import judged, left_out, predicted
 from sim.made_tasks import CARRIED_M, takes
 from sim.teach import by_people
+from support.skills import STILL, at_rest, figures_of, file_with, turns_of
 
 AT_REST = np.zeros(6)
 
@@ -86,14 +85,14 @@ def test_a_moving_hand_is_on_its_way_and_a_trembling_one_moves_nothing(between: 
     going = np.zeros(2)
 
     def at(hands: np.ndarray) -> np.ndarray:
-        return between.predict(hands, np.zeros((2, 3)), np.zeros((2, 3)), going, belief=belief).position
+        return between.predict(hands, STILL, STILL, going, belief=belief).position
 
-    found = between.predict(half, 0.6 * way, np.zeros((2, 3)), going, belief=belief)
+    found = between.predict(half, 0.6 * way, STILL, going, belief=belief)
     h = 1e-2
     slope = (at(half + 0.6 * h * way) - at(half - 0.6 * h * way)) / (2 * h)
     np.testing.assert_allclose(found.velocity, slope, atol=0.06)
     assert np.linalg.norm(slope) > 0.1
-    calm = between.predict(half, 0.02 * way, np.zeros((2, 3)), going, belief=belief)
+    calm = between.predict(half, 0.02 * way, STILL, going, belief=belief)
     assert np.linalg.norm(calm.velocity) < 2e-3
     assert np.linalg.eigvalsh(found.covariance).min() > 0
 
@@ -136,15 +135,10 @@ def test_its_file_holds_it_exactly_and_what_does_not_fit_is_refused(between: Ski
     hands = between.hands + 0.01
     assert back.mean(hands).tobytes() == between.mean(hands).tobytes()
     assert back.file == between.file
-    with np.load(io.BytesIO(between.file)) as archive:
-        arrays = dict(archive)
 
     def refusal(**changes: Any) -> str:
-        spoilt = arrays | changes
-        out = io.BytesIO()
-        np.savez(out, allow_pickle=False, **spoilt | {"checksum": np.array(checksum(spoilt))})
         with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
-            decoded(out.getvalue(), origin="x.npz")
+            decoded(file_with(between, **changes), origin="x.npz")
         return str(caught.value)
 
     assert "corners has 99, 0 to 65" in refusal(corners=np.full((4, 2), 99))
@@ -210,7 +204,7 @@ def test_six_places_of_each_hand_are_learned() -> None:
 
 
 def test_the_teachers_delay_is_learned_and_the_tool_led_by_less(cyclic: Skill) -> None:
-    figures = msgspec.json.decode(cyclic.figures, type=Figures)
+    figures = figures_of(cyclic)
     late_s, std_s = figures.delay_s, figures.delay_std_s
     assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)  # the mean of 0.09 to 0.34 s
     assert 0.0 < std_s < 0.2
@@ -244,7 +238,7 @@ def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
     skill = learn(shown, name="path")
     assert isinstance(skill.model, StagedKMP)
     assert decoded(skill.file, origin="memory").model.task.leads == skill.model.task.leads
-    return skill.model.task.leads, msgspec.json.decode(skill.figures, type=Figures)
+    return skill.model.task.leads, figures_of(skill)
 
 
 @pytest.mark.thorough
@@ -283,7 +277,7 @@ def carried() -> StoredSkill:
 
 @pytest.mark.thorough
 def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carried: StoredSkill) -> None:
-    figures = msgspec.json.decode(carried.figures, type=Figures)
+    figures = figures_of(carried)
     assert figures.taken == "orientation of the left hand"
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, StagedKMP)
@@ -296,22 +290,16 @@ def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carrie
 
 @pytest.mark.thorough
 def test_its_velocity_is_that_of_the_turning_hand_and_without_orientation_it_moves_only(carried: StoredSkill) -> None:
-    model, still = carried.model, np.zeros((2, 3))
+    model = carried.model
     hands, belief = model.hands[1].reshape(2, 3), model.belief(model.hands[1])
     lag_s, h, rate = turn_lag_s(model.delay_s), 1e-3, np.array([0.0, 0.0, 0.5])
-
-    def turns(at_s: float) -> np.ndarray:
-        """The rows of the filters of hands that turn evenly: each lags by as much again."""
-        rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel() for i in range(TURNS)]
-        return np.stack([rows, rows], axis=1)
-
     behind, now, ahead = (
-        carried.predict(hands, still, still, turns=turns(at_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
+        at_rest(carried, hands, turns=turns_of(rate, at_s, lag_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
     )
     np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
     lever = Rotation.from_rotvec(-TURNS * lag_s * rate).apply(CARRIED_M)
     np.testing.assert_allclose(now.velocity, np.cross(rate, lever), atol=0.01)
     np.testing.assert_allclose(now.position, hands[0] + lever, atol=0.02)
-    untold = carried.predict(hands, still, still, belief=belief.copy())
+    untold = at_rest(carried, hands, belief=belief.copy())
     assert not untold.velocity.any()
     np.testing.assert_allclose(untold.position, model.nominal.at[1, 6:], atol=0.02)

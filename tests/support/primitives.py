@@ -47,7 +47,7 @@ def skill(seed=0, *, lambda_covariance=None, prior_mean=None, representation="de
 
 def via(seed, count, inputs=4, outputs=3, std=1e-4):
     random = np.random.default_rng(seed)
-    points = Gaussians(random.normal(size=(count, outputs)), np.tile(std**2 * np.eye(outputs), (count, 1, 1)))
+    points = Gaussians.of(random.normal(size=(count, outputs)), deviation=std)
     return random.normal(size=(count, inputs)), points
 
 
