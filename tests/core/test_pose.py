@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.contract import cdr
 from service.core.arm.stage import Arm
-from service.core.controller import Controller, outgoing
+from service.core.controller import outgoing
 from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.stage import Limiter
@@ -27,7 +27,8 @@ from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
-from support.in_process import ASSUMED, frames, ticks_of
+from support.followed import followed
+from support.in_process import ticks_of
 from support.wam import FRAME, URDF
 
 PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
@@ -130,7 +131,7 @@ def test_an_orientation_taught_at_a_place_is_predicted_and_followed_there(skill:
     x, y, z, w = turned.tolist()
     taught = adapted(skill, (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))), tolerance=0.05)
     script = HandScript(msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0)
-    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
+    seen = followed(taught, ticks_of(script))
     last = seen[-300:]
     assert np.abs(last["orientation"] @ turned).min() > math.cos(math.radians(1.0))
     axis = Rotation.from_quat(last["tool_orientation"]).apply([0, 0, 1.0])

@@ -10,7 +10,6 @@ import pytest
 
 from service.contract.records import Mode, Reason
 from service.contract.requests import Hands, ViaPoint
-from service.core.controller import Controller
 from service.core.frame import Records, Tick
 from service.core.skill.staged import StagedKMP
 from service.files.demonstration_files import summary
@@ -24,10 +23,10 @@ from service.learning.table import table
 from service.learning.via_points import adapted
 from sim.made_tasks import takes
 from support.circling import circling
-from support.in_process import ASSUMED, frames, hand
+from support.followed import followed
+from support.in_process import ASSUMED, hand
 from support.skills import STILL, at_rest, figures_of
 from support.spoiled import Streams, streams_of, write_streams
-from support.wam import URDF
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
 Point = tuple[float, float, float]
@@ -168,7 +167,7 @@ def served(
         events = [hand(one, AT, k + 1)] if k % 5 == 0 and k < one_to else []
         events += [hand(other, at, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
         ticks.append(Tick(k, tuple(events)))
-    return frames(Controller(ASSUMED, skill, urdf=URDF), ticks)
+    return followed(skill, ticks)
 
 
 def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200) -> list[tuple[int, int]]:
