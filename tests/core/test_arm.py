@@ -289,14 +289,6 @@ def test_a_step_never_raises_nor_returns_nan(
     assert (solution.velocity[q <= LOWER] >= 0).all()
 
 
-def test_a_step_follows_from_its_arguments_alone() -> None:
-    used = Arm(CELL, URDF)
-    for q in random_joints(20, seed=6):
-        fresh = Arm(CELL, URDF).step(q, START, STILL, AHEAD)
-        again = used.step(q, START, STILL, AHEAD)
-        assert fresh.velocity.tobytes() == again.velocity.tobytes()
-
-
 def test_the_wanted_velocity_of_the_joints_is_continuous_across_their_limits() -> None:
     rng = np.random.default_rng(7)
     for _ in range(200):

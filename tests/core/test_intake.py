@@ -107,6 +107,7 @@ BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
         ("camera", "base", IN_BASE),  # not mapped again, as the tracker has a frame of its own
         ("camera", "optitrack", BY_ITS_TABLE),
         ("camera", "vicon/world", IN_BASE),
+        ("camera", "headset", None),
         ("base", "camera", None),
         ("base", "Base", None),
         ("base", "base\0", None),

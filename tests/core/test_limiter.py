@@ -212,21 +212,6 @@ def test_a_nan_stops_all_joints() -> None:
     assert np.abs(state[1]).max() < 1e-12
 
 
-def test_it_continues_bit_for_bit_from_a_saved_state() -> None:
-    rng = np.random.default_rng(3)
-    wanted = np.repeat(rng.uniform(-2, 2, (30, 7)), 25, axis=0)
-    through = Limiter(LIMITS, PERIOD)
-    state: tuple[Vector, Vector, Vector] = (REST, REST, REST)
-    for velocity in wanted:
-        q, dq, ddq = (np.array(values.tolist()) for values in state)
-        fresh = Limiter(LIMITS, PERIOD).step(q, dq, ddq, velocity)
-        result = through.step(*state, velocity)
-        for one, other in zip(result[:3], fresh[:3], strict=True):
-            assert one.tobytes() == other.tobytes()
-        assert result.limited == fresh.limited
-        state = result[:3]
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300, 1e9])
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_a_state_that_is_no_state_neither_raises_nor_moves_the_others(bad: float, which: int) -> None:

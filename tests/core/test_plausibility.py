@@ -379,7 +379,7 @@ def test_compiled_and_plain_memory_agree() -> None:
 
 
 def uneven(rate_hz: float, seconds: float, kind: str, seed: int) -> Vector:
-    """Times [s] of a tracker's samples that come evenly, early or late, at random, or three at once."""
+    """Times [s] of samples that come evenly, early or late, at random, or three at once."""
     random, count = np.random.default_rng(seed), int(rate_hz * seconds)
     if kind == "random":
         return np.cumsum(random.exponential(1 / rate_hz, count))

@@ -100,9 +100,8 @@ def test_distances_of_capsules_are_those_of_coal() -> None:
         if random.random() < 0.2:
             one[1] = one[0]  # a ball
         found = between_segments(one, other, near)
-        assert found - 0.02 == pytest.approx(
-            coal_shapes.distance(coal_shapes.capsule(one), coal_shapes.capsule(other)), abs=1e-5
-        )
+        expected = coal_shapes.distance(coal_shapes.capsule(one), coal_shapes.capsule(other))
+        assert found - 0.02 == pytest.approx(expected, abs=1e-5)
         assert np.linalg.norm(near[3:6] - near[:3]) == pytest.approx(found, abs=1e-12)
         assert near[:3] + found * near[6:] == pytest.approx(near[3:6], abs=1e-9)
 

@@ -158,18 +158,6 @@ def test_one_point_alone():
     np.testing.assert_allclose(one.predict([[1.0]]).covariance, [[[1 - 1 / 1.5]]])
 
 
-def test_position_with_velocity_too():
-    t = np.linspace(0, 2, 150)[:, None]
-    mean = np.hstack([np.sin(3 * t), np.cos(2 * t), 3 * np.cos(3 * t), -2 * np.sin(2 * t)])
-    reference = Gaussians(mean, np.tile(np.diag([1e-3, 2e-3, 0.1, 0.1]), (150, 1, 1)))
-    dense, low = of_both(t, reference, kernel=VelocityKernel(8.0), lambda_mean=0.1)
-    agree(dense, low, t[::10] + 0.003, within=1e-5)
-    via = [[0.77]], Gaussians.of([[0.9, 0.0, 0.5, -2.0]], deviation=1e-4)
-    dense, low = (one.adapt(*via, tolerance=0.01) for one in (dense, low))
-    agree(dense, low, t[::10] + 0.003, within=1e-5)
-    np.testing.assert_allclose(low.mean([[0.77]]), [[0.9, 0.0, 0.5, -2.0]], atol=1e-3)
-
-
 def correlated(seed, count, outputs, spread):
     """A path over time with its rates, and correlations: deviations of 10 mm to 10 mm / spread."""
     random, t = np.random.default_rng(seed), np.linspace(0, 2, count)[:, None]

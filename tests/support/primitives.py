@@ -57,7 +57,7 @@ def naive(one, queries):
     """
     known = one.inner.solution.database.functionals
     outputs = one.reference.outputs
-    unit = np.eye(outputs)
+    unit = np.eye(outputs // one.kernel.channels)
     sigma = block_diag(*one.reference.covariance)
     big = np.kron(between(one.kernel, known, known), unit)
     row = np.kron(between(one.kernel, Functionals(queries), known), unit)
