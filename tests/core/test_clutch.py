@@ -16,7 +16,7 @@ from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import Scene
-from support.followed import followed
+from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, Loop, clutch, resting, wish
 
 LOOP_RATES_HZ = (100, 250, 500, 1000)
@@ -26,8 +26,7 @@ STALE_S = 0.3
 
 def cell(base: Settings = ASSUMED, rate_hz: int = 500, **hands: Any) -> Settings:
     """A cell with a clutch, or with other settings of [hands]."""
-    changed = msgspec.structs.replace(base.hands, **(hands or {"clutch": "key"}))
-    return msgspec.structs.replace(base, rate_hz=rate_hz, hands=changed)
+    return changed(base, rate_hz=rate_hz, hands=hands or {"clutch": "key"})
 
 
 def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Event, ...]]:

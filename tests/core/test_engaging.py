@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,8 +19,8 @@ from service.settings.config import Settings, SettingsError, ToolSettings, parse
 from sim.scene import Scene
 from sim.script import HandScript
 from support.arm_geometry import ArmGeometry
-from support.followed import followed
-from support.in_process import ASSUMED, Loop, assert_limits_hold, clutch, led, ticks_of
+from support.followed import changed, followed
+from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, led, ticks_of
 from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
 
 BRIEF_HOLD_S = TUNING.intake.tracker_memory_s
@@ -31,15 +30,14 @@ ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
 E = 0.15  # [m/s]
 LOOP_HZ = (100, 250, 500, 1000)
 TOOL_RISE_MPS = 0.1  # the tool may be faster than its slow setpoint, as in a stop
+RAISED = np.array(((0.75, -0.30, 0.25), RIGHT))  # hands of which the left one is on its way
 RESUMED = 600  # tick in which the hands of the script move
 inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
 wild = st.tuples(*(st.floats(-1e3, 1e3),) * 3)
 
 
 def cell(base: Settings = ASSUMED, rate_hz: int = 500, engage_speed: float = E, **hands: Any) -> Settings:
-    tool = msgspec.structs.replace(base.tool, engage_speed=engage_speed)
-    changed = msgspec.structs.replace(base.hands, **hands)
-    return msgspec.structs.replace(base, rate_hz=rate_hz, tool=tool, hands=changed)
+    return changed(base, rate_hz=rate_hz, tool={"engage_speed": engage_speed}, hands=hands)
 
 
 def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
@@ -116,9 +114,9 @@ def test_every_following_begins_slowly_also_after_a_fault(taught: Skill) -> None
     begins = int(np.argmax(failed["mode"] == Mode.FOLLOW))
     assert begins >= 200
     assert not engages(failed)[begins]  # it is at its target still
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     loop.run(1500)
-    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: np.array((LEFT, RIGHT))
     again = loop.run(1500, {0: order("fault"), 400: order("reset")})
     begins = int(np.argmax(again["mode"][400:] == Mode.FOLLOW)) + 400
     assert engages(again)[begins]
@@ -141,12 +139,12 @@ def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
 ) -> None:
     """Unseen hands hold the arm 0.1 s later. They have moved when they are seen again."""
     loop = Loop(cell(Settings()), taught)
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     assert not engages(loop.run(3000))[-1]
     loop.hands = None
     unseen = loop.run(round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()})
     assert unseen["mode"][-1] != Mode.FOLLOW
-    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: np.array((LEFT, RIGHT))
     seen = loop.run(1000)
     begins = int(np.argmax(seen["mode"] == Mode.FOLLOW))
     assert seen["mode"][begins] == Mode.FOLLOW
@@ -158,7 +156,7 @@ def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
 
 def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
     loop = Loop(cell(Settings(), engage_speed=0.02), taught)
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     assert engages(loop.run(1000))[-1]
     moving, loop.hands = loop.hands, None
     assert loop.run(150)["mode"][-1] == Mode.HOLD

@@ -27,7 +27,7 @@ from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
-from support.followed import followed
+from support.followed import changed, followed
 from support.in_process import ticks_of
 from support.wam import FRAME, URDF
 
@@ -35,10 +35,6 @@ PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
 
 
 PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
-
-
-def full(settings: Settings) -> Settings:
-    return msgspec.structs.replace(settings, tool=msgspec.structs.replace(settings.tool, orientation="full"))
 
 
 def random_rotations(count: int, seed: int) -> Rotation:
@@ -92,7 +88,7 @@ def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> Non
 
 @pytest.mark.parametrize("about", [False, True])
 def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(about: bool) -> None:
-    settings = full(Settings()) if about else Settings()
+    settings = changed(Settings(), tool={"orientation": "full"}) if about else Settings()
     lead, state = OrientationSetpoint(settings), blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
     target = Rotation.from_rotvec(math.radians(120) * np.array([1.0, 2.0, 2.0]) / 3.0)
@@ -111,7 +107,7 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
 
 
 def test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to() -> None:
-    settings = full(Settings())
+    settings = changed(Settings(), tool={"orientation": "full"})
     arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
     q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
     here = arm.at(q)

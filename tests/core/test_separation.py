@@ -36,7 +36,7 @@ from sim.scene import Scene
 from sim.script import HandScript
 from support import coal_shapes
 from support.arms import MODELS, cell_of
-from support.followed import followed
+from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, seen
 from support.wam import STATE, URDF
 
@@ -130,9 +130,7 @@ def test_a_stop_from_the_allowed_speed_ends_the_clearance_away(hand_speed: float
 
 
 def test_constraints_are_how_fast_distances_shrink() -> None:
-    settings = msgspec.structs.replace(
-        ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
-    )
+    settings = changed(ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),)))
     apart, table = Separation(settings, URDF), settings.table
     low, high = (
         np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M],
@@ -200,16 +198,15 @@ def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5)
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     """The hand stops where the arm, which stays where it is, does not touch it."""
-    uncertain = msgspec.structs.replace(ASSUMED.people, position_uncertainty=0.03)
-    cell = msgspec.structs.replace(cell_of(arm), people=uncertain)
+    cell = changed(cell_of(arm), people={"position_uncertainty": 0.03})
     ticks, hands = zip(*thrust((0.53, -0.27, 0.37), 1.2), strict=True)
     seen = followed(taught, list(ticks), cell)
     assert (seen["flags"] & Flag.SEPARATION).any() or (seen["mode"] == Mode.HOLD).any()
     distance, speed, _, _ = nearest(seen, np.array(hands), cell)
     assert distance.min() > 0
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
-    least_m = uncertain.clearance + uncertain.position_uncertainty
-    allowed = np.array([allowed_speed(d, 0.0, uncertain.brake, 0.13, least_m) for d in distance[late].ravel()])
+    least_m = cell.people.clearance + cell.people.position_uncertainty
+    allowed = np.array([allowed_speed(d, 0.0, cell.people.brake, 0.13, least_m) for d in distance[late].ravel()])
     assert (speed[late].ravel() - allowed).max() <= SLIP_SPEED_MPS + 1e-3
 
 
@@ -234,8 +231,8 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
     body = body_of(cell, urdf)
     box = Box(centre=(0.52, -0.2, 0.36), half_size=(0.08, 0.04, 0.3))
     cells = [
-        msgspec.structs.replace(cell, table=TableTop(centre=(0.8, 0.0, 0.27))),
-        msgspec.structs.replace(cell, obstacles=Obstacles(boxes=(box,))),
+        changed(cell, table=TableTop(centre=(0.8, 0.0, 0.27))),
+        changed(cell, obstacles=Obstacles(boxes=(box,))),
     ]
     for settings in cells:
         seen = followed(taught, [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)], settings)
@@ -275,7 +272,7 @@ def _apart_from(corners: Vector, capsules: Vector, body: Body) -> list[float]:
 def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(
     taught: Skill, boxes: tuple[Box, ...], seconds: float
 ) -> None:
-    settings = msgspec.structs.replace(ASSUMED, obstacles=Obstacles(boxes=boxes))
+    settings = changed(ASSUMED, obstacles=Obstacles(boxes=boxes))
     ticks = [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, seconds)]
     seen, free = (followed(taught, ticks, s) for s in (settings, ASSUMED))
     assert (seen["mode"] == Mode.FOLLOW).all()

@@ -29,9 +29,12 @@ def base(representation="dense", kernel="a length an input", **options):
     return KMP.fit(S, REFERENCE, kernel=KERNELS[kernel], representation=representation, **options)
 
 
+def placed(one):
+    return one.adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
+
+
 def taught(one, deviation=1e-4):
-    desired = Gaussians.of(TRUTH(S[:1]), deviation=1e-4)
-    return one.adapt(PLACE, desired, tolerance=0.3).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
+    return placed(one).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -67,7 +70,7 @@ def test_a_taught_jacobian_is_the_jacobian_there_and_the_place_is_still_met(repr
     step = 0.01 * RANDOM.normal(size=(5, 4))
     follows = TRUTH(S[:1]) + step @ FOLLOW[0].T
     np.testing.assert_allclose(one.mean(PLACE + step), follows, atol=1e-3)
-    bare = base(representation, kernel).adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
+    bare = placed(base(representation, kernel))
     assert np.abs(bare.mean(PLACE + step) - follows).max() > 4e-3
 
 
@@ -97,7 +100,7 @@ def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_was(representation):
-    before = base(representation).adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
+    before = placed(base(representation))
     after = taught(base(representation))
     near, far = PLACE + 0.05, np.full((1, 4), 9.0)
     a, b = (np.trace(one.predict(near).covariance[0]) for one in (before, after))

@@ -21,11 +21,10 @@ from service.learning.learn import learn
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.table import table
 from service.learning.via_points import adapted
-from sim.made_tasks import takes
 from support.circling import circling
 from support.followed import followed
 from support.in_process import ASSUMED, hand
-from support.skills import STILL, at_rest, figures_of
+from support.skills import STILL, at_rest, figures_of, made
 from support.spoiled import Streams, streams_of, write_streams
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
@@ -103,7 +102,7 @@ def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: St
 def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() -> None:
     shown = []
     for seed in range(4):
-        take = takes("one_hand", people=(seed,), each=1)[0].demonstration
+        take = made("one_hand", [seed], each=1)[0]
         shown.append(take._replace(right=take.left, conducts="left"))
     learnt = learn(shown)
     assert isinstance(learnt.model, StagedKMP)

@@ -13,13 +13,12 @@ from service.learning.learn import learn
 from service.learning.methods.staged import is_clear
 from service.learning.skill_file import SkillError
 from service.learning.takes import takes_of
-from sim.made_tasks import takes
-from support.skills import figures_of
+from support.skills import figures_of, made
 
 
 @functools.cache
 def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
-    return [take.demonstration for take in takes(kind, people=range(people), each=2)]
+    return made(kind, range(people))
 
 
 @pytest.mark.thorough

@@ -27,9 +27,9 @@ from service.learning.skill_file import SkillError, StoredSkill, decoded, with_f
 from service.learning.table import table
 from service.learning.via_points import adapted, in_force, warnings_of
 from sim.experiments.people.left_out import judged, left_out, predicted
-from sim.made_tasks import CARRIED_M, takes
+from sim.made_tasks import CARRIED_M
 from sim.teach import by_people
-from support.skills import STILL, at_rest, figures_of, file_with, turns_of
+from support.skills import STILL, at_rest, figures_of, file_with, made, turns_of
 
 AT_REST = np.zeros(6)
 
@@ -173,9 +173,9 @@ def test_places_near_each_other_are_taught_as_stages_tell_them_apart(between: Sk
 def rms_mm(kind: str, skill: Skill) -> float:
     """The error at the moment in four takes of other people, through the core."""
     total, count = 0.0, 0
-    for take in takes(kind, people=(6, 7), each=2):
-        seen = left_out("", "", take.demonstration)
-        aimed = adapted(skill, take.demonstration.places, tolerance=0.05)
+    for demonstration in made(kind, (6, 7)):
+        seen = left_out("", "", demonstration)
+        aimed = adapted(skill, demonstration.places, tolerance=0.05)
         one = judged(seen, predicted(aimed, seen))
         total, count = total + one.squares, count + one.samples
     return 1000.0 * float(np.sqrt(total / count))
@@ -183,14 +183,14 @@ def rms_mm(kind: str, skill: Skill) -> float:
 
 @pytest.fixture(scope="module")
 def cyclic() -> Skill:
-    return learn([take.demonstration for take in takes("cyclic", people=range(4), each=2)])
+    return learn(made("cyclic", range(4)))
 
 
 def test_a_place_is_visited_twice_with_another_tool(cyclic: Skill) -> None:
     """Once the hands left it, what was before tells which visit it is."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
     assert rms_mm("cyclic", cyclic) < 50.0  # a Gaussian process with 2 s of memory: 51, one without: 101
-    places = {place.name: place for place in takes("cyclic", people=(6,), each=1)[0].demonstration.places}
+    places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
     aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
     one, again = places["left out"], places["left out again"]
     assert np.allclose(one.left, again.left)
@@ -199,7 +199,7 @@ def test_a_place_is_visited_twice_with_another_tool(cyclic: Skill) -> None:
 
 
 def test_six_places_of_each_hand_are_learned() -> None:
-    skill = learn([take.demonstration for take in takes("six", people=range(4), each=2)])
+    skill = learn(made("six", range(4)))
     assert rms_mm("six", skill) < 45.0  # nearest neighbours: 78
 
 
@@ -231,7 +231,7 @@ def without_follow(shown: Demonstration) -> Demonstration:
 @pytest.fixture(scope="module")
 def on_path() -> list[Demonstration]:
     """The tool follows the left hand, whatever the right one does."""
-    return [take.demonstration for take in takes("path", people=range(4), each=2)]
+    return made("path", range(4))
 
 
 def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
@@ -262,8 +262,8 @@ def test_a_hand_leads_only_where_it_is_followed_or_was_ahead(on_path: list[Demon
 
 
 def test_where_it_waits_it_waits_to_the_end() -> None:
-    skill = learn([take.demonstration for take in takes("three", people=range(3), each=2)], name="three")
-    places = takes("three", people=range(3), each=1)[0].demonstration.places
+    skill = learn(made("three", range(3)), name="three")
+    places = made("three", [0], each=1)[0].places
     there = adapted(skill, places, tolerance=0.05)
     left_alone = np.array([[*places[1].left, *places[0].right]])
     assert np.linalg.norm(there.mean(left_alone)[0] - places[0].tool) < 0.03
@@ -272,7 +272,7 @@ def test_where_it_waits_it_waits_to_the_end() -> None:
 @pytest.fixture(scope="module")
 def carried() -> StoredSkill:
     """The tool is fixed to what the left hand carries."""
-    return learn([without_follow(take.demonstration) for take in takes("heading", people=range(4), each=2)])
+    return learn([without_follow(one) for one in made("heading", range(4))])
 
 
 @pytest.mark.thorough

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -14,8 +15,10 @@ from kmp.storage import checksum
 from service.core.frame import Vector
 from service.core.skill import TURNS
 from service.core.skill.skill import Prediction, Skill
+from service.learning.demonstration import Demonstration
 from service.learning.records import Figures
 from service.learning.skill_file import StoredSkill
+from sim.made_tasks import takes
 
 STILL = np.zeros((2, 3))
 
@@ -47,3 +50,8 @@ def file_with(skill: Skill, **arrays: Any) -> bytes:
     out = io.BytesIO()
     np.savez(out, allow_pickle=True, **changed)
     return out.getvalue()
+
+
+def made(kind: str, people: Iterable[int], *, each: int = 2) -> list[Demonstration]:
+    """Demonstrations of a made task, some by each of the people."""
+    return [take.demonstration for take in takes(kind, people=people, each=each)]
