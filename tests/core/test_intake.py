@@ -5,6 +5,8 @@ between its samples.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -56,6 +58,16 @@ def test_a_rotation_turns_as_its_quaternion_does() -> None:
     np.testing.assert_allclose(rotation((-0.1, 0.4, -0.3, -0.8)), matrix)
 
 
+@contextmanager
+def only_counted(hands: Hands, cause: Cause) -> Iterator[None]:
+    """Assert that a sample is counted as rejected and changes nothing else."""
+    expected = hands.state.copy()
+    expected["rejected"][cause] += 1
+    yield
+    assert hands.rejected() == {cause: 1}
+    assert hands.state.tobytes() == expected.tobytes()
+
+
 @pytest.mark.parametrize(
     ("position", "turn", "cause"),
     [
@@ -74,11 +86,8 @@ def test_a_useless_hand_sample_is_counted_and_changes_nothing_else(
 ) -> None:
     hands = Hands()
     hands.hand(1)
-    before = hands.state.copy()
-    hands.hand(2, position, turn)
-    assert hands.rejected() == {cause: 1}
-    before["rejected"][cause] += 1
-    assert hands.state.tobytes() == before.tobytes()
+    with only_counted(hands, cause):
+        hands.hand(2, position, turn)
 
 
 def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
@@ -318,11 +327,8 @@ def test_a_useless_arm_sample_is_counted_and_changes_nothing_else(
 ) -> None:
     hands = Hands()
     hands.arm(1)
-    before = hands.state.copy()
-    hands.arm(2, names, position, velocity)
-    assert hands.rejected() == {cause: 1}
-    before["rejected"][cause] += 1
-    assert hands.state.tobytes() == before.tobytes()
+    with only_counted(hands, cause):
+        hands.arm(2, names, position, velocity)
 
 
 def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with_any_stamp() -> None:
