@@ -1,5 +1,6 @@
 """What every solution must be, whichever way it was found."""
 
+import inspect
 import tracemalloc
 
 import numpy as np
@@ -20,12 +21,14 @@ from kmp.dense import Dense
 from kmp.low_rank import LowRank
 from kmp.low_rank.solution import Conditioned
 from kmp.predictor import Inner
-from kmp.solution import mean_at
+from kmp.solution import Solution, mean_at
 
 S = np.random.default_rng(0).normal(size=(40, 2))
 REFERENCE = Gaussians.of(np.sin(S), deviation=0.1)
 VIA = S[:3] + 0.01, REFERENCE.take(slice(0, 3))
 MANY = S[:38] + 0.01, REFERENCE.take(slice(0, 38))
+
+MEMBERS = [name for name in vars(Solution) if not name.startswith("_")]
 
 
 def fitted(representation, via=None):
@@ -50,6 +53,19 @@ def primitive(request):
 def test_each_is_the_solution_that_is_meant():
     assert {type(primitive.inner.solution) for primitive, _ in SOLUTIONS.values()} == {Dense, LowRank, Conditioned}
     assert all(type(primitive.inner.solution) is kind for primitive, kind in SOLUTIONS.values())
+
+
+@pytest.mark.parametrize("kind", [Dense, LowRank, Conditioned])
+def test_a_method_takes_what_the_protocol_says(kind):
+    for name in MEMBERS:
+        wanted = vars(Solution)[name]
+        if inspect.isfunction(wanted):
+            given = inspect.signature(getattr(kind, name)).parameters
+            assert list(given) == list(inspect.signature(wanted).parameters), name
+
+
+def test_all_that_the_protocol_names_is_there(primitive):
+    assert [name for name in MEMBERS if not hasattr(primitive.inner.solution, name)] == []
 
 
 def test_counts_and_shapes_agree(primitive):
