@@ -263,6 +263,19 @@ def of_dmp(data: Data) -> Outcome:
     )
 
 
+def of_all(data: Data, ell: float, penalty: float) -> list[Outcome]:
+    """The rows of all methods."""
+    return [
+        of_kmp(data, ell, penalty),
+        of_chosen_kmp(data),
+        of_regression(data),
+        of_gmr(data),
+        of_gaussian_process(data, ell),
+        of_promp(data),
+        of_dmp(data),
+    ]
+
+
 COLUMNS = ("fit ms", "query us", "+ cov. us", "adapt ms", "RMSE mm", "via mm", "end mm")
 SCALES = (1e3, 1e6, 1e6, 1e3, 1e3, 1e3, 1e3)
 
@@ -294,25 +307,10 @@ def table_one(over_time: list[Outcome], by_hands: list[Outcome]) -> None:
 def main() -> None:
     warnings.simplefilter("ignore")
     with threadpool_limits(1):
-        over_time, by_hands = letters(), hands()
-        first = [
-            of_kmp(over_time, 8.0, 0.1),
-            of_chosen_kmp(over_time),
-            of_regression(over_time),
-            of_gmr(over_time),
-            of_gaussian_process(over_time, 8.0),
-            of_promp(over_time),
-            of_dmp(over_time),
-        ]
-        second = [
-            of_kmp(by_hands, 0.5, 2.0),
-            of_chosen_kmp(by_hands),
-            of_regression(by_hands),
-            of_gmr(by_hands),
-            of_gaussian_process(by_hands, 0.5),
-            of_promp(by_hands),
-            of_dmp(by_hands),
-        ]
+        over_time = letters()
+        by_hands = hands()
+        first = of_all(over_time, 8.0, 0.1)
+        second = of_all(by_hands, 0.5, 2.0)
     printed("Over time: 1 input, 2 outputs, 200 points", first)
     printed("By hands: 6 inputs, 3 outputs, 200 points", second)
     table_one(first, second)

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 
 from service.contract.records import Mode, Reason
-from service.core.controller import Controller
 from service.core.frame import Event, Tick, order
 from service.core.skill.pose import CLOSED, OPEN, UNKNOWN
 from service.core.skill.skill import Skill
 from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import Scene
-from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, frames, led, resting, wish
-from support.wam import URDF
+from support.followed import changed, followed
+from support.in_process import ASSUMED, LEFT, RIGHT, Loop, clutch, resting, wish
 
 LOOP_RATES_HZ = (100, 250, 500, 1000)
 SENT_HZ = 10
@@ -27,8 +26,7 @@ STALE_S = 0.3
 
 def cell(base: Settings = ASSUMED, rate_hz: int = 500, **hands: Any) -> Settings:
     """A cell with a clutch, or with other settings of [hands]."""
-    changed = msgspec.structs.replace(base.hands, **(hands or {"clutch": "key"}))
-    return msgspec.structs.replace(base, rate_hz=rate_hz, hands=changed)
+    return changed(base, rate_hz=rate_hz, hands=hands or {"clutch": "key"})
 
 
 def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Event, ...]]:
@@ -41,7 +39,7 @@ def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Eve
 
 
 def reasons(settings: Settings, skill: Skill, ticks: list[Tick]) -> np.ndarray:
-    seen = frames(Controller(settings, skill, urdf=URDF), ticks)
+    seen = followed(skill, ticks, settings)
     assert ((seen["mode"] == Mode.FOLLOW) == (seen["reason"] == Reason.NONE)).all()
     return seen["reason"]
 
@@ -73,8 +71,8 @@ def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
 
 
 def test_without_a_clutch_in_the_settings_its_messages_change_nothing(taught: Skill) -> None:
-    plain = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 300))
-    chattered = frames(Controller(ASSUMED, taught, urdf=URDF), resting(0, 300, lambda k: (clutch(k % 3 == 0), wish(1))))
+    plain = followed(taught, resting(0, 300))
+    chattered = followed(taught, resting(0, 300, lambda k: (clutch(k % 3 == 0), wish(1))))
     assert plain.tobytes() == chattered.tobytes()
 
 
@@ -83,25 +81,6 @@ def test_the_last_message_of_a_tick_counts(taught: Skill) -> None:
     found = reasons(cell(), taught, resting(0, 200, both))
     assert (found[:100] == Reason.CLUTCH).all()
     assert (found[100:] == Reason.NONE).all()
-
-
-@pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
-@pytest.mark.parametrize("period", [1, 2, 7, 40])
-def test_a_clutch_that_chatters_breaks_no_limit(taught: Skill, rate_hz: int, period: int) -> None:
-    """Pressed and released in turn while the hands move, and the arm with them."""
-    random = np.random.default_rng(period)
-    count = 2 * rate_hz
-    path = np.array(((0.75, -0.3, 0.25), (0.75, 0.3, 0.2))) + 0.1 * np.sin(
-        np.arange(count)[:, None, None] / rate_hz * 2 * np.pi * random.uniform(0.5, 1.0, (1, 2, 3))
-    )
-    ticks = list(led(path, lambda k: (clutch(k // period % 2 == 0),), every=max(1, rate_hz // 100)))
-    settings = cell(rate_hz=rate_hz)
-    seen = frames(Controller(settings, taught, urdf=URDF), ticks)
-    assert_limits_hold(seen, settings)
-    assert not (seen["mode"] == Mode.FAULT).any()
-    held = np.array([k // period % 2 == 1 for k in range(count)])
-    assert (seen["reason"][held] == Reason.CLUTCH).all()
-    assert (seen["reason"][~held] != Reason.CLUTCH).all()
 
 
 def test_an_operator_and_an_arm_that_is_not_ready_are_named_before_the_clutch(taught: Skill) -> None:
@@ -128,7 +107,7 @@ def test_an_arm_outside_its_limits_returns_only_while_the_clutch_is_pressed(taug
 
 def gripper(settings: Settings, skill: Skill, events: Mapping[int, Event]) -> list[int]:
     """State of the gripper in each tick in which the hands rest at a via-point."""
-    return frames(Controller(settings, skill, urdf=URDF), resting(0, 900, at(events)))["gripper"].tolist()
+    return followed(skill, resting(0, 900, at(events)), settings)["gripper"].tolist()
 
 
 def test_a_wish_decides_the_gripper_where_the_skill_does_not(taught: Skill) -> None:
@@ -148,7 +127,7 @@ def test_a_skill_with_a_gripper_decides_it_alone(skill: Skill) -> None:
     there = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
     closing = adapted(skill, (there, *more), tolerance=0.05)
     wishes = cell(gripper="key")
-    alone = frames(Controller(wishes, closing, urdf=URDF), resting(0, 300))
+    alone = followed(closing, resting(0, 300), wishes)
     assert alone["closure"][-1] >= 0.0
-    wished = frames(Controller(wishes, closing, urdf=URDF), resting(0, 300, lambda k: (wish(k % 2),)))
+    wished = followed(closing, resting(0, 300, lambda k: (wish(k % 2),)), wishes)
     assert alone.tobytes() == wished.tobytes()

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.records import Flag, Mode
-from service.core.controller import Controller
+from service.contract.records import Flag, Mode, Reason
 from service.core.frame import Event, Tick, Vector, order
 from service.core.skill.skill import Skill
 from service.core.tuning import TUNING
@@ -21,9 +19,9 @@ from service.settings.config import Settings, SettingsError, ToolSettings, parse
 from sim.scene import Scene
 from sim.script import HandScript
 from support.arm_geometry import ArmGeometry
-from support.in_process import ASSUMED, Loop, assert_limits_hold, clutch, frames, led, ticks_of
+from support.followed import changed, followed
+from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, led, ticks_of
 from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
-from support.wam import URDF
 
 BRIEF_HOLD_S = TUNING.intake.tracker_memory_s
 ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
@@ -32,15 +30,14 @@ ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
 E = 0.15  # [m/s]
 LOOP_HZ = (100, 250, 500, 1000)
 TOOL_RISE_MPS = 0.1  # the tool may be faster than its slow setpoint, as in a stop
+RAISED = np.array(((0.75, -0.30, 0.25), RIGHT))  # hands of which the left one is on its way
 RESUMED = 600  # tick in which the hands of the script move
 inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
 wild = st.tuples(*(st.floats(-1e3, 1e3),) * 3)
 
 
 def cell(base: Settings = ASSUMED, rate_hz: int = 500, engage_speed: float = E, **hands: Any) -> Settings:
-    tool = msgspec.structs.replace(base.tool, engage_speed=engage_speed)
-    changed = msgspec.structs.replace(base.hands, **hands)
-    return msgspec.structs.replace(base, rate_hz=rate_hz, tool=tool, hands=changed)
+    return changed(base, rate_hz=rate_hz, tool={"engage_speed": engage_speed}, hands=hands)
 
 
 def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
@@ -82,8 +79,7 @@ def test_after_a_hold_the_tool_comes_slowly_to_where_the_hands_have_gone(
     path = (hands[before] if k < moved else hands[after] for k in range(round(end_s * rate_hz)))
     settings = cell(rate_hz=rate_hz)
     ticks = led(path, lambda k: (at[k],) if k in at else (), every=rate_hz // 100)
-    seen = frames(Controller(settings, taught, urdf=URDF), ticks)
-    assert_limits_hold(seen, settings)
+    seen = followed(taught, ticks, settings)
     slow, speed = engages(seen), tool_speeds(settings, seen)
     assert np.linalg.norm(seen["setpoint_velocity"][slow], axis=1).max() <= E
     assert speed[slow].max() <= E + TOOL_RISE_MPS
@@ -100,7 +96,7 @@ def test_after_a_hold_the_tool_comes_slowly_to_where_the_hands_have_gone(
 def test_a_target_that_moves_away_faster_is_followed_slowly_until_it_pauses(taught: Skill) -> None:
     """The flag says that the tool is behind; it ends when the target rests."""
     slowly, ticks = cell(engage_speed=0.1), resumed(HandScript(Scene(), seed=5), tail_s=5.0)
-    seen = frames(Controller(slowly, taught, urdf=URDF), ticks)
+    seen = followed(taught, ticks, slowly)
     slow, behind = engages(seen), np.linalg.norm(seen["target"] - seen["setpoint"], axis=1)
     assert np.linalg.norm(seen["setpoint_velocity"][slow], axis=1).max() <= 0.1
     assert behind[slow].max() > 1.3 * behind[slow][0]
@@ -118,9 +114,9 @@ def test_every_following_begins_slowly_also_after_a_fault(taught: Skill) -> None
     begins = int(np.argmax(failed["mode"] == Mode.FOLLOW))
     assert begins >= 200
     assert not engages(failed)[begins]  # it is at its target still
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     loop.run(1500)
-    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: np.array((LEFT, RIGHT))
     again = loop.run(1500, {0: order("fault"), 400: order("reset")})
     begins = int(np.argmax(again["mode"][400:] == Mode.FOLLOW)) + 400
     assert engages(again)[begins]
@@ -143,12 +139,12 @@ def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
 ) -> None:
     """Unseen hands hold the arm 0.1 s later. They have moved when they are seen again."""
     loop = Loop(cell(Settings()), taught)
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     assert not engages(loop.run(3000))[-1]
     loop.hands = None
     unseen = loop.run(round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()})
     assert unseen["mode"][-1] != Mode.FOLLOW
-    loop.hands = lambda k: np.array(((0.98, -0.32, 0.06), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: np.array((LEFT, RIGHT))
     seen = loop.run(1000)
     begins = int(np.argmax(seen["mode"] == Mode.FOLLOW))
     assert seen["mode"][begins] == Mode.FOLLOW
@@ -160,7 +156,7 @@ def test_the_tool_engages_anew_unless_only_the_hands_caused_a_brief_hold(
 
 def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
     loop = Loop(cell(Settings(), engage_speed=0.02), taught)
-    loop.hands = lambda k: np.array(((0.75, -0.30, 0.25), (0.98, 0.32, 0.06)))
+    loop.hands = lambda k: RAISED
     assert engages(loop.run(1000))[-1]
     moving, loop.hands = loop.hands, None
     assert loop.run(150)["mode"][-1] == Mode.HOLD
@@ -186,9 +182,10 @@ def test_storms_of_holds_break_no_limit_and_make_nothing_fast(taught: Skill, rat
         2 * np.pi * random.uniform(0.3, 0.8, (1, 2, 3)) * times
     )
     settings = cell(rate_hz=rate_hz, **({"clutch": "key"} if what == "clutch" else {}))
-    seen = frames(Controller(settings, taught, urdf=URDF), led(path, messages, every=max(1, rate_hz // 100)))
-    assert_limits_hold(seen, settings)
+    seen = followed(taught, led(path, messages, every=max(1, rate_hz // 100)), settings)
     assert not (seen["mode"] == Mode.FAULT).any()
+    held = seen["reason"] == {"resume": Reason.OPERATOR, "clutch": Reason.CLUTCH}[what]
+    assert np.array_equal(held, ~is_on)
     speed, slow = np.linalg.norm(seen["setpoint_velocity"], axis=1), engages(seen)
     follows = (seen["mode"] == Mode.FOLLOW)[:-1] & slow[1:]
     assert (speed[1:] <= np.maximum(E, speed[:-1]) + 1e-9)[follows].all()
@@ -220,14 +217,14 @@ def test_bounds_of_a_setpoint_that_engages_hold_whatever_is_asked(
 
 def test_a_slow_engaging_does_not_look_stuck(taught: Skill) -> None:
     path: Iterator[Tick] = led(np.tile(((0.62, -0.28, 0.30), (0.98, 0.32, 0.06)), (2000, 1, 1)))
-    seen = frames(Controller(cell(engage_speed=0.02), taught, urdf=URDF), path)
+    seen = followed(taught, path, cell(engage_speed=0.02))
     assert engages(seen)[-1]
     assert not (seen["flags"] & Flag.STUCK).any()
 
 
 def test_the_turn_of_the_tool_is_slowed_in_proportion(taught: Skill) -> None:
     ticks = [*resumed(HandScript(Scene(), seed=5))][: RESUMED + 1000]
-    seen = frames(Controller(cell(engage_speed=0.05), taught, urdf=URDF), ticks)[RESUMED:]
+    seen = followed(taught, ticks, cell(engage_speed=0.05))[RESUMED:]
     assert engages(seen).all()
     turning = np.linalg.norm(seen["setpoint_turning"], axis=1)
     assert turning.max() <= 0.05 / ASSUMED.tool.max_speed * ASSUMED.tool.max_turn_speed
@@ -235,7 +232,7 @@ def test_the_turn_of_the_tool_is_slowed_in_proportion(taught: Skill) -> None:
 
 def test_without_an_engage_speed_nothing_engages(taught: Skill) -> None:
     ticks = list(ticks_of(HandScript(Scene(), seed=3), wait_s=0.2))[:800]
-    off, full = (frames(Controller(cell(engage_speed=e), taught, urdf=URDF), ticks) for e in (0.0, 0.8))
+    off, full = (followed(taught, ticks, cell(engage_speed=e)) for e in (0.0, 0.8))
     assert off.tobytes() == full.tobytes()
     assert not engages(off).any()
 

@@ -85,14 +85,6 @@ def test_whatever_its_jerk_and_the_loops_rate_it_comes_to_rest(rate_hz: int, max
         np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
 
 
-def test_a_target_that_moves_steadily_is_followed_close() -> None:
-    velocity = np.array([0.1, -0.05, 0.03])
-    targets = [np.array([MIDDLE + velocity * k * PERIOD_S, velocity, (0.0,) * 3]) for k in range(1200)]
-    states, _ = driven(targets)
-    assert np.linalg.norm(states[-1, 0] - targets[-1][0]) < 0.012
-    assert np.abs(states[-200:, 2]).max() < 1e-3
-
-
 @pytest.mark.parametrize(("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)])
 def test_a_target_that_goes_to_and_fro_faster_than_the_arm_can_is_still_met(
     brake: float, hz: float, most_m: float
@@ -147,7 +139,8 @@ def test_more_weight_on_jerk_makes_gains_smaller() -> None:
 @pytest.mark.parametrize("rate_hz", [50, 60, 100, 500])
 def test_a_target_that_moves_steadily_is_followed_close_at_every_rate(rate_hz: int) -> None:
     """At 50 Hz it was 37 mm behind: in a long tick a stop's way is no straight line of the jerk."""
-    velocity = np.array([0.2, 0.0, 0.0])
-    targets = [np.array([MIDDLE + velocity * (k / rate_hz - 1.0), velocity, (0.0,) * 3]) for k in range(2 * rate_hz)]
-    states, _ = driven(targets, rate_hz=rate_hz)
-    assert np.linalg.norm(states[-1, 0] - targets[-1][0]) < 0.003
+    for velocity in np.array([[0.2, 0.0, 0.0], [0.1, -0.05, 0.03]]):
+        places = [MIDDLE + velocity * (k / rate_hz - 1.0) for k in range(2 * rate_hz)]
+        states, _ = driven([np.array([place, velocity, (0.0,) * 3]) for place in places], rate_hz=rate_hz)
+        assert np.linalg.norm(states[-1, 0] - places[-1]) < 0.003
+        assert np.abs(states[-2 * rate_hz // 5 :, 2]).max() < 1e-3

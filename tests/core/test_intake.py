@@ -5,6 +5,8 @@ between its samples.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -56,6 +58,16 @@ def test_a_rotation_turns_as_its_quaternion_does() -> None:
     np.testing.assert_allclose(rotation((-0.1, 0.4, -0.3, -0.8)), matrix)
 
 
+@contextmanager
+def only_counted(hands: Hands, cause: Cause) -> Iterator[None]:
+    """Assert that a sample is counted as rejected and changes nothing else."""
+    expected = hands.state.copy()
+    expected["rejected"][cause] += 1
+    yield
+    assert hands.rejected() == {cause: 1}
+    assert hands.state.tobytes() == expected.tobytes()
+
+
 @pytest.mark.parametrize(
     ("position", "turn", "cause"),
     [
@@ -74,11 +86,8 @@ def test_a_useless_hand_sample_is_counted_and_changes_nothing_else(
 ) -> None:
     hands = Hands()
     hands.hand(1)
-    before = hands.state.copy()
-    hands.hand(2, position, turn)
-    assert hands.rejected() == {cause: 1}
-    before["rejected"][cause] += 1
-    assert hands.state.tobytes() == before.tobytes()
+    with only_counted(hands, cause):
+        hands.hand(2, position, turn)
 
 
 def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
@@ -87,64 +96,39 @@ def test_a_quaternion_and_its_negative_are_the_same_rotation() -> None:
     assert hands.fresh()
 
 
-@pytest.mark.parametrize(
-    ("frame", "configured", "taken"),
-    [
-        ("base", "base", True),
-        ("", "base", True),
-        ("camera", "base", False),
-        ("camera", "camera", True),
-        ("base", "camera", True),
-        ("Base", "base", False),
-        ("base\0", "base", False),
-    ],
-)
-def test_a_hand_in_a_frame_that_nobody_configured_is_refused(frame: str, configured: str, taken: bool) -> None:
-    hands = Hands(HandSettings(frame=configured))
-    hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.5, 0.1, 0.2), STRAIGHT))
-    assert hands.fresh() == taken
-    assert hands.rejected() == ({} if taken else {Cause.WRONG_FRAME: 1})
+TRACKERS = {
+    "optitrack": TrackerSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)),
+    "vicon/world": TrackerSettings(),
+}
+MAPPED, IN_BASE = (0.5004, 0.0002, 0.0001), (0.4, 0.2, 0.1)
+BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
 
 
 @pytest.mark.parametrize(
-    ("configured", "frame", "mapped"),
+    ("configured", "frame", "at"),
     [
-        ("optitrack", "optitrack", True),
-        ("optitrack", "", True),
-        ("optitrack", "base", False),
-        ("base", "base", True),
-        ("", "base", True),
-        ("", "", True),
+        ("base", "base", MAPPED),
+        ("base", "", MAPPED),
+        ("", "base", MAPPED),
+        ("", "", MAPPED),
+        ("camera", "camera", MAPPED),
+        ("camera", "", MAPPED),
+        ("camera", "base", IN_BASE),  # not mapped again, as the tracker has a frame of its own
+        ("camera", "optitrack", BY_ITS_TABLE),
+        ("camera", "vicon/world", IN_BASE),
+        ("camera", "headset", None),
+        ("base", "camera", None),
+        ("base", "Base", None),
+        ("base", "base\0", None),
     ],
 )
-def test_a_pose_in_base_is_not_mapped_again_where_the_tracker_has_a_frame_of_its_own(
-    configured: str, frame: str, mapped: bool
+def test_a_hand_is_mapped_as_its_frame_is_configured_or_refused(
+    configured: str, frame: str, at: tuple[float, ...] | None
 ) -> None:
-    hands = Hands(HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT)))
+    own = HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT))
+    hands = Hands(own, trackers=TRACKERS)
     hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
-    np.testing.assert_allclose(hands.state["hands"][LEFT, 0], (0.5004, 0.0002, 0.0001) if mapped else (0.4, 0.2, 0.1))
-
-
-@pytest.mark.parametrize(
-    ("frame", "at"),
-    [
-        ("headset", (0.1 + 0.4, 0.2, 0.1)),
-        ("", (0.1 + 0.4, 0.2, 0.1)),
-        ("base", (0.4, 0.2, 0.1)),
-        ("optitrack", (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)),
-        ("vicon/world", (0.4, 0.2, 0.1)),
-        ("camera", None),
-    ],
-)
-def test_a_tracker_with_a_table_of_its_own_is_mapped_by_it(frame: str, at: tuple[float, ...] | None) -> None:
-    hands = Hands(
-        HandSettings(frame="headset", base_from_tracker=(0.1, 0.0, 0.0, *STRAIGHT)),
-        trackers={
-            "optitrack": TrackerSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)),
-            "vicon/world": TrackerSettings(),
-        },
-    )
-    hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
+    assert hands.fresh() == (at is not None)
     assert hands.rejected() == ({Cause.WRONG_FRAME: 1} if at is None else {})
     if at is not None:
         np.testing.assert_allclose(hands.state["hands"][LEFT, 0], at, atol=1e-12)
@@ -343,11 +327,8 @@ def test_a_useless_arm_sample_is_counted_and_changes_nothing_else(
 ) -> None:
     hands = Hands()
     hands.arm(1)
-    before = hands.state.copy()
-    hands.arm(2, names, position, velocity)
-    assert hands.rejected() == {cause: 1}
-    before["rejected"][cause] += 1
-    assert hands.state.tobytes() == before.tobytes()
+    with only_counted(hands, cause):
+        hands.arm(2, names, position, velocity)
 
 
 def test_an_arm_is_silent_after_exactly_the_configured_time_and_heard_again_with_any_stamp() -> None:

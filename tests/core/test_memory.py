@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
 from service.contract.records import Field
-from service.core.frame import blank
 from service.core.skill import ORDER, TURNS
 from service.core.skill.hands_kmp import HandsKMP
 from service.core.skill.memory import features, moving_features, remember, turning
@@ -17,6 +15,7 @@ from service.core.skill.tuning import MEMORY_LAG_S, TURN_LAG_S, TURN_WEIGHT_M
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import StoredSkill, decoded
+from support.skills import at_rest, figures_of
 
 FIELDS = (
     Field("tick", "int64"),
@@ -136,18 +135,11 @@ def order(skill: StoredSkill) -> int:
 def test_learn_remembers_where_hands_alone_tell_too_little_and_nowhere_else() -> None:
     skill = learn(takes(8, remembers=True))
     assert order(skill) == ORDER
-    assert msgspec.json.decode(skill.figures)["taken"].startswith("memory")
+    assert figures_of(skill).taken.startswith("memory")
     assert order(learn(takes(8, remembers=False))) == 0
     back = decoded(skill.file, origin="again")
     hands = np.array(skill.hands[len(skill.hands) // 2]).reshape(2, 3)
     past = np.tile(hands, (ORDER, 1, 1)) + 0.05
-    still = np.zeros((2, 3))
-    there = [one.predict(hands, still, still, past=past).position for one in (skill, back)]
+    there = [at_rest(one, hands, past=past).position for one in (skill, back)]
     np.testing.assert_array_equal(*there)
-    assert np.linalg.norm(there[0] - skill.predict(hands, still, still).position) > 0.0
-
-
-def test_a_state_of_the_controller_has_the_memory() -> None:
-    from service.core.frame import state_layout
-
-    assert blank(state_layout(7))["memory"].shape == (ORDER, 2, 3)
+    assert np.linalg.norm(there[0] - at_rest(skill, hands).position) > 0.0

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from service.contract import cdr
 from service.core.arm.stage import Arm
-from service.core.controller import Controller, outgoing
+from service.core.controller import outgoing
 from service.core.frame import blank, state_layout
 from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
 from service.core.limiter.stage import Limiter
@@ -27,17 +27,14 @@ from service.learning.via_points import adapted
 from service.settings.config import Settings
 from sim.scene import TOOL_ORIENTATION, Scene
 from sim.script import HandScript
-from support.in_process import ASSUMED, frames, ticks_of
+from support.followed import changed, followed
+from support.in_process import ticks_of
 from support.wam import FRAME, URDF
 
 PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
 
 
 PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
-
-
-def full(settings: Settings) -> Settings:
-    return msgspec.structs.replace(settings, tool=msgspec.structs.replace(settings.tool, orientation="full"))
 
 
 def random_rotations(count: int, seed: int) -> Rotation:
@@ -73,7 +70,7 @@ def test_a_tool_is_off_by_its_whole_turn_or_by_where_it_points() -> None:
 def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> None:
     random = np.random.default_rng(3)
     inputs, zeta = random.normal(size=(12, 6)), 0.5 * random.normal(size=(12, 3))
-    reference = Gaussians(zeta, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
+    reference = Gaussians.of(zeta, deviation=0.01)
     primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.3), lambda_mean=1.0)
     auxiliary = random_rotations(1, 4)[0].as_quat()
     ours, kmp = LearnedOrientation(primitive, auxiliary), OrientationKMP(primitive, auxiliary)
@@ -91,7 +88,7 @@ def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> Non
 
 @pytest.mark.parametrize("about", [False, True])
 def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(about: bool) -> None:
-    settings = full(Settings()) if about else Settings()
+    settings = changed(Settings(), tool={"orientation": "full"}) if about else Settings()
     lead, state = OrientationSetpoint(settings), blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
     target = Rotation.from_rotvec(math.radians(120) * np.array([1.0, 2.0, 2.0]) / 3.0)
@@ -110,7 +107,7 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
 
 
 def test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to() -> None:
-    settings = full(Settings())
+    settings = changed(Settings(), tool={"orientation": "full"})
     arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
     q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
     here = arm.at(q)
@@ -130,7 +127,7 @@ def test_an_orientation_taught_at_a_place_is_predicted_and_followed_there(skill:
     x, y, z, w = turned.tolist()
     taught = adapted(skill, (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))), tolerance=0.05)
     script = HandScript(msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0)
-    seen = frames(Controller(ASSUMED, taught, urdf=URDF), ticks_of(script))
+    seen = followed(taught, ticks_of(script))
     last = seen[-300:]
     assert np.abs(last["orientation"] @ turned).min() > math.cos(math.radians(1.0))
     axis = Rotation.from_quat(last["tool_orientation"]).apply([0, 0, 1.0])

@@ -47,6 +47,7 @@ from support.in_process import (
     ticks_of,
 )
 from support.paths import RECORDINGS
+from support.skills import at_rest
 from support.starts import free_postures
 
 HAND_BRAKE_MPS2 = TUNING.setpoint.hand_brake_mps2
@@ -313,7 +314,7 @@ def test_the_arm_rests_at_a_target_on_a_side_of_the_workspace(name: str, rate_hz
     """The box is drawn so that the target of resting hands lies beyond one, two or three sides."""
     random = np.random.default_rng(rate_hz + len(name))
     cell = replace(cell_of(name), rate_hz=rate_hz)
-    target = skill.predict(np.array((LEFT, RIGHT)), np.zeros((2, 3)), np.zeros((2, 3))).position
+    target = at_rest(skill, (LEFT, RIGHT)).position
     box = np.stack([target - random.uniform(0.05, 0.2, 3), target + random.uniform(0.05, 0.2, 3)])
     for axis in random.choice(3, random.integers(1, 4), replace=False):
         side = random.integers(2)

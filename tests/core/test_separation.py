@@ -11,13 +11,14 @@ from collections.abc import Iterator
 import coal
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
 from service.contract.records import Flag, Mode
 from service.core.arm.stage import Arm
 from service.core.controller import Controller, start_state
-from service.core.frame import Tick, Vector, blank, frame_layout
+from service.core.frame import Record, Tick, Vector, blank, frame_layout
 from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from service.core.kinematics import Kinematics
 from service.core.limiter.stage import LimiterStage
@@ -33,7 +34,9 @@ from service.settings.config import Box, Obstacles, Settings, TableTop, robot_de
 from sim.experiments.separation import nearest as measured
 from sim.scene import Scene
 from sim.script import HandScript
+from support import coal_shapes
 from support.arms import MODELS, cell_of
+from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, seen
 from support.wam import STATE, URDF
 
@@ -97,17 +100,10 @@ def test_distances_of_capsules_are_those_of_coal() -> None:
         if random.random() < 0.2:
             one[1] = one[0]  # a ball
         found = between_segments(one, other, near)
-        expected = coal.distance(*_capsule(one), *_capsule(other), coal.DistanceRequest(), coal.DistanceResult())
+        expected = coal_shapes.distance(coal_shapes.capsule(one), coal_shapes.capsule(other))
         assert found - 0.02 == pytest.approx(expected, abs=1e-5)
         assert np.linalg.norm(near[3:6] - near[:3]) == pytest.approx(found, abs=1e-12)
         assert near[:3] + found * near[6:] == pytest.approx(near[3:6], abs=1e-9)
-
-
-def _capsule(segment: Vector) -> tuple[coal.Capsule, coal.Transform3s]:
-    way = segment[1] - segment[0]
-    length = float(np.linalg.norm(way))
-    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), way if length else np.array([0.0, 0, 1])).matrix()
-    return coal.Capsule(0.01, length), coal.Transform3s(turn, segment.mean(axis=0))
 
 
 def test_distances_of_a_capsule_and_a_box_are_the_least_along_it_and_negative_inside() -> None:
@@ -134,17 +130,14 @@ def test_a_stop_from_the_allowed_speed_ends_the_clearance_away(hand_speed: float
 
 
 def test_constraints_are_how_fast_distances_shrink() -> None:
-    settings = msgspec.structs.replace(
-        ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
-    )
+    settings = changed(ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),)))
     apart, table = Separation(settings, URDF), settings.table
     low, high = (
         np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M],
         np.add(table.centre, [*table.half_size, 0.0]),
     )
     boxes = np.array([[low, high], [(0.45, -0.05, 0.15), (0.55, 0.05, 0.25)]])
-    state = start_state(settings, _Nothing())  # type: ignore[arg-type]
-    state["hand_ticks"], state["hands"][:, 0] = 0, np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]
+    state = with_hands(*(np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]), settings)
     random, near, total = np.random.default_rng(4), np.empty(9), 0
     for q, dq in zip(random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True):
         here = ARM.at(q)
@@ -172,6 +165,14 @@ class _Nothing:
     digest, orientation = bytes(16), (0.0, 0.0, 0.0, 1.0)
 
 
+def with_hands(left: npt.ArrayLike, right: npt.ArrayLike = RIGHT, settings: Settings = ASSUMED) -> Record:
+    """A state in which hands are seen at positions (3,) [m], at rest."""
+    state = start_state(settings, _Nothing())  # type: ignore[arg-type]
+    state["hand_ticks"] = 0
+    state["hands"][:, 0] = left, right
+    return state
+
+
 def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tuple[Vector, Vector, Vector, Vector]:
     """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
     near its links come to each other and to the table (T,).
@@ -197,28 +198,27 @@ def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5)
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     """The hand stops where the arm, which stays where it is, does not touch it."""
-    uncertain = msgspec.structs.replace(ASSUMED.people, position_uncertainty=0.03)
-    cell = msgspec.structs.replace(cell_of(arm), people=uncertain)
+    cell = changed(cell_of(arm), people={"position_uncertainty": 0.03})
     ticks, hands = zip(*thrust((0.53, -0.27, 0.37), 1.2), strict=True)
-    seen = frames(Controller(cell, taught, urdf=robot_description(cell)), list(ticks))
+    seen = followed(taught, list(ticks), cell)
     assert (seen["flags"] & Flag.SEPARATION).any() or (seen["mode"] == Mode.HOLD).any()
     distance, speed, _, _ = nearest(seen, np.array(hands), cell)
     assert distance.min() > 0
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
-    least_m = uncertain.clearance + uncertain.position_uncertainty
-    allowed = np.array([allowed_speed(d, 0.0, uncertain.brake, 0.13, least_m) for d in distance[late].ravel()])
+    least_m = cell.people.clearance + cell.people.position_uncertainty
+    allowed = np.array([allowed_speed(d, 0.0, cell.people.brake, 0.13, least_m) for d in distance[late].ravel()])
     assert (speed[late].ravel() - allowed).max() <= SLIP_SPEED_MPS + 1e-3
 
 
 def test_distance_and_limit_are_in_the_frame(taught: Skill) -> None:
-    seen = frames(Controller(ASSUMED, taught, urdf=URDF), [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0)])
+    seen = followed(taught, [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0)])
     hands = np.ascontiguousarray(seen["hands"])
     distance = nearest(seen, hands)[0].min(axis=(1, 2))
     assert np.abs(seen["hand_distance"][1:] - distance[:-1]).max() < 0.005  # a tick apart
     assert seen["hand_limit"].min() >= 0
     most = Separation(ASSUMED, URDF).max_speed
     assert seen["hand_limit"].max() <= most
-    alone = frames(Controller(ASSUMED, taught, urdf=URDF), [Tick(0)])
+    alone = followed(taught, [Tick(0)])
     assert (alone["hand_distance"][0], alone["hand_limit"][0]) == (3.0, most)
 
 
@@ -231,11 +231,11 @@ def test_the_table_and_a_box_in_the_way_are_not_touched_and_the_setpoint_waits(t
     body = body_of(cell, urdf)
     box = Box(centre=(0.52, -0.2, 0.36), half_size=(0.08, 0.04, 0.3))
     cells = [
-        msgspec.structs.replace(cell, table=TableTop(centre=(0.8, 0.0, 0.27))),
-        msgspec.structs.replace(cell, obstacles=Obstacles(boxes=(box,))),
+        changed(cell, table=TableTop(centre=(0.8, 0.0, 0.27))),
+        changed(cell, obstacles=Obstacles(boxes=(box,))),
     ]
     for settings in cells:
-        seen = frames(Controller(settings, taught, urdf=urdf), [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)])
+        seen = followed(taught, [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)], settings)
         assert (seen["mode"] == Mode.FOLLOW).all()
         assert (seen["flags"] & Flag.SEPARATION).any()
         behind = 0.1 if len(settings.joints.names) > 6 else 0.15  # six joints have no way around
@@ -272,9 +272,9 @@ def _apart_from(corners: Vector, capsules: Vector, body: Body) -> list[float]:
 def test_an_arm_that_cannot_leave_a_thing_goes_on_by_what_is_free(
     taught: Skill, boxes: tuple[Box, ...], seconds: float
 ) -> None:
-    settings = msgspec.structs.replace(ASSUMED, obstacles=Obstacles(boxes=boxes))
+    settings = changed(ASSUMED, obstacles=Obstacles(boxes=boxes))
     ticks = [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, seconds)]
-    seen, free = (frames(Controller(s, taught, urdf=URDF), ticks) for s in (settings, ASSUMED))
+    seen, free = (followed(taught, ticks, s) for s in (settings, ASSUMED))
     assert (seen["mode"] == Mode.FOLLOW).all()
     assert np.linalg.norm(seen["tool"][-1] - free["tool"][-1]) < 0.05
     assert np.linalg.norm(free["tool"] - free["tool"][0], axis=1).max() > 0.2
@@ -301,11 +301,8 @@ def test_parts_that_are_too_near_each_other_go_apart_and_hardly_slip(arm: str) -
 
 def test_motion_that_leaves_a_hand_is_not_slowed() -> None:
     apart = Separation(ASSUMED, URDF)
-    state = start_state(ASSUMED, _Nothing())  # type: ignore[arg-type]
     here = ARM.at(POSTURE)
-    state["hand_ticks"] = 0
-    state["hands"][:, 0] = here.position, RIGHT
-    state["hands"][0, 0, 0] += 0.09
+    state = with_hands(np.add(here.position, (0.09, 0.0, 0.0)))
     for way in ([-0.4, 0.0, 0.0], [-0.2, 0.1, 0.3]):
         apart.step(state, FRAME, here.record)
         free = ARM.step(POSTURE, here.position, np.array(way), orientation_of(here))
@@ -321,8 +318,7 @@ def test_motion_that_leaves_a_hand_is_not_slowed() -> None:
 def test_a_hand_that_passes_is_foreseen_where_the_arm_goes(hand_speed: float) -> None:
     """The tool leaves the hand now, but goes where a fast one will be a tenth of a second later."""
     apart, here, way, near = Separation(ASSUMED, URDF), ARM.at(POSTURE), np.array([0.3, 0.4, 0.0]), np.empty(9)
-    state = start_state(ASSUMED, _Nothing())  # type: ignore[arg-type]
-    state["hand_ticks"], state["hands"][:, 0] = 0, (np.add(here.position, (0.14, -0.16, 0.0)), RIGHT)
+    state = with_hands(np.add(here.position, (0.14, -0.16, 0.0)))
     state["hands"][0, 1, 1] = hand_speed
     free = ARM.step(POSTURE, here.position, way, orientation_of(here))
     state["joints"][1] = free.velocity
@@ -342,11 +338,10 @@ def test_a_hand_that_passes_is_foreseen_where_the_arm_goes(hand_speed: float) ->
 def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -> None:
     apart = Separation(ASSUMED, URDF)
     apart.set_contacts(taught.via_points)
-    state, here = start_state(ASSUMED, _Nothing()), ARM.at(POSTURE)  # type: ignore[arg-type]
-    state["hand_ticks"] = 0
+    here = ARM.at(POSTURE)
     tool = BODY.capsules["link"] == 7
     for off, gentle in ((0.0, True), (0.1, False)):
-        state["hands"][:, 0] = Scene().handover, Scene().right_start
+        state = with_hands(Scene().handover, Scene().right_start)
         state["hands"][:, 0, 2] += off
         apart.step(state, FRAME, here.record)
         limits = sorted(set(apart.constraints["planned"][: apart.count].round(6).tolist()))
@@ -369,9 +364,7 @@ def test_the_tool_alone_may_touch_the_hand_that_receives_gently(taught: Skill) -
 
 def test_a_hand_just_seen_counts_as_fast() -> None:
     apart, here = Separation(ASSUMED, URDF), ARM.at(POSTURE)
-    state = start_state(ASSUMED, _Nothing())  # type: ignore[arg-type]
-    state["hand_ticks"], state["hands"][:, 0] = 0, (here.position, RIGHT)
-    state["hands"][0, 0, 0] += 0.25
+    state = with_hands(np.add(here.position, (0.25, 0.0, 0.0)))
     state["mode_probabilities"] = 1 / 3
     apart.step(state, FRAME, here.record)
     known = apart.speed_limit

@@ -12,7 +12,7 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from service.core.arm.stage import Arm
-from service.core.frame import Vector, blank, copied, frame_layout
+from service.core.frame import Vector, blank, frame_layout
 from service.core.setpoint.bounds import speed_to_come, stop_distance
 from service.core.setpoint.stage import SetpointGenerator, SetpointStage
 from service.core.setpoint.step import slow_down
@@ -269,17 +269,3 @@ def test_the_way_of_a_stop_is_that_of_the_fastest_one(speed: float, acceleration
 def test_the_speed_to_come_counts_what_an_acceleration_still_adds() -> None:
     assert speed_to_come(np.array([0.3, 0.0, 0.4]), np.zeros(3), 200.0, 0.0) == pytest.approx(0.5)
     assert speed_to_come(np.zeros(3), np.array([4.0, 0.0, 0.0]), 200.0, 0.0) == pytest.approx(0.04)
-
-
-def test_going_on_from_a_copy_of_the_state_gives_the_same_bits() -> None:
-    random = np.random.default_rng(5)
-    targets = [np.array([random.uniform(*BOX), *random.normal(0.0, 1.0, (2, 3))]) for _ in range(60)]
-    generator, state = SetpointGenerator(Settings()), blank(STATE)
-    generator.begin(state, at_rest(MIDDLE))
-    for target in targets[:30]:
-        generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
-    other, copy = SetpointGenerator(Settings()), copied(state)
-    for target in targets[30:]:
-        generator.step(state, Target(*target, clamped=False), BOX, FREE, 1.0)
-        other.step(copy, Target(*target, clamped=False), BOX, FREE, 1.0)
-    assert state.tobytes() == copy.tobytes()

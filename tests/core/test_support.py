@@ -23,9 +23,9 @@ from service.learning.skill_file import decoded, with_file
 from service.settings.config import Settings
 from sim.scene import Scene
 from support.paths import RECORDINGS
+from support.skills import at_rest
 
 FAR_STD_M = 0.3
-STILL = np.zeros((2, 3))
 
 
 @pytest.fixture(scope="module")
@@ -104,13 +104,13 @@ def test_a_skill_of_the_hands_inputs_gates_by_its_primitive_whatever_its_covaria
     off = 0.01 * np.random.default_rng(3).normal(size=(len(hands), 3))
     local = LocalErrors.of(plain.model.primitive, plain.model.inputs(hands), off, FAR_STD_M)
     skill = decoded(with_file(replace(plain, model=replace(plain.model, errors=local))).file, origin="memory")
-    one, other = (s.predict(hands[3].reshape(2, 3), STILL, STILL) for s in (skill, plain))
+    one, other = (at_rest(s, hands[3]) for s in (skill, plain))
     assert one.gate_m == other.gate_m
     np.testing.assert_allclose(one.covariance, local.covariances(hands[3:4])[0], atol=1e-9)
     before = one.covariance, np.zeros((3, 3)), -1.0, one.gate_m
-    again = skill.predict(hands[3].reshape(2, 3), STILL, STILL, before=before)
+    again = at_rest(skill, hands[3], before=before)
     assert (again.gate_m, again.covariance.tobytes()) == (one.gate_m, one.covariance.tobytes())
-    apart = skill.predict(hands[3].reshape(2, 3) + 1.0, STILL, STILL)
+    apart = at_rest(skill, hands[3] + 1.0)
     assert np.trace(apart.covariance) == pytest.approx(3 * (FAR_STD_M**2 + LEAST_STD_M**2), rel=1e-3)
 
 

@@ -5,11 +5,13 @@ outlasts a round of a session.
 
 from __future__ import annotations
 
-import msgspec
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from service.core.skill.hands_kmp import HandsKMP
+from service.core.skill.skill import Prediction
 from service.core.skill.staged import StagedKMP
 from service.core.skill.task_clock import (
     CLOCK_CHANGE,
@@ -21,12 +23,13 @@ from service.core.skill.task_clock import (
     count,
     counted,
 )
+from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.methods.clock import Tempo, clock_of
-from service.learning.records import Figures
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
+from service.learning.skill_file import StoredSkill, decoded
 from sim.experiments.people.left_out import judged, left_out, predicted_rounds
 from support.kinds import KINDS, learned, named, takes
+from support.skills import at_rest, figures_of
 
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)
@@ -136,48 +139,37 @@ def test_the_intake_finds_when_hands_begin_to_move() -> None:
         assert shown.seconds[np.argmax(moves)] - 0.1 < starts_s < shown.seconds[np.argmax(moves)] + 0.2
 
 
+@pytest.mark.parametrize(
+    ("kind_of_takes", "says", "late_s", "error_mm"),
+    [(takes, "timetable", 6.0, 30.0), (named, "anew in each stage", 7.0, 20.0)],
+    ids=["one clock", "in each stage"],
+)
 @pytest.mark.thorough
-def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else() -> None:
-    skill = learn(takes(6, timetable=True))
-    figures = msgspec.json.decode(skill.figures, type=Figures)
+def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else(
+    kind_of_takes: Callable[..., list[Demonstration]], says: str, late_s: float, error_mm: float
+) -> None:
+    shown = kind_of_takes(6, timetable=True)
+    skill = learn(shown)
+    figures = figures_of(skill)
+    back = decoded(skill.file, origin="again")
     found = clock(skill)
     assert found is not None
     assert not found.waits
+    assert clock(back) == found
+    assert clock(learn(kind_of_takes(6, timetable=False))) is None
     assert figures.taken.endswith("and a clock")
-    assert figures.all.error_mm < 30.0
-    assert any("timetable" in text for text in figures.warnings)
-    assert clock(learn(takes(6, timetable=False))) is None
-    back = decoded(skill.file, origin="again")
-    assert clock(back) == clock(skill)
-    hands, still = takes(1, timetable=True)[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
-    there = [one.predict(hands, still, still, clock=np.array([6.0, 1.0, 0.0])) for one in (skill, back)]
-    np.testing.assert_array_equal(there[0].position, there[1].position)
-    early = skill.predict(hands, still, still, clock=np.array([3.0, 1.0, 0.0]))
-    assert np.linalg.norm(there[0].position - early.position) > 0.15
-    moved = skill.predict(hands, still, still, clock=np.array([4.8, 1.0, 0.0]))
-    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.01, 0.01))
-    np.testing.assert_allclose(moved.velocity, (ahead.position - behind.position) / 0.02, atol=2e-3)
-
-
-@pytest.mark.thorough
-def test_a_stage_has_a_clock_where_it_is_a_timetable_and_nowhere_else() -> None:
-    shown = named(6, timetable=True)
-    skill = learn(shown)
-    figures = msgspec.json.decode(skill.figures, type=Figures)
-    assert isinstance(skill.model, StagedKMP)
-    assert skill.model.clock is not None
-    assert not skill.model.clock.waits
     assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
-    assert any("anew in each stage" in text for text in figures.warnings)
-    assert clock(learn(named(6, timetable=False))) is None
-    back = decoded(skill.file, origin="again")
-    assert isinstance(back.model, StagedKMP)
-    assert back.model.clock == skill.model.clock
-    hands, still = shown[0].hands[-1].reshape(2, 3), np.zeros((2, 3))
-    early, moving, late = (skill.predict(hands, still, still, clock=np.array([t, 1.0, 0.0])) for t in (3.0, 4.8, 7.0))
-    assert np.linalg.norm(late.position - shown[0].tool[-1, :3]) < 0.02
-    assert np.linalg.norm(late.position - early.position) > 0.2
-    behind, ahead = (skill.predict(hands, still, still, clock=np.array([4.8 + h, 1.0, 0.0])) for h in (-0.02, 0.02))
+    assert figures.all.error_mm < 30.0
+    assert any(says in text for text in figures.warnings)
+
+    def at(one: StoredSkill, clock_s: float) -> Prediction:
+        return at_rest(one, shown[0].hands[-1], clock=np.array([clock_s, 1.0, 0.0]))
+
+    late = at(skill, late_s)
+    np.testing.assert_array_equal(late.position, at(back, late_s).position)
+    assert 1000.0 * np.linalg.norm(late.position - shown[0].tool[-1, :3]) < error_mm
+    assert np.linalg.norm(late.position - at(skill, 3.0).position) > 0.2
+    behind, moving, ahead = (at(skill, 4.8 + step_s) for step_s in (-0.02, 0.0, 0.02))
     np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
 
 
@@ -203,10 +195,3 @@ def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
     assert seconds[199] == pytest.approx(1.9, abs=0.05)
     assert not any(seconds[200:300])
     assert seconds[-1] == pytest.approx(0.9, abs=0.05)
-
-
-def test_a_file_with_a_broken_clock_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    skill = learn(takes(6, timetable=True))
-    monkeypatch.setattr(TaskClock, "numbers", np.full(13, np.inf))
-    with pytest.raises(SkillError, match="task_clock"):
-        decoded(with_file(skill).file, origin="broken")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from service.core.tool_limits import binding, limits_of_task, path_of, tool_limi
 from service.core.tuning import TUNING
 from service.files.shipped import ARMS, cell_of
 from service.settings.config import Settings, robot_description
+from support.followed import changed
 
 PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 
@@ -22,9 +22,9 @@ PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 @pytest.mark.parametrize("name", ARMS)
 def test_at_its_limit_the_tool_needs_all_that_is_planned_of_the_joint_that_is_named(name: str) -> None:
     settings = cell_of(name)
-    fast = msgspec.structs.replace(settings.tool, max_speed=100.0, max_acceleration=1000.0, fault_speed=200.0)
     arm, random = Arm(settings, robot_description(settings)), np.random.default_rng(0)
-    quick = msgspec.structs.replace(settings, tool=fast)  # its own limits never bind
+    never_binding = {"max_speed": 100.0, "max_acceleration": 1000.0, "fault_speed": 200.0}
+    quick = changed(settings, tool=never_binding)
     for _ in range(20):
         q = np.array(settings.arm.posture) + random.uniform(-0.2, 0.2, len(settings.joints.names))
         u = random.normal(size=3)
@@ -55,9 +55,8 @@ def test_of_a_task_the_limits_follow_the_joints_until_the_tool_has_its_own(skill
     urdf, path = robot_description(settings), path_of(skill)
 
     def limits(share: float, max_speed: float = 0.8) -> dict[str, tuple[float, str]]:
-        joints = msgspec.structs.replace(settings.joints, velocity=tuple(share * v for v in settings.joints.velocity))
-        tool = msgspec.structs.replace(settings.tool, max_speed=max_speed)
-        cell = msgspec.structs.replace(settings, joints=joints, tool=tool)
+        velocity = tuple(share * v for v in settings.joints.velocity)
+        cell = changed(settings, joints={"velocity": velocity}, tool={"max_speed": max_speed})
         return {
             where: (one.speed, one.speed_joint)
             for where, one in limits_of_task(cell, urdf, path, skill.orientation).items()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kmp import KMP, Gaussians, ViaPointMissed, named_arrays
-from support.primitives import database, kernel, properties, same_bits, seeds, skill, via
+from support.primitives import database, kernel, properties, representations, same_bits, seeds, skill, via
 
 
 def test_via_points_of_small_variance_are_met():
@@ -51,9 +51,9 @@ def test_the_tolerance_itself_is_not_near_enough():
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
 @properties
-@given(seeds, st.floats(0, 3))
-def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance):
-    primitive = skill(seed)
+@given(seeds, st.floats(0, 3), representations)
+def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance, representation):
+    primitive = skill(seed, representation=representation)
     inputs, points = via(seed, 5, std=0.01)
     inputs[4] = inputs[3] + 0.05
     order = np.random.default_rng(seed).permutation(5)
@@ -64,10 +64,11 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
         singly = singly.adapt(inputs[n : n + 1], points.take(slice(n, n + 1)), tolerance=tolerance)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     assert np.array_equal(together.inner.changes.replaced, shuffled.inner.changes.replaced)
-    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-7)
+    np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-8)
     found, wanted = shuffled.predict(queries).covariance, together.predict(queries).covariance
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
     assert same_bits(singly, together, queries)
+    assert primitive.adapt(*via(0, 0), tolerance=1) is together.base is primitive
 
 
 @properties
@@ -87,7 +88,7 @@ def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, toler
 def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation):
     inputs, reference = database()
     primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
-    points = Gaussians(np.zeros((80, 3)), np.tile(1e-4 * np.eye(3), (80, 1, 1)))
+    points = Gaussians.of(np.zeros((80, 3)), deviation=0.01)
     elsewhere = 40.0 + 3 * np.random.default_rng(0).normal(size=(80, 4))
     adapted = primitive.adapt(elsewhere, points, tolerance=0.1)
     assert len(adapted.inputs) == 110
@@ -106,12 +107,6 @@ def test_every_point_of_the_base_may_be_replaced():
     np.testing.assert_allclose(adapted.mean(adapted.inputs), points.mean, atol=1e-4)
 
 
-def test_adapting_the_base_to_nothing_gives_the_base():
-    primitive = skill()
-    adapted = primitive.adapt(*via(0, 2), tolerance=1)
-    assert adapted.base.adapt(*via(0, 0), tolerance=1) is primitive
-
-
 def test_adapting_leaves_the_primitive_as_it_was():
     primitive, queries = skill(), np.random.default_rng(0).normal(size=(3, 4))
     before = primitive.predict(queries)
@@ -123,7 +118,7 @@ def test_adapting_leaves_the_primitive_as_it_was():
 def test_a_via_point_that_is_missed_is_named_with_the_numbers():
     primitive = skill()
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
-    points = Gaussians([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], np.tile(1e-4 * np.eye(3), (3, 1, 1)))
+    points = Gaussians.of([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], deviation=0.01)
     says = r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell"
     with pytest.warns(ViaPointMissed, match=says) as told:
         adapted = primitive.adapt(near, points, tolerance=0)
@@ -135,5 +130,5 @@ def test_a_via_point_that_is_missed_is_named_with_the_numbers():
 def test_a_via_point_that_may_be_missed_or_is_missed_by_less_than_a_millimetre_is_not_named():
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
     for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
-        points = Gaussians([[0.0, 0, 0], [apart, 0, 0]], np.tile(std**2 * np.eye(3), (2, 1, 1)))
+        points = Gaussians.of([[0.0, 0, 0], [apart, 0, 0]], deviation=std)
         skill().adapt(near, points, tolerance=0)

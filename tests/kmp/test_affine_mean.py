@@ -14,12 +14,8 @@ from kmp import (
 )
 from kmp.functionals import Functionals
 from kmp.solution import mean_of
+from support.primitives import KERNELS, curve
 
-KERNELS = {
-    "one length": GaussianKernel(0.5),
-    "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
-    "velocity": VelocityKernel(2.0),
-}
 POSITIONS = AffineMean([[0.5, -1.0, 2.0], [1.5, 0.25, -0.75]], [0.3, -0.2])
 OVER_TIME = AffineMean([[0.5], [-1.5], [0.0], [0.0]], [0.3, -0.2, 0.5, -1.5])  # the rates' offset is the values' slope
 
@@ -34,23 +30,18 @@ def at(prior, points):
 
 def both(kernel, representation, how):
     """A primitive over an affine mean, and the same over none of what is left of the outputs."""
-    random, kernel = np.random.default_rng(0), KERNELS[kernel]
-    t = np.linspace(0, 2, 60)[:, None]
-    s = t if kernel.channels == 2 else np.hstack([t, np.sin(3 * t), np.cos(2 * t)])
+    kernel = KERNELS[kernel]
+    s, reference = curve(kernel)
     prior = OVER_TIME if kernel.channels == 2 else POSITIONS
-    rates = [2 * np.cos(2 * t), -3 * np.sin(3 * t)] if kernel.channels == 2 else []
-    mean = np.hstack([np.sin(2 * t), np.cos(3 * t), *rates])
-    root = 0.05 * random.normal(size=(60, mean.shape[1], mean.shape[1]))
-    covariance = root @ root.swapaxes(1, 2) + 1e-3 * np.eye(mean.shape[1])
     along = np.zeros_like(s)
     along[40:] = 0.7
     points = Functionals.checked(s, along if how == "directions" else None)
     moved, parameters = at(prior, points), {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 3.0}
     parameters |= {"representation": representation, "directions": points.directions}
-    one = KMP.fit(s, Gaussians(mean + moved, covariance), prior_mean=prior, **parameters)
-    rest = KMP.fit(s, Gaussians(mean, covariance), **parameters)
+    one = KMP.fit(s, Gaussians(reference.mean + moved, reference.covariance), prior_mean=prior, **parameters)
+    rest = KMP.fit(s, reference, **parameters)
     if how == "adapted":
-        via, desired = s[20:22] + 0.01, Gaussians(mean[20:22] + 0.05, covariance[20:22])
+        via, desired = s[20:22] + 0.01, Gaussians(reference.mean[20:22] + 0.05, reference.covariance[20:22])
         shifted = Gaussians(desired.mean + at(prior, Functionals(via)), desired.covariance)
         one, rest = one.adapt(via, shifted, tolerance=0.02), rest.adapt(via, desired, tolerance=0.02)
     return prior, one, rest
@@ -89,7 +80,7 @@ def test_it_is_as_if_what_is_left_had_been_learned(kernel, representation, how):
 def test_via_points_and_their_velocities_are_met_and_constraints_obeyed():
     _, one, _ = both("a length an input", "dense", "fitted")
     where, wanted = one.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
-    exact = Gaussians(wanted, np.tile(1e-8 * np.eye(2), (2, 1, 1)))
+    exact = Gaussians.of(wanted, deviation=1e-4)
     through = one.adapt(where, exact, tolerance=0.0, directions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     np.testing.assert_allclose(through.mean(where[:1])[0], wanted[0], atol=1e-3)
     np.testing.assert_allclose(through.jacobian(where[0])[:, 0], wanted[1], atol=1e-3)

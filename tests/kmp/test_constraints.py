@@ -8,7 +8,7 @@ from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKerne
 
 T = np.linspace(0, 2, 50)[:, None]
 PATH = np.hstack([np.sin(3 * T), np.cos(2 * T)])
-REFERENCE = Gaussians(PATH, np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+REFERENCE = Gaussians.of(PATH, deviation=0.03)
 WHERE = np.linspace(0, 2, 41)[:, None]
 LOW = LinearConstraints(WHERE, np.tile([0.0, 1.0], (41, 1)), np.full(41, -0.2))  # stay above -0.2
 SIDE = LinearConstraints(WHERE, np.tile([-2.0, 0.5], (41, 1)), np.full(41, -1.6))
@@ -82,7 +82,7 @@ def test_a_speed_can_be_limited_and_rates_among_the_outputs_too():
     skill = base().constrained(slow)
     assert base().jacobians(WHERE)[:, 0, 0].max() > 2.9
     assert skill.jacobians(WHERE)[:, 0, 0].max() < 1.5 + 1e-9
-    rates = Gaussians(np.hstack([PATH[:, :1], 3 * np.cos(3 * T)]), np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+    rates = Gaussians.of(np.hstack([PATH[:, :1], 3 * np.cos(3 * T)]), deviation=0.03)
     one = KMP.fit(T, rates, kernel=VelocityKernel(5.0), lambda_mean=1.0)
     limits = LinearConstraints(WHERE, np.tile([0.0, -1.0], (41, 1)), np.full(41, -2.0))
     assert violation(one, limits) > 0.9
@@ -90,7 +90,7 @@ def test_a_speed_can_be_limited_and_rates_among_the_outputs_too():
 
 
 def test_via_points_and_constraints_hold_together_in_any_order():
-    via = Gaussians([[0.5, 0.1]], [1e-8 * np.eye(2)])
+    via = Gaussians.of([[0.5, 0.1]], deviation=1e-4)
     first = base().constrained(LOW).adapt([[1.3]], via, tolerance=0.03)
     then = base().adapt([[1.3]], via, tolerance=0.03).constrained(LOW)
     for skill in (first, then):

@@ -19,7 +19,7 @@ def letter(representation="dense"):
         lambda_mean=2.0,
         representation=representation,
     )
-    return primitive.adapt([[1.0]], Gaussians([[1.4, -1.2]], [1e-8 * np.eye(2)]), tolerance=0.02)
+    return primitive.adapt([[1.0]], Gaussians.of([[1.4, -1.2]], deviation=1e-4), tolerance=0.02)
 
 
 def basis(count=5):

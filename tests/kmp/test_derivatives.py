@@ -8,11 +8,12 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel, ViaPointMissed, named_arrays
 from kmp.functionals import Functionals
 from kmp.kernel import between, variances
+from support.primitives import naive
 
 RANDOM = np.random.default_rng(0)
 S = RANDOM.normal(size=(60, 4))
 TRUTH = lambda s: np.stack([np.sin(s[:, 0]), s[:, 1] * s[:, 2], np.cos(s[:, 3])], axis=1)  # noqa: E731
-REFERENCE = Gaussians(TRUTH(S), np.tile(1e-3 * np.eye(3), (60, 1, 1)))
+REFERENCE = Gaussians.of(TRUTH(S), deviation=0.03)
 PLACE = S[:1] + 0.1
 FOLLOW = np.eye(3, 4)[None]  # the output follows the first three inputs
 KERNELS = {
@@ -28,9 +29,12 @@ def base(representation="dense", kernel="a length an input", **options):
     return KMP.fit(S, REFERENCE, kernel=KERNELS[kernel], representation=representation, **options)
 
 
+def placed(one):
+    return one.adapt(PLACE, Gaussians.of(TRUTH(S[:1]), deviation=1e-4), tolerance=0.3)
+
+
 def taught(one, deviation=1e-4):
-    desired = Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)])
-    return one.adapt(PLACE, desired, tolerance=0.3).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
+    return placed(one).adapt_jacobian(PLACE, FOLLOW, deviation=deviation)
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -66,38 +70,25 @@ def test_a_taught_jacobian_is_the_jacobian_there_and_the_place_is_still_met(repr
     step = 0.01 * RANDOM.normal(size=(5, 4))
     follows = TRUTH(S[:1]) + step @ FOLLOW[0].T
     np.testing.assert_allclose(one.mean(PLACE + step), follows, atol=1e-3)
-    bare = base(representation, kernel).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    bare = placed(base(representation, kernel))
     assert np.abs(bare.mean(PLACE + step) - follows).max() > 4e-3
 
 
 def test_one_point_with_its_jacobian_says_what_thirteen_points_say():
     step = np.concatenate([np.zeros((1, 4)), 0.03 * np.eye(4), -0.03 * np.eye(4)])
-    around = Gaussians(TRUTH(S[:1]) + step @ FOLLOW[0].T, np.tile(1e-8 * np.eye(3), (9, 1, 1)))
+    around = Gaussians.of(TRUTH(S[:1]) + step @ FOLLOW[0].T, deviation=1e-4)
     nine, one = base().adapt(PLACE + step, around, tolerance=0.3), taught(base())
     queries = PLACE + 0.01 * RANDOM.normal(size=(20, 4))
     np.testing.assert_allclose(one.mean(queries), nine.mean(queries), atol=1e-3)
     np.testing.assert_allclose(one.jacobian(queries[0]), nine.jacobian(queries[0]), atol=0.05)
 
 
-def naive(one, queries):
-    """Equations (8) and (9) and the covariance of IJRR 2019 for functionals, as they stand."""
-    known, n = one.inner.solution.database.functionals, len(one.inputs)
-    sigma = np.zeros((n, 3, n, 3))
-    sigma[np.arange(n), :, np.arange(n)] = one.reference.covariance
-    m = np.kron(between(one.kernel, known, known), np.eye(3)) + one.lambda_mean * sigma.reshape(3 * n, 3 * n)
-    k = np.kron(between(one.kernel, Functionals(queries), known), np.eye(3))
-    right = one.reference.mean - known.values[:, None] * one.prior_mean
-    mean = (k @ np.linalg.solve(m, right.ravel())).reshape(-1, 3) + one.prior_mean
-    left = np.eye(3 * len(queries)) - k @ np.linalg.solve(m, k.T)
-    blocks = [left[i : i + 3, i : i + 3] for i in range(0, len(left), 3)]
-    return mean, np.array(blocks) * len(one.base.inputs) / one.lambda_covariance
-
-
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
     one = taught(base(representation), deviation=0.1)
     queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
-    mean, covariance = naive(one, queries)
+    mean, joint = naive(one, queries)
+    covariance = np.array([joint[n, :, n] for n in range(len(queries))])
     found = one.predict(queries)
     np.testing.assert_allclose(found.mean, mean, atol=1e-8)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-8)
@@ -109,7 +100,7 @@ def test_mean_and_covariance_are_those_of_the_naive_solution(representation):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_was(representation):
-    before = base(representation).adapt(PLACE, Gaussians(TRUTH(S[:1]), [1e-8 * np.eye(3)]), tolerance=0.3)
+    before = placed(base(representation))
     after = taught(base(representation))
     near, far = PLACE + 0.05, np.full((1, 4), 9.0)
     a, b = (np.trace(one.predict(near).covariance[0]) for one in (before, after))
@@ -119,22 +110,6 @@ def test_a_jacobian_makes_its_neighbourhood_surer_and_leaves_what_is_far_as_it_w
     np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("representation", ["dense", "low_rank"])
-@pytest.mark.parametrize("kernel", ["one length", "a length an input"])
-def test_the_motion_of_one_query_is_that_of_finite_differences_compiled_or_not(representation, kernel, monkeypatch):
-    one, h = taught(base(representation, kernel)), 1e-4
-    s, v, a = PLACE[0] + 0.03, *RANDOM.normal(size=(2, 4))
-    behind, here, ahead = one.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
-    found, plain = one.predict_motion(s, v, a), one.inner.query.motion(s, v, a, covariance=True)
-    for motion in (found, plain):
-        np.testing.assert_allclose(motion.mean, here, atol=1e-9)
-        np.testing.assert_allclose(motion.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(motion.acceleration, (ahead - 2 * here + behind) / h**2, rtol=1e-3, atol=1e-3)
-    for compiled, other in zip(found, plain, strict=True):
-        np.testing.assert_allclose(compiled, other, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(one.curvature(s, v), found.curvature, atol=1e-9)
-
-
 @pytest.mark.parametrize("kernel", ["periodic", "velocity"])
 def test_over_time_a_derivative_can_be_taught_too(kernel):
     t = np.linspace(0, 2.4, 50)[:, None]
@@ -142,7 +117,7 @@ def test_over_time_a_derivative_can_be_taught_too(kernel):
     mean = np.hstack([np.sin(w * t), w * np.cos(w * t)])
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 1e-2]), (50, 1, 1)))
     one = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
-    wanted = Gaussians([[5.0, 2.0]], [1e-8 * np.eye(2)])
+    wanted = Gaussians.of([[5.0, 2.0]], deviation=1e-4)
     adapted, h = one.adapt([[0.6]], wanted, tolerance=0, directions=[[1.0]]), 1e-5
     ahead, behind = adapted.mean([[0.6 + h]]), adapted.mean([[0.6 - h]])
     np.testing.assert_allclose((ahead - behind) / (2 * h), wanted.mean, atol=1e-3)
@@ -153,7 +128,7 @@ def test_over_time_a_derivative_can_be_taught_too(kernel):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_velocity_is_a_derivative_along_the_inputs_velocity(representation):
-    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians([[0.1, 0.2, -0.3]], [1e-8 * np.eye(3)])
+    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
     one = base(representation).adapt(PLACE, wanted, tolerance=9.0, directions=v)
     np.testing.assert_allclose(one.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, wanted.mean[0], atol=1e-5)
     assert len(one.inputs) == 61  # no reference point gave way

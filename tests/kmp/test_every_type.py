@@ -27,7 +27,7 @@ from kmp.arrays.immutable import Immutable
 from kmp.storage import checksum
 
 S = np.random.default_rng(0).normal(size=(20, 2))
-R = Gaussians(S, np.tile(0.01 * np.eye(2), (20, 1, 1)))
+R = Gaussians.of(S, deviation=0.1)
 EYES = np.tile(0.01 * np.eye(3), (20, 1, 1))
 K = GaussianKernel(1.0)
 ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
@@ -142,9 +142,10 @@ def test_a_primitive_that_was_stored_or_pickled_predicts_and_is_adapted_as_befor
     stored = kmp.load(tmp_path / "skill")
     assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
     queries, place = one.inputs[:5] + 0.1, one.inputs[3:4] + 0.05
-    desired = Gaussians(one.mean(place) + 0.01, [0.01 * np.eye(one.outputs)])
+    desired = Gaussians.of(one.mean(place) + 0.01, deviation=0.1)
     for again in (stored.primitive, pickle.loads(pickle.dumps(one))):
         assert again.representation == one.representation
+        assert not again.weights.flags.writeable
         adapted = (primitive.adapt(place, desired, tolerance=0.01) for primitive in (again, one))
         for a, b in ((again, one), (again.base, one.base), tuple(adapted)):
             for many in (queries, queries[:1]):

@@ -3,33 +3,29 @@
 import numpy as np
 import pytest
 
-from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+from kmp import KMP, Gaussians
 from kmp.compiled import AVAILABLE
-
-KERNELS = {
-    "one length": GaussianKernel(0.5),
-    "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
-    "velocity": VelocityKernel(2.0),
-}
+from support.primitives import KERNELS, curve
 
 
-def primitive(kernel, representation, adapted):
-    random, kernel = np.random.default_rng(0), KERNELS[kernel]
-    t = np.linspace(0, 2, 60)[:, None]
-    inputs = t if kernel.channels == 2 else np.hstack([t, np.sin(3 * t), np.cos(2 * t)])
-    values, rates = np.hstack([np.sin(2 * t), np.cos(3 * t)]), np.hstack([2 * np.cos(2 * t), -3 * np.sin(3 * t)])
-    mean = np.hstack([values, rates]) if kernel.channels == 2 else values
-    root = 0.05 * random.normal(size=(60, mean.shape[1], mean.shape[1]))
-    reference = Gaussians(mean, root @ root.swapaxes(1, 2) + 1e-3 * np.eye(mean.shape[1]))
-    lambdas = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "prior_mean": [0.3, 0.2, 0, 0][: mean.shape[1]]}
-    fitted = KMP.fit(inputs, reference, kernel=kernel, representation=representation, **lambdas)
-    if not adapted:
-        return fitted
-    via = Gaussians(mean[20:22] + 0.05, np.tile(1e-3 * np.eye(mean.shape[1]), (2, 1, 1)))
-    return fitted.adapt(inputs[20:22] + 0.01, via, tolerance=0.02)
+def primitive(kernel, representation, changed):
+    inputs, reference = curve(KERNELS[kernel])
+    prior = [0.3, 0.2, 0, 0][: reference.outputs]
+    options = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "prior_mean": prior, "representation": representation}
+    one = KMP.fit(inputs, reference, kernel=KERNELS[kernel], **options)
+    if changed != "fitted":
+        via = Gaussians.of(reference.mean[20:22] + 0.05, deviation=0.03)
+        one = one.adapt(inputs[20:22] + 0.01, via, tolerance=0.02)
+    if changed == "with a Jacobian":
+        place = inputs[31:32] + 0.01
+        one = one.adapt_jacobian(place, one.jacobians(place) + 0.1, deviation=0.1)
+    return one
 
 
-@pytest.fixture(params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)], ids=str)
+CHANGES = ("fitted", "adapted", "with a Jacobian")
+
+
+@pytest.fixture(params=[(k, r, c) for k in KERNELS for r in ("dense", "low_rank") for c in CHANGES], ids=str)
 def skill(request):
     return primitive(*request.param)
 
@@ -83,7 +79,7 @@ def test_compiled_means_and_jacobians_are_the_plain_ones_to_a_few_units_in_the_l
 
 @pytest.mark.parametrize("how", [np.asfortranarray, np.float32, lambda s: s.astype(">f8"), lambda s: s.tolist()])
 def test_a_query_may_come_as_any_array(how):
-    one = primitive("one length", "dense", False)
+    one = primitive("one length", "dense", "fitted")
     s = np.random.default_rng(3).normal(size=(5, 3)).astype(np.float32).astype(np.float64)
     assert np.array_equal(one.mean(how(s)), one.mean(s))
     assert np.array_equal(one.jacobian(how(s)[0]), one.jacobian(s[0]))
@@ -121,14 +117,6 @@ def test_the_covariance_can_be_left_out_and_changes_nothing_else(skill):
         assert np.array_equal(getattr(found, name), getattr(whole, name))
 
 
-def test_shapes_are_those_of_one_query(skill):
-    found, outputs = skill.predict_motion(*moving(skill)), skill.outputs
-    assert [array.shape for array in found[:3]] == [(outputs,)] * 3
-    assert found.covariance.shape == (outputs, outputs)
-    assert found.jacobian.shape == (outputs, skill.inputs.shape[1])
-    assert found.curvature.shape == (outputs,)
-
-
 def test_what_one_query_touches_is_contiguous_and_read_only(skill):
     query = skill.inner.query
     for array in (query.centres, query.weights, query.weight_rows, query.stretch, query.prior_mean):
@@ -136,14 +124,7 @@ def test_what_one_query_touches_is_contiguous_and_read_only(skill):
         assert not array.flags.writeable
 
 
-def test_an_input_at_rest_gives_an_output_at_rest():
-    one = primitive("one length", "dense", False)
-    found = one.predict_motion(one.inputs[3], np.zeros(3), np.zeros(3))
-    np.testing.assert_array_equal(found.velocity, 0)
-    np.testing.assert_array_equal(found.acceleration, 0)
-
-
 def test_numbers_too_large_to_square_are_still_finite():
-    one = primitive("one length", "dense", False)
+    one = primitive("one length", "dense", "fitted")
     with np.errstate(over="ignore"):
         np.testing.assert_array_equal(one.mean([[1e200, 0, 0]]), [one.prior_mean])

@@ -121,7 +121,7 @@ def test_start_and_goal_frames_carry_the_skill_to_new_places():
 
 def test_via_points_of_the_world_are_met_in_frames_elsewhere():
     skill, t = learned()
-    desired = Gaussians([[0.4, 0.9]], [1e-8 * np.eye(2)])
+    desired = Gaussians.of([[0.4, 0.9]], deviation=1e-4)
     placed = skill.placed([CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])])
     adapted = placed.adapt([[0.5]], desired, tolerance=0.01)
     np.testing.assert_allclose(adapted.mean([[0.5]]), desired.mean, atol=1e-3)

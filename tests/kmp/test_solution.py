@@ -24,9 +24,10 @@ from kmp.predictor import Inner
 from kmp.solution import Solution, mean_at
 
 S = np.random.default_rng(0).normal(size=(40, 2))
-REFERENCE = Gaussians(np.sin(S), np.tile(0.01 * np.eye(2), (40, 1, 1)))
+REFERENCE = Gaussians.of(np.sin(S), deviation=0.1)
 VIA = S[:3] + 0.01, REFERENCE.take(slice(0, 3))
 MANY = S[:38] + 0.01, REFERENCE.take(slice(0, 38))
+
 MEMBERS = [name for name in vars(Solution) if not name.startswith("_")]
 
 
@@ -156,7 +157,7 @@ def test_outputs_that_nothing_tells_apart_are_solved_as_one_with_the_same_result
 
 
 def via(count, outputs):
-    return Gaussians(np.ones((count, outputs)), np.tile(1e-3 * np.eye(outputs), (count, 1, 1)))
+    return Gaussians.of(np.ones((count, outputs)), deviation=0.03)
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
@@ -180,7 +181,7 @@ def test_adapting_changes_whether_outputs_are_solved_as_one(first):
 @pytest.mark.parametrize("lambda_covariance", [None, 3.0])
 def test_adapting_copies_no_factor_and_gives_what_a_fit_of_all_points_gives(lambda_covariance):
     inputs = np.random.default_rng(1).normal(size=(600, 2))
-    reference = Gaussians(np.sin(inputs), np.tile(0.01 * np.eye(2), (600, 1, 1)))
+    reference = Gaussians.of(np.sin(inputs), deviation=0.1)
     one = KMP.fit(inputs, reference, kernel=GaussianKernel(1.0), lambda_mean=1.0, lambda_covariance=lambda_covariance)
     factor = one.inner.solution.mean_factor
     tracemalloc.start()

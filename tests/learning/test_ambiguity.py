@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -12,11 +11,12 @@ from service.learning.learn import learn
 from service.learning.records import Figures
 from support.circling import circling
 from support.fine_motion import fine
+from support.skills import figures_of
 from support.taught_scene import demonstrated
 
 
 def judged(demonstrations: list[Demonstration]) -> Figures:
-    return msgspec.json.decode(learn(demonstrations, points=80).figures, type=Figures)
+    return figures_of(learn(demonstrations, points=80))
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0002, 0.001, 0.003])

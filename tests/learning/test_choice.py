@@ -9,9 +9,9 @@ import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.criteria.cross_validation import mahalanobis, rms
-from kmp.criteria.direct import DirectSelection
+from kmp.criteria.direct import DirectSelection, ridge_mean
 from service.core.skill.model import CHI_SQUARE, LEVELS
-from service.learning.choice import POSITION_SCALES, selection_of, thinned
+from service.learning.choice import MAX_GAIN, POSITION_SCALES, RIDGE_M, selection_of, thinned
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.skill_file import SkillError
@@ -33,20 +33,22 @@ def choice() -> DirectSelection:
     return selection_of([shown(seed) for seed in range(4)], 60)
 
 
-def test_the_residuals_left_out_are_those_of_primitives_fitted_without(choice: DirectSelection) -> None:
+@pytest.mark.parametrize("ridge_m", [None, RIDGE_M])
+def test_the_residuals_left_out_are_those_of_primitives_and_means_fitted_without(
+    choice: DirectSelection, ridge_m: float | None
+) -> None:
     ell, noise = 4.0, 0.1
-    for one, mine in ((h, choice.group == h) for h in range(4)):
-        rest = ~mine
-        reference = Gaussians(choice.outputs[rest], np.broadcast_to(np.eye(3), (rest.sum(), 3, 3)))
-        fitted = KMP.fit(
-            choice.inputs[rest],
-            reference,
-            kernel=GaussianKernel(ell),
-            lambda_mean=noise,
-            prior_mean=choice.outputs.mean(axis=0),
-        )
+    for group in range(4):
+        mine = choice.group == group
+        inputs = choice.inputs[~mine]
+        outputs = choice.outputs[~mine]
+        prior = choice.outputs.mean(axis=0)
+        if ridge_m is not None:
+            prior = ridge_mean(inputs, outputs, ridge_m, max_gain=MAX_GAIN)
+        reference = Gaussians.of(outputs, deviation=1.0)
+        fitted = KMP.fit(inputs, reference, kernel=GaussianKernel(ell), lambda_mean=noise, prior_mean=prior)
         expected = choice.outputs[mine] - fitted.mean(choice.inputs[mine])
-        np.testing.assert_allclose(choice.residuals(ell, noise)[mine], expected, atol=1e-9, err_msg=str(one))
+        np.testing.assert_allclose(choice.residuals(ell, noise, ridge_m)[mine], expected, atol=1e-9)
 
 
 def test_the_choice_is_as_good_as_any_that_was_tried(choice: DirectSelection) -> None:

@@ -4,15 +4,14 @@ hold.
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 
 from service.contract.requests import ViaPoint
 from service.learning.demonstration import Demonstration
 from service.learning.gate import FLOOR_M
 from service.learning.learn import learn
-from service.learning.records import Figures
 from support.circling import circling
+from support.skills import at_rest, figures_of
 
 NOISE_M = 0.002  # of a usual tracker
 PLACES = tuple(
@@ -33,17 +32,17 @@ def along_a_line(number: int) -> Demonstration:
 def test_between_places_the_gate_is_no_nearer_than_noise() -> None:
     skill = learn([along_a_line(number) for number in range(3)])
     assert skill.threshold >= FLOOR_M
-    random, still = np.random.default_rng(1), np.zeros((2, 3))
+    random = np.random.default_rng(1)
     hands = along_a_line(0).hands[::10].reshape(-1, 2, 3)
-    noisy = [skill.predict(at + NOISE_M * random.normal(size=(2, 3)), still, still).gate_m for at in hands]
+    noisy = [at_rest(skill, at + NOISE_M * random.normal(size=(2, 3))).gate_m for at in hands]
     assert max(noisy) < skill.threshold
-    said = msgspec.json.decode(skill.figures, type=Figures).warnings
+    said = figures_of(skill).warnings
     assert any("less noise than any tracker" in one for one in said)
 
 
 def test_a_covariance_is_never_less_than_a_trackers_noise() -> None:
     made = [one._replace(tool=(one.left + one.right) / 2) for one in (circling(seed, noise_m=0.0) for seed in range(4))]
-    figures = msgspec.json.decode(learn(made, points=80).figures, type=Figures)
+    figures = figures_of(learn(made, points=80))
     assert figures.all.error_mm < 1.0 < figures.all.predicted_mm
     assert figures.gate_mm > 1.0
     said = "; ".join(figures.warnings)

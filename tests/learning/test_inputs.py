@@ -4,7 +4,6 @@ leaving demonstrations out, or people.
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,10 +14,10 @@ from service.learning.demonstration import Demonstration, persons
 from service.learning.learn import learn
 from service.learning.methods.held_out import swapped
 from service.learning.methods.inputs import KINDS
-from service.learning.records import Figures
 from service.learning.skill_file import StoredSkill, decoded
 from service.learning.table import table
 from sim.experiments.people.left_out import judged, left_out, predicted
+from support.skills import at_rest, figures_of, turns_of
 
 TIMES = np.arange(0.0, 6.0, 0.04)
 CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is fixed to
@@ -53,10 +52,6 @@ def shown(seed: int, kind: str, person: str = "") -> Demonstration:
     return Demonstration((1e9 * (1.0 + TIMES)).astype(np.int64), *poses, person=person)
 
 
-def figures(skill: StoredSkill) -> Figures:
-    return msgspec.json.decode(skill.figures, type=Figures)
-
-
 @pytest.fixture(scope="module")
 def carried() -> StoredSkill:
     return learn([shown(seed, "carried") for seed in range(6)], points=120)
@@ -64,7 +59,7 @@ def carried() -> StoredSkill:
 
 def test_where_both_hands_tell_it_is_a_function_of_both() -> None:
     skill = learn([shown(seed, "both") for seed in range(5)], points=120)
-    found = figures(skill)
+    found = figures_of(skill)
     assert skill.conductor is None
     assert found.taken == "positions"
     assert set(found.tried_mm) == {
@@ -81,19 +76,17 @@ def test_where_both_hands_tell_it_is_a_function_of_both() -> None:
 
 def test_where_one_hand_tells_as_much_the_other_makes_no_difference_and_that_is_said() -> None:
     skill = learn([shown(seed, "left") for seed in range(5)], points=120)
-    found = figures(skill)
+    found = figures_of(skill)
     assert skill.conductor == 0
     assert found.taken == "positions of the left hand"
     assert any("the left hand alone" in warning and "may be absent" in warning for warning in found.warnings)
-    hands, still = shown(9, "left").hands[40].reshape(2, 3), np.zeros((2, 3))
+    hands = shown(9, "left").hands[40].reshape(2, 3)
     away = np.stack([hands[0], [3.0, 3.0, 3.0]])
-    np.testing.assert_array_equal(
-        skill.predict(hands, still, still).position, skill.predict(away, still, still).position
-    )
+    np.testing.assert_array_equal(at_rest(skill, hands).position, at_rest(skill, away).position)
 
 
 def test_a_tool_that_is_fixed_to_a_turned_hand_is_predicted_by_how_that_is_turned(carried: StoredSkill) -> None:
-    found = figures(carried)
+    found = figures_of(carried)
     assert found.taken == "orientations of the left hand"
     assert isinstance(carried.model, HandsKMP)
     assert carried.model.turned
@@ -107,25 +100,20 @@ def test_a_tool_that_is_fixed_to_a_turned_hand_is_predicted_by_how_that_is_turne
 
 
 def test_its_velocity_is_that_of_the_turning_hand_and_its_file_serves_as_it_was_learned(carried: StoredSkill) -> None:
-    again, still = decoded(carried.file, origin="a file"), np.zeros((2, 3))
+    again = decoded(carried.file, origin="a file")
     hands = np.array([[0.6, -0.2, 0.3], [0.6, 0.2, 0.3]])
     h, rate = 1e-3, np.array([0.0, 0.0, 0.5])
-
-    def turns(at_s: float) -> np.ndarray:
-        """The rows of the filters of hands that turn evenly: each lags by as much again."""
-        rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * TURN_LAG_S)).as_matrix().ravel() for i in range(3)]
-        return np.stack([rows, rows], axis=1)
-
-    behind, now, ahead = (again.predict(hands, still, still, turns=turns(t)) for t in (-h, 0.0, h))
-    np.testing.assert_array_equal(now.position, carried.predict(hands, still, still, turns=turns(0.0)).position)
+    turns = [turns_of(rate, at_s, TURN_LAG_S) for at_s in (-h, 0.0, h)]
+    behind, now, ahead = (at_rest(again, hands, turns=rows) for rows in turns)
+    np.testing.assert_array_equal(now.position, at_rest(carried, hands, turns=turns[1]).position)
     np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
     assert np.linalg.norm(now.velocity) > 0.03
-    untold = again.predict(hands, still, still).position
+    untold = at_rest(again, hands).position
     np.testing.assert_allclose(untold, again.mean(hands.reshape(1, 6))[0], atol=2e-6)
 
 
 def test_a_task_by_the_clock_is_told_to_be_a_timetable() -> None:
-    found = figures(learn([shown(seed, "clock") for seed in range(4)], points=120))
+    found = figures_of(learn([shown(seed, "clock") for seed in range(4)], points=120))
     assert found.all.other_mm["same elapsed time"] < 10
     assert any("the task is a timetable" in warning for warning in found.warnings)
 
@@ -136,7 +124,7 @@ def test_takes_of_a_person_are_left_out_together_where_two_are_named() -> None:
     assert persons([one._replace(person="Ada") for one in takes]) == [0, 1, 2, 3]
     assert persons([takes[0], takes[2], takes[0]._replace(person="")]) == [0, 1, 2]
     by_person, alone = (
-        figures(learn(some, points=120)) for some in (takes, [one._replace(person="") for one in takes])
+        figures_of(learn(some, points=120)) for some in (takes, [one._replace(person="") for one in takes])
     )
     assert table(by_person).startswith("held out by person")
     assert not table(alone).startswith("held out by")

@@ -15,14 +15,14 @@ from service.learning.records import Evidence, Figures
 from service.learning.skill_file import SkillError
 from service.learning.table import table
 from service.settings.config import Reach
-from sim.made_tasks import takes
 from support.paths import ROOT
+from support.skills import figures_of, made
 from support.taught_scene import demonstrated
 
 
 def judged(demonstrations: list[Demonstration], **options: object) -> Figures:
     """The figures of what is learned from these."""
-    return msgspec.json.decode(learn(demonstrations, points=80, **options).figures, type=Figures)  # type: ignore[arg-type]
+    return figures_of(learn(demonstrations, points=80, **options))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_picture_is_one(good: list[Demonstration], tmp_path: Path) -> None:
 
 def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_of_its_errors() -> None:
     seen: list[Evidence] = []
-    learn([take.demonstration for take in takes("cyclic", people=range(2), each=2)], show=seen.append)
+    learn(made("cyclic", range(2)), show=seen.append)
     by_title = {axes.get_title(): axes for axes in drawn(seen[0]).axes}
     (stages,) = (axes for title, axes in by_title.items() if "stage" in title)
     name = stages.get_title().split(",")[0]

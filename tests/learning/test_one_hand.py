@@ -10,7 +10,6 @@ import pytest
 
 from service.contract.records import Mode, Reason
 from service.contract.requests import Hands, ViaPoint
-from service.core.controller import Controller
 from service.core.frame import Records, Tick
 from service.core.skill.staged import StagedKMP
 from service.files.demonstration_files import summary
@@ -19,15 +18,14 @@ from service.files.mcap_file import RecordingError
 from service.files.pose_streams import PoseTopic
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
-from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.table import table
 from service.learning.via_points import adapted
-from sim.made_tasks import takes
 from support.circling import circling
-from support.in_process import ASSUMED, frames, hand
+from support.followed import followed
+from support.in_process import ASSUMED, hand
+from support.skills import STILL, at_rest, figures_of, made
 from support.spoiled import Streams, streams_of, write_streams
-from support.wam import URDF
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
 Point = tuple[float, float, float]
@@ -66,23 +64,23 @@ def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: 
 
 
 def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(skill: StoredSkill) -> None:
-    found = msgspec.json.decode(skill.figures, type=Figures)
+    found = figures_of(skill)
     assert found.unsafe == ()
     assert found.all.error_mm < min(found.all.other_mm.values())
     assert found.beside > 80
     assert f"in wrong samples: {found.beside:.0f} % of the hand 30 cm beside\n" in table(found)
     assert "swapped" not in table(found)
-    again, still = decoded(skill.file, origin="a file"), np.zeros((2, 3))
+    again = decoded(skill.file, origin="a file")
     assert again.conductor == skill.conductor
     told = []
     for other in ((0.5, -0.2, 0.3), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0)):
         at = conducting(skill, AT, other)
         moving = np.stack([[0.1, 0.0, 0.0], [3.0, 3.0, 3.0]])[:: 1 if skill.conductor == 0 else -1]
-        found_there = again.predict(at.reshape(2, 3), moving, still)
+        found_there = again.predict(at.reshape(2, 3), moving, STILL)
         told.append(np.concatenate([*found_there[:3], found_there.covariance.ravel(), again.mean(at[None])[0]]))
     np.testing.assert_array_equal(told, [told[0]] * 3)
     assert np.linalg.norm(told[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25])) < 0.02
-    off = again.predict(conducting(skill, (1.1, 0.2, 0.3), AT).reshape(2, 3), still, still)
+    off = at_rest(again, conducting(skill, (1.1, 0.2, 0.3), AT))
     assert off.gate_m > skill.threshold
 
 
@@ -104,7 +102,7 @@ def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: St
 def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() -> None:
     shown = []
     for seed in range(4):
-        take = takes("one_hand", people=(seed,), each=1)[0].demonstration
+        take = made("one_hand", [seed], each=1)[0]
         shown.append(take._replace(right=take.left, conducts="left"))
     learnt = learn(shown)
     assert isinstance(learnt.model, StagedKMP)
@@ -168,7 +166,7 @@ def served(
         events = [hand(one, AT, k + 1)] if k % 5 == 0 and k < one_to else []
         events += [hand(other, at, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
         ticks.append(Tick(k, tuple(events)))
-    return frames(Controller(ASSUMED, skill, urdf=URDF), ticks)
+    return followed(skill, ticks)
 
 
 def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200) -> list[tuple[int, int]]:
@@ -201,10 +199,3 @@ def test_the_arm_keeps_away_from_where_a_hand_that_has_gone_was_seen_last(skill:
     near, away = (np.linalg.norm(found["tool"][-1] - there) for found in (free, seen))
     assert near < 0.03
     assert away > 0.05
-
-
-def test_a_skill_of_both_hands_waits_for_both_as_ever() -> None:
-    both = learn([circling(seed, apart_m=0.03) for seed in range(3)], points=80)
-    assert both.conductor is None
-    ticks = [Tick(k, (hand("left", AT, k + 1),) if k % 5 == 0 else ()) for k in range(300)]
-    assert set(frames(Controller(ASSUMED, both, urdf=URDF), ticks)["reason"].tolist()) == {Reason.NO_HANDS}

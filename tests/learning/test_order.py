@@ -5,26 +5,20 @@ from __future__ import annotations
 import functools
 from random import Random
 
-import msgspec
 import numpy as np
 import pytest
 
 from service.learning.demonstration import Demonstration, persons
 from service.learning.learn import learn
 from service.learning.methods.staged import is_clear
-from service.learning.records import Figures
-from service.learning.skill_file import SkillError, StoredSkill
+from service.learning.skill_file import SkillError
 from service.learning.takes import takes_of
-from sim.made_tasks import takes
+from support.skills import figures_of, made
 
 
 @functools.cache
 def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
-    return [take.demonstration for take in takes(kind, people=range(people), each=2)]
-
-
-def figures(skill: StoredSkill) -> Figures:
-    return msgspec.json.decode(skill.figures, type=Figures)
+    return made(kind, range(people))
 
 
 @pytest.mark.thorough
@@ -60,13 +54,13 @@ def test_a_take_with_exchanged_hands_is_left_out_and_named() -> None:
     spoilt = good[2]._replace(left=good[2].right, right=good[2].left)
     names = [f"take {number}" for number in range(len(good))]
     skill = learn([*good[:2], spoilt, *good[3:]], names=names)
-    warnings = figures(skill).warnings
+    warnings = figures_of(skill).warnings
     assert warnings[0].startswith("take 2 stands out, and is left out: its tool is ")
     assert "with its hands exchanged: put each tracker on its own hand" in warnings[0]
-    assert {row.name for row in figures(skill).demonstrations} == {*names} - {"take 2"}
-    assert figures(skill).gate_mm < 150.0
+    assert {row.name for row in figures_of(skill).demonstrations} == {*names} - {"take 2"}
+    assert figures_of(skill).gate_mm < 150.0
     others = learn([*good[:2], *good[3:]], names=[name for name in names if name != "take 2"])
-    assert figures(skill).all == figures(others).all
+    assert figures_of(skill).all == figures_of(others).all
 
 
 def test_a_delay_is_stated_only_if_the_gain_is_clear() -> None:
@@ -77,6 +71,6 @@ def test_a_delay_is_stated_only_if_the_gain_is_clear() -> None:
 
 @pytest.mark.thorough
 def test_a_delay_that_is_given_is_taken() -> None:
-    assert figures(learn(shown(), delay_s=0.35)).delay_s == 0.35
+    assert figures_of(learn(shown(), delay_s=0.35)).delay_s == 0.35
     with pytest.raises(SkillError, match=r"a delay goes with via-points"):
         learn([one._replace(places=()) for one in shown()], delay_s=0.1)

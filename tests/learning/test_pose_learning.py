@@ -18,13 +18,14 @@ from service.learning.ambiguity import SAME_M
 from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from service.learning.pose import learned_pose
-from service.learning.records import Figures, HeldOut
+from service.learning.records import HeldOut
 from service.learning.skill_file import SkillError, decoded
 from service.learning.takes import takes_of
 from service.learning.via_points import adapted, in_force
 from sim.scene import TOOL_ORIENTATION
 from sim.teach import demonstrations
-from support.taught_scene import PLACES, SCENE
+from support.skills import at_rest, figures_of
+from support.taught_scene import PLACES, SCENE, with_hands
 
 TURN = np.radians(120.0) * np.array([0.0, 0.6, 0.8])
 START = Rotation.from_quat(TOOL_ORIENTATION)
@@ -51,15 +52,14 @@ def posed(shown: list[Demonstration]) -> Skill:
 
 def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]) -> float:
     """Between what is predicted for hands (6,) at rest, and an orientation."""
-    still = np.zeros((2, 3))
-    found = skill.predict(np.reshape(hands, (2, 3)), still, still).turn.orientation
+    found = at_rest(skill, hands).turn.orientation
     return float(np.degrees((Rotation.from_quat(found) * Rotation.from_quat(orientation).inv()).magnitude()))
 
 
 def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
-    figures = msgspec.json.decode(posed.figures)
-    assert not any("orientation" in text for text in (*figures["unsafe"], *figures["warnings"]))
-    assert figures["orientation_error_deg"] < 5
+    figures = figures_of(posed)
+    assert not any("orientation" in text for text in (*figures.unsafe, *figures.warnings))
+    assert figures.orientation_error_deg < 5
     for row in (0, -1):
         one = shown[0]
         assert angle_deg(posed, one.hands[row], one.tool[row, 3:]) < 15  # smoothed, not averaged: that would be 60
@@ -90,8 +90,7 @@ def test_a_constant_orientation_and_no_gripper_stay_out_of_the_skill(coarse: Ski
 
 def test_a_skill_with_orientation_and_gripper_comes_back_from_its_file(posed: Skill) -> None:
     back = decoded(posed.file, origin="x.npz")
-    hands, still = np.array([*PLACES[2].left, *PLACES[2].right]).reshape(2, 3), np.zeros((2, 3))
-    one, other = (skill.predict(hands, still, still) for skill in (posed, back))
+    one, other = (at_rest(skill, with_hands(PLACES[2])) for skill in (posed, back))
     assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
     assert one.turn.covariance.tobytes() == other.turn.covariance.tobytes()
     assert one.closure == other.closure
@@ -101,14 +100,14 @@ def test_a_skill_with_orientation_and_gripper_comes_back_from_its_file(posed: Sk
 def test_places_teach_orientation_and_gripper_and_give_them_back(posed: Skill, skill: Skill) -> None:
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
     told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
-    hands, still = np.array([*told.left, *told.right]).reshape(2, 3), np.zeros((2, 3))
+    hands = with_hands(told)
     for one in (posed, skill, shipped_skill()):  # the last is between places
         taught = adapted(one, (*PLACES[:2], told), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad
         assert missed is not None
         assert missed < 0.02
-        assert taught.predict(hands, still, still).closure < 0.1
+        assert at_rest(taught, hands).closure < 0.1
         assert decoded(taught.file, origin="x").digest == taught.digest
         cleared = adapted(taught, (), tolerance=0.05)
         assert (cleared.turn is None, cleared.gripper is None) == (one.turn is None, one.gripper is None)
@@ -143,13 +142,13 @@ def test_a_gripper_that_tells_millimetres_is_refused(shown: list[Demonstration])
 @pytest.mark.parametrize("turn_deg", [200, 300, 400, 480])
 def test_a_tool_that_turns_by_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
     """By each take alike, whichever signs its quaternions have."""
-    found = msgspec.json.decode(learn([spinning(seed, turn_deg) for seed in range(4)], points=60).figures, type=Figures)
+    found = figures_of(learn([spinning(seed, turn_deg) for seed in range(4)], points=60))
     assert found.orientation_error_deg < 15
     assert found.unsafe == ()
 
 
 def test_a_tool_whose_turns_are_learned_wrongly_is_unsafe() -> None:
-    found = msgspec.json.decode(learn([spinning(seed, 1500) for seed in range(4)], points=60).figures, type=Figures)
+    found = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
     assert any("up to 60° accepted: it turns by up to" in line for line in found.unsafe)
 
 

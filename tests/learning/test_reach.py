@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from service.files.shipped import ARMS, cell_of, shipped_skill
 from service.learning.reach import beyond_m, out_of_reach
 from service.learning.skill_file import StoredSkill
 from service.settings.config import Reach, Settings, robot_description
+from support.followed import changed
 from support.turning import sliding_cell
 
 WIDE = Reach(centre=(0.0, 0.0, 0.3), inner=0.01, outer=3.0, min_x=-1.0, min_z=-1.0)
@@ -22,7 +22,7 @@ WIDE = Reach(centre=(0.0, 0.0, 0.3), inner=0.01, outer=3.0, min_x=-1.0, min_z=-1
 
 def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
     cell = sliding_cell(folder) if arm == "sliding" else cell_of(arm)
-    return msgspec.structs.replace(cell, reach=reach)
+    return changed(cell, reach=reach)
 
 
 @pytest.mark.parametrize("arm", [*ARMS, "sliding"])
@@ -69,11 +69,11 @@ def test_the_joints_limits_narrow_a_reach_that_is_only_part_of_the_arms() -> Non
     cell = cell_of("ur5")
     posture = np.array(cell.arm.posture)
     lower, upper = (tuple((posture + by).tolist()) for by in (-0.3, 0.3))
-    cell = msgspec.structs.replace(cell, joints=msgspec.structs.replace(cell.joints, lower=lower, upper=upper))
+    cell = changed(cell, joints={"lower": lower, "upper": upper})
     here = Arm(cell, robot_description(cell)).at(posture).position - cell.reach.centre
     half_turn = np.array([-here[0], -here[1], here[2]]) + cell.reach.centre
-    reach = msgspec.structs.replace(cell.reach, min_x=-1.0)
-    found = beyond_m(msgspec.structs.replace(cell, reach=reach), np.array([here + cell.reach.centre, half_turn]))
+    places = np.array([here + cell.reach.centre, half_turn])
+    found = beyond_m(changed(cell, reach={"min_x": -1.0}), places)
     assert found[0] == 0.0
     assert 0.2 < found[1] < 2.0 * math.hypot(here[0], here[1])
 

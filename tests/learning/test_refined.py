@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,18 +14,13 @@ from service.learning.choice import shared_counts
 from service.learning.demonstration import Demonstration, NamedDemonstration
 from service.learning.learn import learn
 from service.learning.methods.weights import chosen
-from service.learning.records import Figures
 from service.learning.skill_file import SkillError, StoredSkill, decoded
 from service.learning.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
 from service.learning.table import table
-from sim.made_tasks import takes
 from support.circling import circling
+from support.skills import figures_of, made
 
 HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
-
-
-def figures_of(skill: StoredSkill) -> Figures:
-    return msgspec.json.decode(skill.figures, type=Figures)
 
 
 def with_habit(one: Demonstration) -> Demonstration:
@@ -72,10 +66,10 @@ def test_takes_that_do_it_as_the_others_did_count_as_theirs(others: StoredSkill)
 
 @pytest.mark.thorough
 def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_theirs() -> None:
-    shown = [one.demonstration.every(3) for one in takes("three", people=range(3), each=2)]
+    shown = [one.every(3) for one in made("three", range(3))]
     shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]
     skill = learn(shown, name="others")
-    mine = [with_habit(one.demonstration.every(3)) for one in takes("three", people=[7], each=4)]
+    mine = [with_habit(one.every(3)) for one in made("three", [7], each=4)]
     mine = [one._replace(person="me") for one in mine]
     first = learn(mine[:2], name="first", names=["a", "b"], refined=skill)
     both = figures_of(learn(mine[2:], name="both", names=["c", "d"], refined=first))
@@ -102,7 +96,7 @@ def test_what_cannot_be_refined_is_refused_with_the_remedy(others: StoredSkill) 
 
 
 def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
-    given = takes("three", people=[0], each=1)[0].demonstration
+    given = made("three", [0], each=1)[0]
     closure = np.linspace(0.0, 1.0, len(given.stamps_ns))
     given = given._replace(person="Ada", gripper=closure, begins=(200,), conducts="left")
     one, other = (NamedDemonstration(name, part) for name, part in (("a", given), ("b", given.every(2))))
@@ -126,8 +120,8 @@ def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
 
 @pytest.mark.thorough
 def test_which_hand_leads_is_chosen_over_all_takes_and_not_by_three_of_one_person() -> None:
-    of_others = learn([one.demonstration for one in takes("path", people=range(4), each=2)], name="others")
-    mine = learn([one.demonstration for one in takes("path", people=[32], each=3)], name="mine", refined=of_others)
+    of_others = learn(made("path", range(4)), name="others")
+    mine = learn(made("path", [32], each=3), name="mine", refined=of_others)
     assert isinstance(of_others.model, StagedKMP)
     assert isinstance(mine.model, StagedKMP)
     assert mine.model.task.leads == of_others.model.task.leads == LEFT

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -16,11 +15,11 @@ from service.core.skill.step import calibrate, recent
 from service.core.skill.tuning import UNSURE_M
 from service.files.shipped import shipped_skill
 from service.learning.learn import learn
-from service.learning.records import Figures, TimedErrors
+from service.learning.records import TimedErrors
 from service.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
 from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
 from service.settings.config import Settings
-from sim.made_tasks import takes
+from support.skills import figures_of, made
 
 
 def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> TimedErrors:
@@ -140,11 +139,11 @@ def test_a_tool_s_recent_motion_is_that_of_its_trail_at_any_period() -> None:
 @pytest.fixture(scope="module")
 def learned() -> StoredSkill:
     """A skill of six people, the fifth of whom is quick, at a task whose teacher reacts late."""
-    return learn([take.demonstration.every(4) for take in takes("path", people=range(6), each=1)])
+    return learn([one.every(4) for one in made("path", range(6), each=1)])
 
 
 def test_what_is_learned_says_how_sure_it_is_with_its_lag_left_in(learned: StoredSkill) -> None:
-    figures = msgspec.json.decode(learned.figures, type=Figures)
+    figures = figures_of(learned)
     assert learned.regions.std_s > 0.0
     assert figures.all.within_50 == pytest.approx(50, abs=10)
     assert figures.all.within_95 == pytest.approx(95, abs=3)

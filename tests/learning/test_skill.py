@@ -9,6 +9,7 @@ from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
 from sim.script import HandMotions, HandScript
+from support.skills import at_rest
 from support.taught_scene import HANDOVER, SCENE, with_hands
 
 
@@ -28,7 +29,7 @@ def test_velocity_and_acceleration_are_those_of_the_predicted_motion(aimed: Skil
 
 
 def test_hands_at_rest_ask_for_no_motion(aimed: Skill) -> None:
-    prediction = aimed.predict(with_hands(HANDOVER).reshape(2, 3), np.zeros((2, 3)), np.zeros((2, 3)))
+    prediction = at_rest(aimed, with_hands(HANDOVER))
     assert not prediction.velocity.any()
     assert not prediction.acceleration.any()
 

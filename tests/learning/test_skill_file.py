@@ -6,22 +6,19 @@ import io
 import pickle
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 from random import Random
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
-from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.frame import Vector
 from service.core.skill.skill import Skill
 from service.learning.demonstration import Demonstration
-from service.learning.records import Figures
 from service.learning.skill_file import SkillError, decoded, with_file
 from service.learning.via_points import adapted
+from support.skills import figures_of, file_with
 from support.taught_scene import PLACES
 
 
@@ -47,11 +44,7 @@ def test_a_trip_through_a_file_changes_no_bit(
     queries = taught[5].hands[::50]
     for one, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
         assert one.tobytes() == other.tobytes()
-
-
-def test_a_skill_from_a_file_adapts_as_the_one_that_was_written(learned: Skill) -> None:
-    back = decoded(learned.file, origin="a file")
-    assert adapted(back, PLACES, tolerance=0.05).file == adapted(learned, PLACES, tolerance=0.05).file
+    assert adapted(back, PLACES[:2], tolerance=0.05).file == adapted(learned, PLACES[:2], tolerance=0.05).file
 
 
 def test_the_shipped_skill_is_what_its_file_says(skill: Skill) -> None:
@@ -61,7 +54,7 @@ def test_the_shipped_skill_is_what_its_file_says(skill: Skill) -> None:
 
 
 def test_a_file_holds_the_figures_and_one_without_them_is_read_as_before(skill: Skill, learned: Skill) -> None:
-    found = msgspec.json.decode(decoded(learned.file, origin="a file").figures, type=Figures)
+    found = figures_of(decoded(learned.file, origin="a file"))
     assert [row.name for row in found.demonstrations] == ["demonstration 1", "demonstration 2", "demonstration 3"]
     assert found.gate_mm == pytest.approx(1000 * learned.threshold)
     assert decoded(skill.file, origin="a file").figures == ""
@@ -71,19 +64,6 @@ def test_there_is_no_pickle_in_a_file(aimed: Skill) -> None:
     with np.load(io.BytesIO(aimed.file), allow_pickle=False) as arrays:
         assert all(arrays[name].dtype != object for name in arrays.files)
         assert "[m]" in str(arrays["units"])
-
-
-def changed(skill: Skill, **arrays: Any) -> bytes:
-    """The skill's file with some arrays in place of its own, and their checksum; None leaves one
-    out.
-    """
-    with np.load(io.BytesIO(skill.file), allow_pickle=False) as original:
-        kept = {name: value for name, value in (dict(original) | arrays).items() if value is not None}
-    if not any(value.dtype == object for value in kept.values()):
-        kept |= {"checksum": np.array(checksum(kept))} if "checksum" not in arrays else {}
-    out = io.BytesIO()
-    np.savez(out, allow_pickle=True, **kept)
-    return out.getvalue()
 
 
 def array_file() -> bytes:
@@ -106,27 +86,6 @@ def test_a_file_that_is_no_skill_is_refused_by_name(garbage: bytes) -> None:
         decoded(garbage, origin="nonsense.npz")
 
 
-def test_a_truncated_file_is_refused(skill: Skill) -> None:
-    whole = skill.file
-    for size in range(0, len(whole), len(whole) // 40):
-        with pytest.raises(SkillError, match=r"x\.npz"):
-            decoded(whole[:size], origin="x.npz")
-
-
-def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill) -> None:
-    random = np.random.default_rng(0)
-    whole = skill.file
-    directory = whole.index(b"PK\x01\x02")
-    for start in (0, directory):
-        for _ in range(200):
-            damaged = bytearray(whole)
-            damaged[random.integers(start, len(whole))] = random.integers(256)
-            try:
-                decoded(bytes(damaged), origin="x.npz")
-            except SkillError:
-                continue
-
-
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
@@ -143,36 +102,15 @@ def test_a_damaged_file_is_refused_or_read_and_never_anything_else(skill: Skill)
         ({"ell": np.array(-1.0)}, "ell has -1"),
         ({"places": np.array('[{"name": "a"}]')}, "left"),
         ({"name": np.array([{}], dtype=object)}, "x.npz"),
-    ],
-)
-def test_a_wrong_array_is_named(skill: Skill, arrays: dict[str, Any], message: str) -> None:
-    with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
-        decoded(changed(skill, **arrays), origin="x.npz")
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "arrays",
-    [
-        {"threshold": np.array(np.nan)},
-        {"threshold": np.array(-1.0)},
-        {"box": np.full((2, 3), np.nan)},
-        {"box": np.zeros(3)},
-        {"box": np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])},
-        {"orientation": np.zeros(4)},
-        {"orientation": np.zeros(3)},
-        {"weights": np.full((200, 3), np.nan)},
-    ],
-    ids=lambda arrays: f"{next(iter(arrays))} {np.ravel(next(iter(arrays.values())))[0]:g}",
-)
-def test_an_array_that_would_harm_the_motion_is_refused(skill: Skill, arrays: dict[str, Any]) -> None:
-    with pytest.raises(SkillError, match=next(iter(arrays))):
-        decoded(changed(skill, **arrays), origin="x.npz")
-
-
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
+        ({"task_clock": np.full(13, np.inf)}, "task_clock is [inf"),
+        ({"threshold": np.array(np.nan)}, "threshold"),
+        ({"threshold": np.array(-1.0)}, "threshold"),
+        ({"box": np.full((2, 3), np.nan)}, "box"),
+        ({"box": np.zeros(3)}, "box"),
+        ({"box": np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])}, "box"),
+        ({"orientation": np.zeros(4)}, "orientation"),
+        ({"orientation": np.zeros(3)}, "orientation"),
+        ({"weights": np.full((200, 3), np.nan)}, "weights"),
         ({"weights": np.full((200, 3), 1e300)}, "weights has 1e+300, -1e+12 to 1e+12 accepted"),
         ({"base_weights": np.full((200, 3), 1e300), "weights": np.full((200, 3), 1e300)}, "base_weights has 1e+300"),
         ({"base_weights": np.full((200, 3), 5e3), "weights": np.full((200, 3), 5e3)}, "where it was learned, the tool"),
@@ -198,18 +136,18 @@ def test_an_array_that_would_harm_the_motion_is_refused(skill: Skill, arrays: di
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
 def test_what_no_skill_has_is_refused_with_what_is_accepted(skill: Skill, arrays: dict[str, Any], message: str) -> None:
-    with pytest.raises(SkillError) as caught:
-        decoded(changed(skill, **arrays), origin="x.npz")
-    assert str(caught.value).startswith("x.npz: ")
+    with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
+        decoded(file_with(skill, **arrays), origin="x.npz")
     assert message in str(caught.value)
 
 
-def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill) -> None:
+@pytest.mark.parametrize("begin", [b"", b"PK\x01\x02"], ids=["anywhere", "in the directory"])
+def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -> None:
     random, whole = np.random.default_rng(8), aimed.file
     same = 0
     for _ in range(400):
         damaged = bytearray(whole)
-        damaged[random.integers(len(whole))] ^= 1 << int(random.integers(8))
+        damaged[random.integers(whole.index(begin), len(whole))] ^= 1 << int(random.integers(8))
         try:
             back = decoded(bytes(damaged), origin="x.npz")
         except SkillError:
@@ -227,12 +165,6 @@ def test_a_file_that_unpacks_to_much_is_not_unpacked(skill: Skill) -> None:
             file.write(bytes(1_000_000))
     with pytest.raises(SkillError, match=r"101000008 bytes unpacked, at most 100000000 accepted"):
         decoded(out.getvalue(), origin="x.npz")
-
-
-def test_a_skill_file_can_be_read_from_disk_as_bytes(tmp_path: Path, aimed: Skill) -> None:
-    file = tmp_path / "aimed.npz"
-    file.write_bytes(aimed.file)
-    assert decoded(file.read_bytes(), origin=str(file)).digest == aimed.digest
 
 
 def test_a_damaged_archive_is_told_from_what_never_was_one(skill: Skill) -> None:

@@ -7,19 +7,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import pytest
 
 from service.core.skill.staged import StagedKMP
 from service.files.demonstration_reader import read_demonstration
-from service.learning.records import Figures
 from service.learning.skill_file import decoded
 from service.learning.via_points import adapted
 from sim.experiments.people.left_out import judged, left_out, predicted
 from support import spoiled
 from support.cell import told
 from support.paths import RECORDINGS
+from support.skills import figures_of
 
 pytestmark = pytest.mark.thorough
 
@@ -57,7 +56,7 @@ def learned(folder: Path, spoil: spoiled.Spoil | None) -> Learned:
     assert done.returncode == 0, done.stderr
     skill = decoded(out.read_bytes(), origin="a file")
     assert isinstance(skill.model, StagedKMP)
-    figures, squares, samples = msgspec.json.decode(skill.figures, type=Figures), 0.0, 0
+    figures, squares, samples = figures_of(skill), 0.0, 0
     for number in HELD_OUT:
         other = read_demonstration(RECORDINGS / f"people/demonstration-{number}.mcap")
         seen = left_out("", "", other)

@@ -4,7 +4,6 @@ a place may be visited twice, and what its file may hold.
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import replace
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kmp.storage import checksum
 from service.contract.requests import ViaPoint
 from service.core.skill import TURNS
 from service.core.skill.memory import turn_lag_s
@@ -29,8 +27,9 @@ from service.learning.skill_file import SkillError, StoredSkill, decoded, with_f
 from service.learning.table import table
 from service.learning.via_points import adapted, in_force, warnings_of
 from sim.experiments.people.left_out import judged, left_out, predicted
-from sim.made_tasks import CARRIED_M, takes
+from sim.made_tasks import CARRIED_M
 from sim.teach import by_people
+from support.skills import STILL, at_rest, figures_of, file_with, made, turns_of
 
 AT_REST = np.zeros(6)
 
@@ -86,14 +85,14 @@ def test_a_moving_hand_is_on_its_way_and_a_trembling_one_moves_nothing(between: 
     going = np.zeros(2)
 
     def at(hands: np.ndarray) -> np.ndarray:
-        return between.predict(hands, np.zeros((2, 3)), np.zeros((2, 3)), going, belief=belief).position
+        return between.predict(hands, STILL, STILL, going, belief=belief).position
 
-    found = between.predict(half, 0.6 * way, np.zeros((2, 3)), going, belief=belief)
+    found = between.predict(half, 0.6 * way, STILL, going, belief=belief)
     h = 1e-2
     slope = (at(half + 0.6 * h * way) - at(half - 0.6 * h * way)) / (2 * h)
     np.testing.assert_allclose(found.velocity, slope, atol=0.06)
     assert np.linalg.norm(slope) > 0.1
-    calm = between.predict(half, 0.02 * way, np.zeros((2, 3)), going, belief=belief)
+    calm = between.predict(half, 0.02 * way, STILL, going, belief=belief)
     assert np.linalg.norm(calm.velocity) < 2e-3
     assert np.linalg.eigvalsh(found.covariance).min() > 0
 
@@ -136,15 +135,10 @@ def test_its_file_holds_it_exactly_and_what_does_not_fit_is_refused(between: Ski
     hands = between.hands + 0.01
     assert back.mean(hands).tobytes() == between.mean(hands).tobytes()
     assert back.file == between.file
-    with np.load(io.BytesIO(between.file)) as archive:
-        arrays = dict(archive)
 
     def refusal(**changes: Any) -> str:
-        spoilt = arrays | changes
-        out = io.BytesIO()
-        np.savez(out, allow_pickle=False, **spoilt | {"checksum": np.array(checksum(spoilt))})
         with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
-            decoded(out.getvalue(), origin="x.npz")
+            decoded(file_with(between, **changes), origin="x.npz")
         return str(caught.value)
 
     assert "corners has 99, 0 to 65" in refusal(corners=np.full((4, 2), 99))
@@ -179,9 +173,9 @@ def test_places_near_each_other_are_taught_as_stages_tell_them_apart(between: Sk
 def rms_mm(kind: str, skill: Skill) -> float:
     """The error at the moment in four takes of other people, through the core."""
     total, count = 0.0, 0
-    for take in takes(kind, people=(6, 7), each=2):
-        seen = left_out("", "", take.demonstration)
-        aimed = adapted(skill, take.demonstration.places, tolerance=0.05)
+    for demonstration in made(kind, (6, 7)):
+        seen = left_out("", "", demonstration)
+        aimed = adapted(skill, demonstration.places, tolerance=0.05)
         one = judged(seen, predicted(aimed, seen))
         total, count = total + one.squares, count + one.samples
     return 1000.0 * float(np.sqrt(total / count))
@@ -189,14 +183,14 @@ def rms_mm(kind: str, skill: Skill) -> float:
 
 @pytest.fixture(scope="module")
 def cyclic() -> Skill:
-    return learn([take.demonstration for take in takes("cyclic", people=range(4), each=2)])
+    return learn(made("cyclic", range(4)))
 
 
 def test_a_place_is_visited_twice_with_another_tool(cyclic: Skill) -> None:
     """Once the hands left it, what was before tells which visit it is."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
     assert rms_mm("cyclic", cyclic) < 50.0  # a Gaussian process with 2 s of memory: 51, one without: 101
-    places = {place.name: place for place in takes("cyclic", people=(6,), each=1)[0].demonstration.places}
+    places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
     aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
     one, again = places["left out"], places["left out again"]
     assert np.allclose(one.left, again.left)
@@ -205,12 +199,12 @@ def test_a_place_is_visited_twice_with_another_tool(cyclic: Skill) -> None:
 
 
 def test_six_places_of_each_hand_are_learned() -> None:
-    skill = learn([take.demonstration for take in takes("six", people=range(4), each=2)])
+    skill = learn(made("six", range(4)))
     assert rms_mm("six", skill) < 45.0  # nearest neighbours: 78
 
 
 def test_the_teachers_delay_is_learned_and_the_tool_led_by_less(cyclic: Skill) -> None:
-    figures = msgspec.json.decode(cyclic.figures, type=Figures)
+    figures = figures_of(cyclic)
     late_s, std_s = figures.delay_s, figures.delay_std_s
     assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)  # the mean of 0.09 to 0.34 s
     assert 0.0 < std_s < 0.2
@@ -237,14 +231,14 @@ def without_follow(shown: Demonstration) -> Demonstration:
 @pytest.fixture(scope="module")
 def on_path() -> list[Demonstration]:
     """The tool follows the left hand, whatever the right one does."""
-    return [take.demonstration for take in takes("path", people=range(4), each=2)]
+    return made("path", range(4))
 
 
 def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
     skill = learn(shown, name="path")
     assert isinstance(skill.model, StagedKMP)
     assert decoded(skill.file, origin="memory").model.task.leads == skill.model.task.leads
-    return skill.model.task.leads, msgspec.json.decode(skill.figures, type=Figures)
+    return skill.model.task.leads, figures_of(skill)
 
 
 @pytest.mark.thorough
@@ -268,8 +262,8 @@ def test_a_hand_leads_only_where_it_is_followed_or_was_ahead(on_path: list[Demon
 
 
 def test_where_it_waits_it_waits_to_the_end() -> None:
-    skill = learn([take.demonstration for take in takes("three", people=range(3), each=2)], name="three")
-    places = takes("three", people=range(3), each=1)[0].demonstration.places
+    skill = learn(made("three", range(3)), name="three")
+    places = made("three", [0], each=1)[0].places
     there = adapted(skill, places, tolerance=0.05)
     left_alone = np.array([[*places[1].left, *places[0].right]])
     assert np.linalg.norm(there.mean(left_alone)[0] - places[0].tool) < 0.03
@@ -278,12 +272,12 @@ def test_where_it_waits_it_waits_to_the_end() -> None:
 @pytest.fixture(scope="module")
 def carried() -> StoredSkill:
     """The tool is fixed to what the left hand carries."""
-    return learn([without_follow(take.demonstration) for take in takes("heading", people=range(4), each=2)])
+    return learn([without_follow(one) for one in made("heading", range(4))])
 
 
 @pytest.mark.thorough
 def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carried: StoredSkill) -> None:
-    figures = msgspec.json.decode(carried.figures, type=Figures)
+    figures = figures_of(carried)
     assert figures.taken == "orientation of the left hand"
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, StagedKMP)
@@ -296,22 +290,16 @@ def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carrie
 
 @pytest.mark.thorough
 def test_its_velocity_is_that_of_the_turning_hand_and_without_orientation_it_moves_only(carried: StoredSkill) -> None:
-    model, still = carried.model, np.zeros((2, 3))
+    model = carried.model
     hands, belief = model.hands[1].reshape(2, 3), model.belief(model.hands[1])
     lag_s, h, rate = turn_lag_s(model.delay_s), 1e-3, np.array([0.0, 0.0, 0.5])
-
-    def turns(at_s: float) -> np.ndarray:
-        """The rows of the filters of hands that turn evenly: each lags by as much again."""
-        rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel() for i in range(TURNS)]
-        return np.stack([rows, rows], axis=1)
-
     behind, now, ahead = (
-        carried.predict(hands, still, still, turns=turns(at_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
+        at_rest(carried, hands, turns=turns_of(rate, at_s, lag_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
     )
     np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
     lever = Rotation.from_rotvec(-TURNS * lag_s * rate).apply(CARRIED_M)
     np.testing.assert_allclose(now.velocity, np.cross(rate, lever), atol=0.01)
     np.testing.assert_allclose(now.position, hands[0] + lever, atol=0.02)
-    untold = carried.predict(hands, still, still, belief=belief.copy())
+    untold = at_rest(carried, hands, belief=belief.copy())
     assert not untold.velocity.any()
     np.testing.assert_allclose(untold.position, model.nominal.at[1, 6:], atol=0.02)

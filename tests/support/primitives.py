@@ -5,11 +5,31 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from kmp import KMP, GaussianKernel, Gaussians
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+from kmp.functionals import Functionals
+from kmp.kernel import between
 
 properties = settings(max_examples=15, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
+representations = st.sampled_from(["dense", "low_rank"])
 kernel = GaussianKernel(0.5)
+KERNELS = {
+    "one length": GaussianKernel(0.5),
+    "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
+    "velocity": VelocityKernel(2.0),
+}
+
+
+def curve(kernel):
+    """Inputs (60, I) and normals along a path: over three inputs, or over time with its rates."""
+    t = np.linspace(0, 2, 60)[:, None]
+    has_rates = kernel.channels == 2
+    rates = [2 * np.cos(2 * t), -3 * np.sin(3 * t)] if has_rates else []
+    mean = np.hstack([np.sin(2 * t), np.cos(3 * t), *rates])
+    inputs = t if has_rates else np.hstack([t, np.sin(3 * t), np.cos(2 * t)])
+    outputs = mean.shape[1]
+    root = 0.05 * np.random.default_rng(0).normal(size=(60, outputs, outputs))
+    return inputs, Gaussians(mean, root @ root.swapaxes(1, 2) + 1e-3 * np.eye(outputs))
 
 
 def database(seed=0, count=30, inputs=4, outputs=3):
@@ -19,34 +39,34 @@ def database(seed=0, count=30, inputs=4, outputs=3):
     return random.normal(size=(count, inputs)), Gaussians(random.normal(size=(count, outputs)), covariance)
 
 
-def skill(seed=0, lambda_mean=2.0, lambda_covariance=None, prior_mean=None, **size):
+def skill(seed=0, *, lambda_covariance=None, prior_mean=None, representation="dense", **size):
     inputs, reference = database(seed, **size)
-    return KMP.fit(
-        inputs,
-        reference,
-        kernel=kernel,
-        lambda_mean=lambda_mean,
-        lambda_covariance=lambda_covariance,
-        prior_mean=prior_mean,
-    )
+    options = {"lambda_covariance": lambda_covariance, "prior_mean": prior_mean, "representation": representation}
+    return KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, **options)
 
 
 def via(seed, count, inputs=4, outputs=3, std=1e-4):
     random = np.random.default_rng(seed)
-    points = Gaussians(random.normal(size=(count, outputs)), np.tile(std**2 * np.eye(outputs), (count, 1, 1)))
+    points = Gaussians.of(random.normal(size=(count, outputs)), deviation=std)
     return random.normal(size=(count, inputs)), points
 
 
-def naive(inputs, reference, query, *, lambda_mean, lambda_covariance, prior_mean, count):
-    """Equations (8), (9) and the covariance of the IJRR paper, written down as they stand."""
-    o = reference.mean.shape[1]
-    unit = np.eye(o)
-    big = np.kron(np.exp(-kernel.ell * ((inputs[:, None] - inputs) ** 2).sum(axis=2)), unit)
-    row = np.kron(np.exp(-kernel.ell * ((query - inputs) ** 2).sum(axis=1))[None], unit)
-    sigma = block_diag(*reference.covariance)
-    alpha = np.linalg.solve(big + lambda_mean * sigma, (reference.mean - prior_mean).ravel())
-    explained = row @ np.linalg.solve(big + lambda_covariance * sigma, row.T)
-    return prior_mean + row @ alpha, count / lambda_covariance * (unit - explained)
+def naive(one, queries):
+    """Mean (M, O) and joint covariance (M, O, M, O) by equations (8), (9) and that of IJRR 2019 for
+    values and derivatives, written down as they stand.
+    """
+    known = one.inner.solution.database.functionals
+    outputs = one.reference.outputs
+    unit = np.eye(outputs // one.kernel.channels)
+    sigma = block_diag(*one.reference.covariance)
+    big = np.kron(between(one.kernel, known, known), unit)
+    row = np.kron(between(one.kernel, Functionals(queries), known), unit)
+    own = np.kron(one.kernel(queries, queries), unit)
+    right = one.reference.mean - known.values[:, None] * one.prior_mean
+    alpha = np.linalg.solve(big + one.lambda_mean * sigma, right.ravel())
+    explained = row @ np.linalg.solve(big + one.lambda_covariance * sigma, row.T)
+    covariance = (own - explained) * len(one.base.inputs) / one.lambda_covariance
+    return (row @ alpha).reshape(-1, outputs) + one.prior_mean, covariance.reshape(2 * (len(queries), outputs))
 
 
 def same_bits(a, b, queries):

@@ -13,6 +13,7 @@ from service.learning.demonstration import Demonstration
 from service.learning.learn import learn
 from sim.scene import Scene
 from sim.teach import demonstrations
+from support.skills import at_rest
 
 SCENE = Scene()
 PLACES = SCENE.via_points()
@@ -40,8 +41,7 @@ def error_m(skill: Skill, held_out: Sequence[Demonstration]) -> float:
 
 def deviations(skill: Skill, hands: Vector) -> Vector:
     """Standard deviations (T,) of the predictions for hands (T, 6) at rest [m], as the gate has."""
-    still = np.zeros((2, 3))
-    return np.array([skill.predict(one.reshape(2, 3), still, still).gate_m for one in hands])
+    return np.array([at_rest(skill, one).gate_m for one in hands])
 
 
 def with_hands(place: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:

@@ -1,0 +1,30 @@
+"""Cells with other settings, and their sessions, whose frames hold every limit of the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from msgspec.structs import replace
+
+from service.core.controller import Controller
+from service.core.frame import Tick
+from service.core.skill.skill import Skill
+from service.settings.config import Settings, robot_description
+from support.in_process import ASSUMED, assert_limits_hold, frames
+
+
+def changed(cell: Settings, **parts: Any) -> Settings:
+    """The cell with other parts; a mapping replaces only the fields that it names."""
+    for name, part in parts.items():
+        changed_part = replace(getattr(cell, name), **part) if isinstance(part, Mapping) else part
+        cell = replace(cell, **{name: changed_part})
+    return cell
+
+
+def followed(skill: Skill, ticks: Iterable[Tick], cell: Settings = ASSUMED) -> np.ndarray:
+    """The frames (T,) of a controller that steps through ticks, all within the joints' limits."""
+    found = frames(Controller(cell, skill, urdf=robot_description(cell)), ticks)
+    assert_limits_hold(found, cell)
+    return found
