@@ -10,6 +10,7 @@ from PIL import Image
 
 from service.settings.config import Settings, load
 from support.cell import told
+from support.cell_commands import succeeded
 from support.paths import ROOT
 from support.turning import sliding_cell
 
@@ -21,8 +22,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a first cell for a UR5, and what was printed."""
     folder = tmp_path_factory.mktemp("arm")
     shutil.copy(UR5, folder / "my.urdf")
-    done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
-    assert done.returncode == 0, done.stderr
+    done = succeeded("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
     assert done.stderr == ""
     return folder, done.stdout
 
@@ -57,8 +57,7 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
 
 def test_a_rail_is_in_metres_and_a_missing_shape_has_a_place(tmp_path: Path) -> None:
     sliding_cell(tmp_path)
-    done = told("arm", str(tmp_path / "arm.urdf"), "--output", str(tmp_path / "first.toml"))
-    assert done.returncode == 0, done.stderr
+    done = succeeded("arm", str(tmp_path / "arm.urdf"), "--output", str(tmp_path / "first.toml"))
     assert "no collision shape before rail_joint: a capsule of" in done.stdout
     assert "prismatic joints are in m, m/s, m/s², m/s³" in done.stdout
     assert "rad, m for prismatic joints" in done.stdout
@@ -71,27 +70,6 @@ def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
     assert (done.returncode, "cell.toml exists already: name another file by --output" in done.stderr) == (1, True)
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (("nowhere.urdf",), 2, "cannot read nowhere.urdf"),
-        ((str(UR5), "--plate", "hand"), 1, "no link 'hand'; the last ones of the arm are tool0"),
-        ((str(UR5), "--plate", "tool"), 1, "the last ones of the arm are tool0; did you mean tool0?"),
-        ((str(UR5), "--output", "cell.txt"), 2, "cell.txt: a name that ends in .toml needed"),
-        ((str(UR5), "--at", "9", "0", "0"), 2, "9 given, -3 to 3 needed"),
-        ((str(UR5), "--at", "-2", "0", "0"), 2, "no posture found with the tool at"),
-    ],
-)
-def test_what_cannot_be_done_is_said_in_a_sentence(
-    options: tuple[str, ...], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = told("arm", *options)
-    assert (done.returncode, said in done.stderr) == (code, True), done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_arm_stands_where_it_is_told_with_its_meshes(tmp_path: Path) -> None:

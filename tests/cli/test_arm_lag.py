@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
 from service.cli.arm_lag import Lag, lag
 from service.settings.config import Settings
-from support.paths import ROOT
+from support.examples import example
 
 NAMES = ("a", "b", "c")
 SERVOS = ("delay", "servo")
@@ -122,12 +120,7 @@ def test_a_continuous_joint_may_wrap() -> None:
 
 def rms_mrad(lag_s: float, lead_s: float) -> float:
     """The error of joints that the driver template moves through a servo of the second order."""
-    spec = importlib.util.spec_from_file_location("own_arm", ROOT / "examples" / "own_arm.py")
-    assert spec is not None
-    assert spec.loader is not None
-    own_arm = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(own_arm)
-    arm = own_arm.FakeArm(Settings())
+    arm = example("own_arm").FakeArm(Settings())
     arm.lag_s, written = lead_s, list[np.ndarray]()
     arm.move = lambda position, velocity: written.append(position)
     times = np.arange(0.0, 8.0, PERIOD_S)

@@ -5,24 +5,23 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import signal
 import socket
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from service.cli.main import GROUPS, parser
+from service.contract.requests import encode_json
 from service.daemon.launch import free_port
 from support.cell import thirdhand, told
+from support.cell_commands import assert_refused, started
 from support.paths import RECORDINGS, ROOT
 
 COMMANDS = [name for names in GROUPS.values() for name in names]
 RENAMED = ("--out", "--duration", "--json FILE", "--soak MIN")
-WEB = (("--web",), ("--web", "8080"), ("--web", ""))
 NOBODY = ("--connect", "tcp/127.0.0.1:1")
 
 
@@ -33,6 +32,7 @@ def test_help_lists_each_command_in_one_group() -> None:
     assert re.findall(r"^  ([a-z-]+)\s", text, re.MULTILINE) == COMMANDS
     assert len(set(COMMANDS)) == len(COMMANDS)
     refused = told("nonsense").stderr
+    assert "did you mean" not in refused
     assert set(re.findall(r"[a-z-]+", refused.partition("choose from")[2])) >= set(COMMANDS)
 
 
@@ -49,6 +49,9 @@ def test_the_bench_goes_by_its_own_name() -> None:
     assert text.startswith("usage: thirdhand sim ")
     assert not [word for word in (*RENAMED, "python -m") if re.search(rf"{word}\b", text)]
     assert {"--output", "--seconds"} <= set(re.findall(r"--\w+", text))
+    helps = re.findall(r"^  -\S[^\n]*?(?:  |\n {10,})(\w[^\n]*)", text.partition("options:")[2], re.MULTILINE)
+    assert len(helps) > 15
+    assert [one for one in helps if FRAGMENT.match(one)] == []
     refused = thirdhand("sim", "--speed", "99")
     assert (refused.returncode, "thirdhand sim: error: --speed 99" in refused.stderr) == (2, True)
 
@@ -73,9 +76,7 @@ def test_an_endpoint_without_all_its_parts_is_told_with_what_was_meant(
 
 def test_an_endpoint_of_the_settings_is_told_likewise(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text('[network]\nlisten = ["127.0.0.1:1"]\n')
-    done = told("serve", "--config", str(tmp_path / "cell.toml"))
-    assert done.returncode == 2
-    assert "[network] listen, entry 1" in done.stderr
+    done = assert_refused(2, "[network] listen, entry 1", "serve", "--config", str(tmp_path / "cell.toml"))
     assert "tcp/127.0.0.1:1 ?" in done.stderr
 
 
@@ -92,55 +93,146 @@ def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_i
         ("learn", *takes, "--output", str(tmp_path / "skill.npz")),
     ):
         for path, expected in ((str(config), 2), (missing, 1)):
-            done = told(*command, "--config", path)
-            assert (done.returncode, path in done.stderr) == (expected, True), done.stderr
+            assert_refused(expected, path, *command, "--config", path)
 
 
-@pytest.mark.parametrize(
-    ("code", "words", "arguments"),
-    [
-        (1, "nowhere does not exist: a folder of takes needed", ("record", "--list", "--folder", "nowhere")),
-        (1, "is a daemon or a router running", ("status", *NOBODY)),
-        (1, "", ("doctor", *NOBODY)),
-        (1, "", ("status", "--all", *NOBODY)),
-        (1, "is a daemon or a router running", ("hold", *NOBODY)),
-        *((1, "nowhere.mcap", (command, "nowhere.mcap")) for command in ("play", "replay", "report", "view")),
-        (1, "nowhere.rrd", ("view", "nowhere.rrd")),
-        (1, "nowhere.mcap", ("learn", "nowhere.mcap", "--output", "nowhere.npz")),
-        (1, "at least 2 needed", ("learn", str(RECORDINGS / "demonstration-1.mcap"), "--output", "nowhere.npz")),
-        (2, "--cell: '", ("status", "--cell", "*")),
-        (2, "command line: cell: '*' given", ("serve", "--cell", "*")),
-        (2, "--cell: '", ("hold", "--cell", "")),
-        (2, "--cell: '", ("play", "nowhere.mcap", "--cell", "**")),
-        (2, "", ("record",)),
-        (2, "accepted as a take's name", ("record", "a/b", *NOBODY)),
-        (2, "a port from 0 to 65535 needed", ("status", "--connect", "tcp/127.0.0.1:99999")),
-        (2, "the name of a host or an IP address needed", ("status", "--connect", "tcp/bench..local:7447")),
-        (2, "0 to 65535 needed", ("serve", "--live", "99999")),
-        (2, "no such process", ("serve", "--end-with", "2147483647")),
-        (2, "nan given, -10 to 10 m needed", ("via-points", "add", "here", "--left", "nan", "0", "0")),
-        (2, "nan given, 0 to 10 m needed", ("via-points", "add", "here", "--std", "nan")),
-        (2, "", ("bench", "--seconds", "-1")),
-        *((2, "50 to 1000 Hz", ("serve", "--rate", rate)) for rate in ("7", "5OO")),
-        (2, "needed", ("via-points", "add")),
-        (2, "", ("via-points", "add", "here", *NOBODY)),
-        (2, "", ("view", "live", "--time", "-1", *NOBODY)),
-        *((2, "--web and --screenshot given", ("view", "live", *web, "--screenshot", "a.png")) for web in WEB),
-        (2, "--web shows a running daemon, not files", ("view", "a.rrd", "--web")),
-        (2, "--tab chooses the tab of a picture", ("view", "live", "--web", "--tab", "timing")),
-        (2, "invalid choice", ("serve", "--joints", "left")),
-        (1, "50 Hz is too slow: commands would arrive every 20 ms", ("demo", "--rate", "50")),
-        (2, "allow_insecure = true needed", ("serve", "--connect", "tcp/10.0.0.1:7447")),
-        (2, "unrecognized arguments: --rate 500", ("status", "--rate", "500")),
-    ],
-)
-def test_exit_codes_are_as_promised(
-    code: int, words: str, arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+REFUSED = [  # exit code, words on standard error, command
+    (1, "nowhere does not exist: a folder of takes needed", "record --list --folder nowhere"),
+    (1, "nowhere.rrd", "view nowhere.rrd"),
+    (1, "nowhere.mcap", "view nowhere.mcap"),
+    (1, "nowhere.mcap", "play nowhere.mcap"),
+    (1, "nowhere.mcap", "replay nowhere.mcap"),
+    (1, "nowhere.mcap", "learn nowhere.mcap --output nowhere.npz"),
+    (1, "at least 2 needed", "learn {take} --output nowhere.npz"),
+    (1, "is a daemon or a router running", "status {nobody}"),
+    (1, "is a daemon or a router running", "hold {nobody}"),
+    (1, "", "status --all {nobody}"),
+    (1, "", "doctor {nobody}"),
+    (1, "50 Hz is too slow: commands would arrive every 20 ms", "demo --rate 50"),
+    (1, "not a recording of thirdhand", "replay {take}"),
+    (1, "not a recording of thirdhand", "report {take}"),
+    (1, "no recording nowhere.mcap", "report nowhere.mcap"),
+    (1, "has checksums instead of frames: thirdhand replay {golden} --output whole.mcap", "report {golden}"),
+    (1, "is cut before its first message", "tune head.mcap"),
+    (1, "text.mcap is not an MCAP file", "tune text.mcap"),
+    (1, "no recording nowhere.mcap", "tune nowhere.mcap"),
+    (1, "joints fr3_joint1, fr3_joint2", "tune {golden} --config franka"),
+    (1, "the arm follows for", "tune {golden} --part 8.9 9.7"),
+    (1, "skill.npz", "tune {golden} --skill skill.npz"),
+    (1, "no link 'hand'; the last ones of the arm are tool0", "arm {ur5} --plate hand"),
+    (1, "the last ones of the arm are tool0; did you mean tool0?", "arm {ur5} --plate tool"),
+    (1, "no take 'a' in ", "record a --delete"),
+    (1, "exists already: give another name, or --delete it first", "record there"),
+    (1, "points, entry 2, name: 'glass' given twice, names once each needed", "record a --places twice.json"),
+    (1, "Without a daemon, use --listen tcp/127.0.0.1:7447", "record a {nobody}"),
+    (1, "Without a daemon, use --listen tcp/127.0.0.1:7447", "calibrate {nobody}"),
+    (1, "cannot read configuration nowhere.toml", "calibrate --config nowhere.toml"),
+    (1, "nowhere.mcap", "calibrate --from nowhere.mcap"),
+    (1, "nowhere.log: No such file or directory", "bundle --log nowhere.log {nobody}"),
+    (1, "cannot read configuration", "bundle --config nowhere.toml {nobody}"),
+    (1, "is a daemon or a router running there?", "metrics {nobody}"),
+    (2, "; did you mean status?", "stauts"),
+    (2, "; did you mean list?", "via-points lst"),
+    (2, "; did you mean doctor?", "dotcor"),
+    (2, "--cell: '", "status --cell *"),
+    (2, "command line: cell: '*' given", "serve --cell *"),
+    (2, "--cell: '", "hold --cell ''"),
+    (2, "--cell: '", "play nowhere.mcap --cell **"),
+    (2, "a port from 0 to 65535 needed", "status --connect tcp/127.0.0.1:99999"),
+    (2, "the name of a host or an IP address needed", "status --connect tcp/bench..local:7447"),
+    (2, "unrecognized arguments: --rate 500", "status --rate 500"),
+    (2, "0 to 65535 needed", "serve --live 99999"),
+    (2, "no such process", "serve --end-with 2147483647"),
+    *(
+        (2, f"{rate} given, 50 to 1000 Hz needed", f"{command} --rate {rate}")
+        for command in ("demo", "bench", "serve")
+        for rate in ("49", "1001", "5OO")
+    ),
+    (2, "invalid choice", "serve --joints left"),
+    (2, "allow_insecure = true needed", "serve --connect tcp/10.0.0.1:7447"),
+    (2, "nan given, -10 to 10 m needed", "via-points add here --left nan 0 0"),
+    (2, "nan given, 0 to 10 m needed", "via-points add here --std nan"),
+    (2, "needed", "via-points add"),
+    (2, "", "via-points add here {nobody}"),
+    (2, "", "bench --seconds -1"),
+    (2, "", "view live --time -1 {nobody}"),
+    (2, "--web and --screenshot given", "view live --web --screenshot a.png"),
+    (2, "--web and --screenshot given", "view live --web 8080 --screenshot a.png"),
+    (2, "--web and --screenshot given", "view live --web '' --screenshot a.png"),
+    (2, "--web shows a running daemon, not files", "view a.rrd --web"),
+    (2, "--tab chooses the tab of a picture", "view live --web --tab timing"),
+    (2, "--mouse needed with it", "demo --open"),
+    (2, "--workers: --each needed", "replay a.mcap b.mcap --workers 2"),
+    (2, "--output writes the frames of one recording", "replay a.mcap b.mcap --each --output new.mcap"),
+    (2, "there is no folder no/such", "report {golden} --html no/such/folder.html"),
+    (2, "is a file; a folder needed", "report {golden} --csv {golden}"),
+    (2, "many given; a number of processes, or dask:tcp://HOST:8786", "report a.mcap b.mcap --workers many"),
+    (2, "the picture is of one file; 2 given", "tune a.mcap b.mcap --plot tune.png"),
+    (2, "two times [s], the first below the second, needed", "tune {golden} --part 5 4"),
+    (2, "a name that ends in .png needed", "tune {golden} --plot tune.jpg"),
+    (2, "cannot read nowhere.urdf", "arm nowhere.urdf"),
+    (2, "cell.txt: a name that ends in .toml needed", "arm {ur5} --output cell.txt"),
+    (2, "9 given, -3 to 3 needed", "arm {ur5} --at 9 0 0"),
+    (2, "no posture found with the tool at", "arm {ur5} --at -2 0 0"),
+    (2, "either the name of a take or --list needed", "record"),
+    (2, "either the name of a take or --list needed", "record a --list"),
+    (2, "accepted as a take's name", "record a/b {nobody}"),
+    (2, "accepted as a take's name", "record ../a --show"),
+    (2, "a.jpg: a name that ends in .png needed, like a.png", "record a --plot a.jpg"),
+    (2, "needed, the first below the second", "record a --trim 3 1"),
+    (2, "--rest: nan given, 0.2 to 60 s needed", "record a --rest nan"),
+    (2, "not allowed with argument", "calibrate --held --at 0 0 0"),
+    (
+        2,
+        "--check compares with the last calibration of a cell: give its settings by --config FILE",
+        "calibrate --check",
+    ),
+    (2, "1 points given; 4 or more needed", "calibrate --at 0 0 0"),
+    (2, "6 given, -5 to 5 m needed", "calibrate --at 0 0 6"),
+    (2, "0 given, 0.1 to 200 mm needed", "calibrate --accept 0"),
+    (2, "invalid choice", "calibrate --hand both"),
+    (2, "there is no folder", "bundle --output nowhere/x.tar.gz {nobody}"),
+    (2, "is a folder", "bundle --output . {nobody}"),
+    (2, "PORT or HOST:PORT needed", "metrics --listen no-port"),
+]
+PATHS = {
+    "nobody": " ".join(NOBODY),
+    "take": RECORDINGS / "demonstration-1.mcap",
+    "golden": RECORDINGS / "golden.mcap",
+    "ur5": ROOT / "service" / "arms" / "ur5.urdf",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with files that cannot be used; commands soon give up to connect."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    done = told(*arguments)
-    assert (done.returncode, words in done.stderr) == (code, True), done.stderr
-    assert not code or done.stderr.strip() or done.stdout.startswith("wrong ")
+    monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp()))  # else Matplotlib keeps its own folder
+    for command in ("record", "calibrate"):
+        monkeypatch.setattr(f"service.cli.{command}.CONNECT_TIMEOUT_S", 0.2)
+    working = tmp_path / "working"
+    working.mkdir()
+    monkeypatch.chdir(working)
+    glass = {"name": "glass", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0]}
+    Path("twice.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
+    Path("demonstrations").mkdir()
+    Path("demonstrations/there.mcap").write_bytes(b"")
+    Path("head.mcap").write_bytes((RECORDINGS / "golden.mcap").read_bytes()[:3000])
+    Path("text.mcap").write_text("no recording", encoding="utf-8")
+    Path("skill.npz").write_bytes(b"no skill")
+    return working
+
+
+@pytest.mark.parametrize(("code", "words", "command"), REFUSED)
+def test_what_cannot_be_done_is_refused_with_the_promised_exit_code_and_writes_nothing(
+    code: int, words: str, command: str, folder: Path
+) -> None:
+    before = sorted(folder.rglob("*"))
+    done = assert_refused(code, words.format_map(PATHS), *shlex.split(command.format_map(PATHS)))
+    assert "Traceback" not in done.stderr
+    assert done.stderr.strip() or done.stdout.startswith("wrong ")
+    assert not done.stdout or command.startswith("doctor")
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,9 +279,7 @@ def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
 def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
-    arguments = [sys.executable, "-m", "service", *command, *NOBODY]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        assert process.stderr is not None
+    with started(*command, *NOBODY) as process:
         assert process.stderr.readline().startswith("waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1")
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
@@ -197,13 +287,10 @@ def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tupl
 
 
 def test_a_bench_that_is_interrupted_is_130() -> None:
-    command = [sys.executable, "-m", "service", "sim", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 0)):
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
-            assert process.stderr is not None
-            end = time.monotonic() + 60
+        with started("sim", "--listen", f"tcp/127.0.0.1:{free_port()}") as process:
             while "listening on" not in process.stderr.readline():
-                assert time.monotonic() < end
+                pass
             process.send_signal(number)
             assert process.wait(30) == code
             ended = "ended: the bench of cell thirdhand, after 0 complete runs; without --output no report was written"
@@ -231,13 +318,6 @@ def test_the_help_of_an_option_says_what_it_is_without_the_name_before_it(comman
     assert [one.help for one in options(commands.choices[command]) if FRAGMENT.match(one.help or "")] == []
 
 
-def test_the_help_of_the_bench_says_what_its_options_are() -> None:
-    text = thirdhand("sim", "--help").stdout.partition("options:")[2].partition("example:")[0]
-    helps = re.findall(r"^  -\S[^\n]*?(?:  |\n {10,})(\w[^\n]*)", text, re.MULTILINE)
-    assert len(helps) > 15
-    assert [one for one in helps if FRAGMENT.match(one)] == []
-
-
 def test_view_tells_what_it_shows_and_which_moment_a_picture_has() -> None:
     text = " ".join(told("view", "--help").stdout.split())
     assert "FILE|live [FILE|live ...]" in text
@@ -259,14 +339,11 @@ def test_what_the_operating_system_refuses_is_said_in_words(command: str) -> Non
 
 @pytest.mark.parametrize("arguments", ["serve --check", "sim --via-points"])
 def test_that_the_output_is_full_is_said_in_words(arguments: str) -> None:
-    with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "service", *arguments.split()]
-        done = subprocess.run(
-            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=ROOT
-        )
-    assert done.returncode == 1
+    with open("/dev/full", "w") as full, started(*arguments.split(), stdout=full) as process:
+        _, errors = process.communicate(timeout=60)
     name = arguments.split(maxsplit=1)[0]
-    assert done.stderr == f"thirdhand {name}: No space left on device; room on that disk needed\n"
+    assert process.returncode == 1
+    assert errors == f"thirdhand {name}: No space left on device; room on that disk needed\n"
 
 
 def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:
@@ -274,7 +351,6 @@ def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = told("record", "take", "--folder", str(tmp_path), "--listen", endpoint)
-    assert done.returncode == 1
-    assert f"cannot listen on {endpoint}: Address already in use; another program has it; another port" in done.stderr
+        words = f"cannot listen on {endpoint}: Address already in use; another program has it; another port"
+        done = assert_refused(1, words, "record", "take", "--folder", str(tmp_path), "--listen", endpoint)
     assert "os error" not in done.stderr

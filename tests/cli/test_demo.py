@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,8 @@ from service.files.recording import Recording
 from service.report.columns import read
 from service.settings.config import WAM, Settings
 from sim.scene import Scene
-from support.cell import thirdhand, told
+from support.cell import thirdhand, until
+from support.cell_commands import started, succeeded
 from support.paths import ROOT
 from support.recorded import drawn_ticks
 
@@ -63,8 +63,7 @@ def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(t
         assert report["events"][name]["error_mm"] <= 30
     recorded = [step.tick for step in Recording.open(report["recording"]).steps() if step.frame is not None]
     assert drawn_ticks(Path(report["rrd"]), "/joints/velocity") == recorded
-    replayed = told("replay", "--exact", report["recording"])
-    assert replayed.returncode == 0, replayed.stdout
+    succeeded("replay", "--exact", report["recording"])
     left = {"joints/command", "tool/target", "frame", "objects"}
     left = {f"/thirdhand/{name}" for name in left} | {"/tf", "/robot_description"}
     with Path(report["recording"]).open("rb") as file:
@@ -100,16 +99,13 @@ def test_a_demo_whose_recording_lacks_ticks_says_so_and_fails(tmp_path: Path) ->
     """The scribe of the nominal scene is killed; another one takes its place. On a busy machine the
     events may be missed besides: that missing ticks alone fail a demo is tested below.
     """
-    command = [sys.executable, "-m", "service", "demo", "--json", "--output", str(tmp_path)]
-    with (tmp_path / "said").open("w") as errors:
-        demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT)
-    end = time.monotonic() + 60
-    while "taught while it runs" not in (tmp_path / "said").read_text():
-        assert time.monotonic() < end
-        time.sleep(0.1)
-    (scribe,) = (process for process in psutil.Process(demo.pid).children(recursive=True) if process.name() == "scribe")
-    scribe.kill()
-    out, _ = demo.communicate(timeout=100)
+    said = tmp_path / "said"
+    with said.open("w") as errors, started("demo", "--json", "--output", str(tmp_path), stderr=errors) as demo:
+        until(lambda: "taught while it runs" in said.read_text(), within_s=60)
+        children = psutil.Process(demo.pid).children(recursive=True)
+        (scribe,) = (process for process in children if process.name() == "scribe")
+        scribe.kill()
+        out, _ = demo.communicate(timeout=100)
     assert demo.returncode == 1
     report = json.loads(out)
     assert re.fullmatch(r"[1-9]\d* of \d+ ticks are not recorded", report["missing"])

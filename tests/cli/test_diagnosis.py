@@ -5,6 +5,7 @@ wrong, with what is wanted and what to do.
 from __future__ import annotations
 
 import re
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -57,18 +58,17 @@ HEALTHY = Status(
 )
 
 
-def diagnosed(travels: dict[str, tuple[float, float]] | None = None, **changed: Any) -> list[Finding]:
+def diagnosed(before: Status = HEALTHY, more: Any = MappingProxyType({}), **changed: Any) -> list[Finding]:
     """The findings of a healthy cell of which something has become otherwise, two seconds later."""
-    now = msgspec.structs.replace(HEALTHY, tick=2000, time_ns=HEALTHY.time_ns + 2 * 10**9)
+    now = msgspec.structs.replace(before, tick=2000, time_ns=HEALTHY.time_ns + 2 * 10**9)
     now = msgspec.structs.replace(now, **changed)
-    return findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0", travels=travels)
+    return findings(before, now, own_ns=now.time_ns, own_version="0.1.0", **more)
 
 
 def test_keys_of_ros_2_humble_are_named_as_such() -> None:
     key = "0/lab/hands/left/geometry_msgs::msg::dds_::PoseStamped_/TypeHashNotSupported"
     silent = HEALTHY.sources | {"left": Source()}
-    found = findings(HEALTHY, msgspec.structs.replace(HEALTHY, tick=2000, sources=silent, time_ns=10**18 + 2 * 10**9),
-                     own_ns=10**18, own_version="0.1.0", published=[key, "lab/hands/Left"])  # fmt: skip
+    found = diagnosed(more={"published": [key, "lab/hands/Left"]}, sources=silent)
     by_name = {one.what: one for one in found}
     assert by_name["ROS 2"].found == f"Humble publishes {key}"
     assert "Iron or later" in by_name["ROS 2"].remedy
@@ -103,12 +103,11 @@ def test_what_the_arm_can_do_is_told_and_a_limit_that_binds_is_noted() -> None:
 
 def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
     """Only if it is there all the time, and deeper than a hand's noise."""
-    before = msgspec.structs.replace(HEALTHY, below_table_m={"right": 0.05, "left": 0.01})
-    now = msgspec.structs.replace(before, tick=2000, time_ns=before.time_ns + 2 * 10**9)
-    (text,) = wrongs(findings(before, now, own_ns=now.time_ns, own_version="0.1.0"))
+    below = {"right": 0.05, "left": 0.01}
+    (text,) = wrongs(diagnosed(msgspec.structs.replace(HEALTHY, below_table_m=below)))
     assert "calibration        below the table top: right hand 5 cm" in text
     assert "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose" in text
-    assert wrongs(findings(HEALTHY, now, own_ns=now.time_ns, own_version="0.1.0")) == []
+    assert wrongs(diagnosed(below_table_m=below)) == []
 
 
 def test_a_hand_of_which_all_is_refused_is_told_once() -> None:
@@ -278,35 +277,37 @@ def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() ->
     assert [level for level, _ in told] == sorted((level for level, _ in told), reverse=True)
 
 
-def test_a_unit_that_is_wrong_is_told_with_the_setting_to_write() -> None:
-    refused = "at (812, -203, 95), which looks like mm; [hands] unit is 'm', at most 5 m from the base plate accepted"
-    left = source(
-        "left",
-        fresh=False,
-        age_ms=None,
-        rejected={"out_of_range": 200},
-        cause="out_of_range",
-        refused=refused,
-        unit="mm",
+MILLIMETRES = "at (812, -203, 95), which looks like mm; [hands] unit is 'm', at most 5 m from the base plate accepted"
+DEGREES = "wam/elbow_pitch_joint at 145.6 rad, which looks like degrees; -0.9 to 3.1 accepted"
+HELD_UP = "stamped 2 s after the newest accepted one, which was held up for 2 s on its way"
+
+
+@pytest.mark.parametrize(
+    ("name", "cause", "refused", "more", "words"),
+    [
+        ("left", "out_of_range", MILLIMETRES, {"unit": "mm"}, 'and restart the daemon: unit = "mm"'),
+        ("arm", "out_of_range", DEGREES, {"advice": "publish radians"}, "what to do: publish radians"),
+        ("left", "ahead", HELD_UP, {"advice": "see what holds samples up"}, "what to do: see what holds samples up"),
+    ],
+)
+def test_a_rejected_sample_is_told_first_with_what_to_do_about_that_one(
+    name: str, cause: str, refused: str, more: dict[str, str], words: str
+) -> None:
+    silent = source(
+        name, fresh=False, age_ms=None, rejected={cause: 200, "older": 4}, cause=cause, refused=refused, **more
     )
-    first = wrongs(diagnosed(mode="hold", reason="no_hands", sources=left))[0]
-    assert "left hand" in first
-    assert "looks like mm" in first
-    assert 'and restart the daemon: unit = "mm"' in first
-
-
-def test_joints_in_degrees_are_told_with_the_joints_name() -> None:
-    refused = "wam/elbow_pitch_joint at 145.6 rad, which looks like degrees; -0.9 to 3.1 accepted"
-    rejected = {"rejected": {"out_of_range": 900}, "cause": "out_of_range", "refused": refused}
-    arm = source("arm", fresh=False, age_ms=None, advice="publish joints in radians", **rejected)
-    first = wrongs(diagnosed(mode="hold", reason="arm_not_ready", sources=arm))[0]
-    assert "wam/elbow_pitch_joint at 145.6 rad" in first
-    assert "what to do: publish joints in radians" in first
+    first = wrongs(diagnosed(mode="hold", reason="arm_not_ready" if name == "arm" else "no_hands", sources=silent))[0]
+    assert first.split()[1] == name
+    assert f"rejected as {cause}: {refused}" in first
+    assert words in first
+    assert "clock" not in first
 
 
 def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> None:
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
-    told = wrongs(diagnosed(travels, mode="fault", reason="arm_error", because="a joint was 0.102 rad off"))
+    told = wrongs(
+        diagnosed(more={"travels": travels}, mode="fault", reason="arm_error", because="a joint was 0.102 rad off")
+    )
     assert "b was commanded to move by 0.31 rad, but has not moved since commands began" in told[0]
     assert "are the drives on?" in told[0]
     assert [line.split()[1] for line in told] == ["arm's", "mode"]
@@ -322,12 +323,11 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
     ],
 )
 def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, level: str, words: str) -> None:
-    found = findings(HEALTHY, HEALTHY, own_ns=HEALTHY.time_ns, own_version="0.1.0", lag_ms=lag_ms)
+    found = diagnosed(more={"lag_ms": lag_ms})
     (one,) = (finding for finding in found if finding.what == "arm's lag")
     assert (one.level, one.found) == (level, words)
     assert ("lead by the lag: write position + lag * velocity" in one.text()) == (level == "note")
-    alone = msgspec.structs.replace(HEALTHY, sources={"left": GOOD, "right": GOOD})
-    assert "arm's lag" not in {finding.what for finding in findings(alone, alone, own_ns=0, own_version="0.1.0")}
+    assert "arm's lag" not in {finding.what for finding in diagnosed(sources={"left": GOOD, "right": GOOD})}
 
 
 @pytest.mark.parametrize(
@@ -389,14 +389,12 @@ def test_hands_that_slide_over_the_table_are_of_no_tracker_whose_y_points_up() -
 
 def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
     first = msgspec.structs.replace(HEALTHY, target_m=(0.5, 0.2, 0.3))
-    now = msgspec.structs.replace(first, tick=2000, time_ns=first.time_ns + 2 * 10**9, target_m=(0.5, 0.15, 0.3))
-    told = wrongs(findings(first, now, own_ns=now.time_ns, own_version="0.1.0"))
+    now = {"target_m": (0.5, 0.15, 0.3)}
+    told = wrongs(diagnosed(first, **now))
     assert "tool               15 cm or more from its target for 2.0 s" in told[0]
-    held_back = msgspec.structs.replace(now, flags=("separation",))
-    found = findings(first, held_back, own_ns=now.time_ns, own_version="0.1.0")
+    found = diagnosed(first, flags=("separation",), **now)
     assert [(one.level, "give it room" in one.remedy) for one in found if one.what == "tool"] == [("note", True)]
-    lagging = msgspec.structs.replace(now, target_m=HEALTHY.target_m)
-    assert not any(one.what == "tool" for one in findings(first, lagging, own_ns=now.time_ns, own_version="0.1.0"))
+    assert not any(one.what == "tool" for one in diagnosed(first, target_m=HEALTHY.target_m))
 
 
 def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
@@ -418,13 +416,3 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
     assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: the skill needs both hands"
-
-
-def test_a_rejected_sample_is_followed_by_what_to_do_about_that_one() -> None:
-    told = {"refused": "stamped 2 s after the newest accepted one, which was held up for 2 s on its way"}
-    advice = "see what holds samples up"
-    seen = source("left", rejected={"ahead": 90, "older": 4}, cause="ahead", advice=advice, **told)
-    (found,) = [line for line in wrongs(diagnosed(sources=seen)) if "rejected as ahead" in line]
-    assert told["refused"] in found
-    assert advice in found
-    assert "clock" not in found

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 from support.cell import serving, thirdhand
-from support.paths import ROOT
+from support.cell_commands import python
 
 
 def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(tmp_path: Path) -> None:
@@ -36,9 +34,7 @@ def test_an_unexpected_failure_is_an_object_with_its_exception(tmp_path: Path) -
         "import sys\nfrom service.cli import serve\nfrom service.cli.main import main\n"
         "serve.starting = None\nsys.exit(main(['serve', '--log', 'json']))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
-    )
+    done = python(code)
     line = json.loads(done.stderr)
     assert (done.returncode, line["level"]) == (1, "error")
     assert "Traceback" in line["exception"]

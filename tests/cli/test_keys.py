@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
 
-from support.paths import ROOT
+from support.cell_commands import python
 
 WAITS = "from service.cli.keys import EnterPressed; p = EnterPressed(); print(p(), p.listens, p(), p.listens)"
 INPUTS = {"closed": "False False False False", "empty": "False False False False", "a line": "True True False False"}
@@ -16,14 +14,6 @@ INPUTS = {"closed": "False False False False", "empty": "False False False False
 
 @pytest.mark.parametrize("given", INPUTS)
 def test_enter_is_heard_where_there_is_an_input_and_never_awaited(given: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", WAITS],
-        cwd=ROOT,
-        input="\n" if given == "a line" else "",
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        preexec_fn=(lambda: os.close(0)) if given == "closed" else None,
-    )
+    closes = (lambda: os.close(0)) if given == "closed" else None
+    done = python(WAITS, input="\n" if given == "a line" else "", preexec_fn=closes)
     assert (done.stdout.strip(), done.stderr) == (INPUTS[given], "")

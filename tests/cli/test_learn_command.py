@@ -15,6 +15,7 @@ from service.learning.stored_demonstrations import stored_demonstrations
 from sim.scene import Scene
 from sim.teach import demonstrations
 from support.cell import thirdhand, told
+from support.cell_commands import succeeded
 from support.fine_motion import fine
 from support.paths import RECORDINGS
 
@@ -42,8 +43,7 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
 def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
     people = sorted((RECORDINGS / "people").glob("*.mcap"))[:4]
     out = tmp_path / "skill.npz"
-    done = told("learn", *map(str, people), "--output", str(out))
-    assert done.returncode == 0, done.stderr
+    done = succeeded("learn", *map(str, people), "--output", str(out))
     head, *lines = done.stdout.splitlines()
     assert head.endswith("held   without places   linear   look-up   same elapsed time")
     assert "of blocks" not in head
@@ -78,8 +78,7 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
         ((), "it is not served until somebody accepts its residual risk, named above"),
         (("--accept-residual-risk", "Ada"), "its residual risk is accepted by Ada"),
     ):
-        done = told("learn", *map(str, takes), "--output", str(out), *option)
-        assert done.returncode == 0, done.stderr
+        done = succeeded("learn", *map(str, takes), "--output", str(out), *option)
         assert "residual risk: 1" in done.stdout
         assert says in done.stderr
         assert ("accepted by Ada: 1" in decoded(out.read_bytes(), origin="skill").residual_risk) == bool(option)
@@ -87,14 +86,12 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
 
 def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Path) -> None:
     theirs, mine = tmp_path / "theirs.npz", tmp_path / "mine.npz"
-    done = told("learn", *map(str, files), "--output", str(theirs))
-    assert done.returncode == 0, done.stderr
+    done = succeeded("learn", *map(str, files), "--output", str(theirs))
     own = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
     for path, one in zip(own, demonstrations(Scene(), count=2, seed=5), strict=True):
         write_demonstration(path, one.every(8))
     refine = ("learn", *map(str, own), "--output", str(mine), "--from")
-    done = told(*refine, str(theirs))
-    assert done.returncode == 0, done.stderr
+    done = succeeded(*refine, str(theirs))
     assert "the weight of your demonstrations against the skill's, with errors; " in done.stdout
     names = [one.name for one in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))]
     assert names == [path.stem for path in (*own, *files)]

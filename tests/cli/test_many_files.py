@@ -20,6 +20,7 @@ from service.report.variants import CHANGES, VariantFigures, pooled
 from sim.scene import Scene
 from sim.script import HandScript
 from support.cell import told
+from support.cell_commands import succeeded
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS, ROOT
 from support.wam import URDF
@@ -89,20 +90,6 @@ def test_a_cluster_of_two_workers_prints_the_same(files: list[str], tmp_path: Pa
     assert named_failures(done.stderr) == named_failures(alone.stderr)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("replay", "--workers", "2"), "--workers: --each needed"),
-        (("replay", "--each", "--output", "new.mcap"), "--output writes the frames of one recording"),
-        (("report", "--workers", "many"), "many given; a number of processes, or dask:tcp://HOST:8786"),
-        (("tune", "--plot", "tune.png"), "the picture is of one file; 4 given"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(arguments: tuple[str, ...], message: str, files: list[str]) -> None:
-    done = told(arguments[0], *files, *arguments[1:])
-    assert (done.returncode, message in done.stderr) == (2, True), done.stderr
-
-
 def test_the_figures_of_several_files_are_weighted_by_their_judged_time() -> None:
     def figures(error_mm: float, lag_ms: float, overshoot_mm: float, stops: int, cause: str) -> VariantFigures:
         seen = TrackingFigures(error_mm, 2 * error_mm, lag_ms, 10.0, overshoot_mm, stops)
@@ -118,8 +105,7 @@ def test_the_figures_of_several_files_are_weighted_by_their_judged_time() -> Non
 def test_several_takes_are_tuned_together(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tune, "CHANGES", CHANGES[:5:4])
     takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
-    done = told("tune", *takes, "--part", "3", "7")
-    assert done.returncode == 0, done.stderr
+    done = succeeded("tune", *takes, "--part", "3", "7")
     for words in ("how the tool follows, over 2 files", "max_jerk = 100"):
         assert words in done.stdout
     assert len(re.findall(r"Noise and tremor of the hands", done.stdout)) == 2

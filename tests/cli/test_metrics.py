@@ -7,8 +7,6 @@ import re
 import shutil
 import socket
 import subprocess
-import sys
-import threading
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +24,8 @@ from service.client import Client
 from service.contract.records import Mode, Reason
 from service.contract.requests import Status
 from service.daemon.launch import free_port
-from support.cell import Tracker, serving, thirdhand, told, until
+from support.cell import Tracker, serving, thirdhand, until
+from support.cell_commands import python, started
 from support.paths import ROOT
 
 RULES = ROOT / "examples" / "thirdhand.rules.yml"
@@ -51,18 +50,10 @@ def value(found: Samples, name: str, **labels: str) -> float | None:
 @contextlib.contextmanager
 def page(endpoint: str) -> Iterator[str]:
     """The address of the page that `thirdhand metrics` serves, until the context ends."""
-    command = [sys.executable, "-m", "service", "metrics", "--listen", "127.0.0.1:0", "--connect", endpoint]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        timer = threading.Timer(300, process.kill)
-        timer.start()
-        try:
-            assert process.stderr is not None
-            found = re.search(r"http://127\.0\.0\.1:\d+/metrics", process.stderr.readline())
-            assert found is not None
-            yield found[0]
-        finally:
-            timer.cancel()
-            process.terminate()
+    with started("metrics", "--listen", "127.0.0.1:0", "--connect", endpoint) as process:
+        found = re.search(r"http://127\.0\.0\.1:\d+/metrics", process.stderr.readline())
+        assert found is not None
+        yield found[0]
 
 
 def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(tmp_path: Path) -> None:
@@ -196,27 +187,16 @@ def test_the_alerts_use_metrics_that_exist() -> None:
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
 def test_prometheus_accepts_the_alerts_and_the_metrics() -> None:
     page_text = exposition({"lab/one": msgspec.convert(STATUS, Status)})
-    done = subprocess.run(
-        ["promtool", "check", "metrics"], input=page_text, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    done = subprocess.run(
-        ["promtool", "check", "rules", str(RULES)], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    for command in (["promtool", "check", "metrics"], ["promtool", "check", "rules", str(RULES)]):
+        done = subprocess.run(command, input=page_text, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_what_prevents_the_page_is_a_sentence_and_an_exit_code(tmp_path: Path) -> None:
-    done = told("metrics", "--connect", "tcp/127.0.0.1:1")
-    assert (done.returncode, "is a daemon or a router running there?" in done.stderr) == (1, True)
-    done = told("metrics", "--listen", "no-port")
-    assert (done.returncode, "PORT or HOST:PORT needed" in done.stderr) == (2, True)
     with serving(tmp_path, "--joints", "assumed") as daemon, socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         done = thirdhand("metrics", "--listen", address, "--connect", daemon.endpoint)
         assert (done.returncode, f"--listen {address}: Address already in use" in done.stderr) == (1, True)
     code = "import sys; sys.modules['prometheus_client'] = None; from service.cli.main import main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "metrics"], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
-    )
+    done = python(code, "metrics")
     assert (done.returncode, "pip install 'thirdhand[metrics]'" in done.stderr) == (1, True)

@@ -22,8 +22,6 @@ from service.settings.config import Settings
 from support.paths import RECORDINGS, ROOT
 from support.wam import STATE
 
-GOLDEN = RECORDINGS / "golden.mcap"
-
 
 def rows(path: Path) -> list[list[str]]:
     with path.open(encoding="utf-8", newline="") as file:
@@ -118,23 +116,6 @@ def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
     assert "cut at byte" in said
     assert "<svg" in page.read_text(encoding="utf-8")
     assert len(rows(tmp_path / "tables" / "empty" / "ticks.csv")) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "says"),
-    [
-        (["nowhere.mcap"], 1, "no recording nowhere.mcap"),
-        ([str(RECORDINGS / "demonstration-1.mcap")], 1, "not a recording of thirdhand"),
-        ([str(GOLDEN), "--html", "no/such/folder.html"], 2, "there is no folder no/such"),
-        ([str(GOLDEN), "--csv", str(GOLDEN)], 2, "is a file; a folder needed"),
-        ([str(GOLDEN)], 1, f"has checksums instead of frames: thirdhand replay {GOLDEN} --output whole.mcap"),
-    ],
-)
-def test_what_cannot_be_read_or_written_is_said_first(
-    arguments: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["report", *arguments]) == code
-    assert says in capsys.readouterr().err
 
 
 def test_a_thinned_curve_keeps_its_extremes_and_its_gaps() -> None:

@@ -9,8 +9,6 @@ import os
 import re
 import shutil
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,22 +16,12 @@ import pytest
 
 from service.daemon.launch import free_port
 from support.cell import serving, told
+from support.cell_commands import python, succeeded
 from support.certificates import make_certificates
 from support.paths import RECORDINGS, ROOT
+from support.sabotage import SABOTAGE, fail
 
 TLS, FOREIGN = "tls/127.0.0.1:0", "tcp/192.0.2.1:7447"  # the second is an address that no machine has
-FAILS_ONCE = """
-import pathlib
-from service.core import controller
-
-def step(self, tick, *rest, honest=controller.Controller.step):
-    if (mark := pathlib.Path({mark!r})).exists():
-        mark.unlink()
-        raise RuntimeError("sabotaged")
-    return honest(self, tick, *rest)
-
-controller.Controller.step = step
-"""
 CELL = """
 [network]
 listen = ["{listen}"]
@@ -90,9 +78,7 @@ def test_too_few_files_that_may_be_open_prevent_a_start(tmp_path: Path, option: 
         "resource.setrlimit(resource.RLIMIT_NOFILE, (100, 100))\n"
         f"raise SystemExit(service.cli.main.main({arguments}))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
-    )
+    done = python(program)
     assert done.returncode == 1
     assert "this process may open 100 files, 256 or more needed: raise its limit with" in done.stdout + done.stderr
 
@@ -195,16 +181,16 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
 
 
 def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(tmp_path: Path) -> None:
-    listen, mark = f"tcp/127.0.0.1:{free_port()}", tmp_path / "mark"
-    network, sabotage = f"[network]\nlisten = ['{listen}']\n", FAILS_ONCE.format(mark=str(mark))
+    listen = f"tcp/127.0.0.1:{free_port()}"
+    network, sabotage = f"[network]\nlisten = ['{listen}']\n", SABOTAGE.format(folder=str(tmp_path))
     with serving(tmp_path, "--joints", "assumed", network=network, before=sabotage) as daemon:
         found = lines(tmp_path, code=0, listen=listen)
         assert found["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
         found = lines(tmp_path, "--cell", "another", code=1, listen=listen)
         assert "Address already in use" in found["wrong port"][0]
         status = ("status", "--exit-code", "--connect", daemon.endpoint)
-        assert told(*status).returncode == 0
-        mark.touch()
+        succeeded(*status)
+        fail(tmp_path, "step", "once")
         daemon.until(lambda now: now["mode"] == "fault")
         for more in ((), ("--json",)):
             done = told(*status, *more)

@@ -10,7 +10,7 @@ import pytest
 
 from service.cli import tune
 from service.report.variants import CHANGES
-from support.cell import told
+from support.cell_commands import succeeded
 from support.paths import RECORDINGS
 
 GOLDEN = str(RECORDINGS / "golden.mcap")
@@ -20,8 +20,7 @@ TAKE = str(RECORDINGS / "demonstration-1.mcap")
 @pytest.mark.timeout(300)
 def test_settings_are_tried_on_a_recording(tmp_path: Path) -> None:
     plot = tmp_path / "tune.png"
-    done = told("tune", GOLDEN, "--part", "2", "4.2", "--json", "--plot", str(plot))
-    assert done.returncode == 0, done.stderr
+    done = succeeded("tune", GOLDEN, "--part", "2", "4.2", "--json", "--plot", str(plot))
     found = json.loads(done.stdout)
     assert [one["name"] for one in found["variants"]][:2] == ["as recorded", "follow = closely"]
     assert len(found["variants"]) == len(CHANGES)  # "as recorded", and all but the recording's own `follow`
@@ -36,8 +35,7 @@ def test_settings_are_tried_on_a_recording(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_a_take_is_tuned_with_the_shipped_cell_and_skill(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tune, "CHANGES", CHANGES[:6])
-    done = told("tune", TAKE, "--part", "3", "8")
-    assert done.returncode == 0, done.stderr
+    done = succeeded("tune", TAKE, "--part", "3", "8")
     assert "has no settings: those of the shipped cell are used; --config gives others" in done.stderr
     assert "has no skill: soldering, which is shipped, is used; --skill gives another" in done.stderr
     for words in (
@@ -48,33 +46,3 @@ def test_a_take_is_tuned_with_the_shipped_cell_and_skill(monkeypatch: pytest.Mon
     ):
         assert words in done.stdout
     assert "Leave the settings." in done.stdout or "Write into the cell's settings:\n\n[" in done.stdout
-
-
-@pytest.fixture(scope="module")
-def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with files that cannot be tuned to."""
-    folder, whole = tmp_path_factory.mktemp("broken"), Path(GOLDEN).read_bytes()
-    (folder / "head.mcap").write_bytes(whole[:3000])
-    (folder / "text.mcap").write_text("no recording", encoding="utf-8")
-    (folder / "skill.npz").write_bytes(b"no skill")
-    return folder
-
-
-@pytest.mark.parametrize(("words", "code", "arguments"), [
-    ("is cut before its first message", 1, ("tune", "head.mcap")),
-    ("text.mcap is not an MCAP file", 1, ("tune", "text.mcap")),
-    ("no recording nowhere.mcap", 1, ("tune", "nowhere.mcap")),
-    ("joints fr3_joint1, fr3_joint2", 1, ("tune", GOLDEN, "--config", "franka")),
-    ("the arm follows for", 1, ("tune", GOLDEN, "--part", "8.9", "9.7")),
-    ("two times [s], the first below the second, needed", 2, ("tune", GOLDEN, "--part", "5", "4")),
-    ("skill.npz", 1, ("tune", GOLDEN, "--skill", "skill.npz")),
-    ("a name that ends in .png needed", 2, ("tune", GOLDEN, "--plot", "tune.jpg")),
-])  # fmt: skip
-def test_a_mistake_is_explained(
-    words: str, code: int, arguments: tuple[str, ...], broken: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(broken)
-    done = told(*arguments)
-    assert done.returncode == code, done.stderr
-    assert words in done.stderr
-    assert done.stdout == ""

@@ -8,9 +8,6 @@ import contextlib
 import http.client
 import json
 import re
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +23,7 @@ from service.daemon.launch import free_port
 from service.settings import palette
 from support import chromium
 from support.cell import Daemon, Tracker, serving, told
-from support.paths import ROOT
+from support.cell_commands import started
 
 TIMEOUT_S = 90
 
@@ -66,23 +63,13 @@ def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
     """The URL of a page that `thirdhand view live --web` serves; it must end without a word on
     standard error.
     """
-    command = [sys.executable, "-m", "service", "view", "live", "--web", address, "--connect", daemon.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
-        clock = threading.Timer(TIMEOUT_S, server.kill)
-        clock.start()
-        try:
-            assert server.stdout is not None
-            assert server.stderr is not None
-            assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
-            url = server.stdout.readline().strip()
-            clock.cancel()
-            yield url
-            server.terminate()
-            assert server.wait(TIMEOUT_S) == 0
-            assert server.stderr.read() == ""
-        finally:
-            clock.cancel()
-            server.kill()
+    arguments = ("view", "live", "--web", address, "--connect", daemon.endpoint)
+    with started(*arguments, within_s=5 * TIMEOUT_S) as server:
+        assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
+        yield server.stdout.readline().strip()
+        server.terminate()
+        assert server.wait(TIMEOUT_S) == 0
+        assert server.stderr.read() == ""
 
 
 def token_in(text: str) -> str:

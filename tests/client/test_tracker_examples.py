@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import socket
 import struct
 import subprocess
 import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,17 +17,8 @@ from scipy.spatial.transform import Rotation
 from service.client import Watch, endpoints, open_session
 from service.contract.messages import PoseStamped
 from support.cell import until
+from support.examples import example
 from support.paths import ROOT
-
-
-def example(name: str) -> ModuleType:
-    """An example as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_rigid_bodies_that_are_tracked_are_hands() -> None:

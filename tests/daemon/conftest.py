@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from zenoh_ros2_sdk.session import ZenohSession
 
 from service.client import endpoints, open_session
 from service.core.skill.skill import Skill
@@ -20,6 +21,14 @@ def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A listening session and one connected to it."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as near, open_session(connect=endpoints(near)) as far:
         yield near, far
+
+
+@pytest.fixture
+def router() -> Iterator[zenoh.Session]:
+    """A router, by which nodes of ROS 2 meet a daemon; they close with it."""
+    with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as session:
+        yield session
+        ZenohSession.get_instance().close()
 
 
 @pytest.fixture(scope="session")

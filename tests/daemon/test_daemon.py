@@ -8,8 +8,6 @@ import json
 import os
 import re
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -32,9 +30,10 @@ from service.files.replay import replay
 from service.learning.learn import learn
 from service.settings.config import Settings, robot_description
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
+from support.cell_commands import assert_refused, python, succeeded
 from support.circling import circling
 from support.in_process import arm
-from support.paths import RECORDINGS, ROOT
+from support.paths import ROOT
 from support.wam import JOINT_NAMES
 
 HANDOVER = requests.ViaPoint(
@@ -146,33 +145,6 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         assert daemon.client.status().places == ()
 
 
-@pytest.mark.parametrize(
-    ("suffix", "request_", "words"),
-    [
-        (
-            "via_points",
-            {"op": "add", "points": [{"name": "h", "left": [1, 2], "right": [1, 2, 3], "tool": [1, 2, 3]}]},
-            "$.points[0].left: 2 numbers, 3 needed",
-        ),
-        ("via_points", {"op": "remove", "names": ["nothing"]}, "no via-point 'nothing'"),
-        ("via_points", {"op": "turn"}, "$.op"),
-        ("skill", {"name": "sodlering"}, "its skills: soldering"),
-        ("skill", {"name": "../secret"}, "$.name"),
-        ("resume", {"why": "so"}, "why"),
-        ("via_points", {"op": "list", "a - at `$.x`": 1}, "unknown field"),
-        ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}, "unknown field"),
-        ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}, "unknown field"),
-    ],
-)
-def test_what_is_not_understood_is_refused_in_words(
-    shared_daemon: Any, suffix: str, request_: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(RefusedError) as refused:
-        shared_daemon.client.ask(suffix, request_)
-    assert words in str(refused.value)
-    assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == []  # and others are still answered
-
-
 @pytest.fixture(scope="module")
 def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with serving(tmp_path_factory.mktemp("shared"), "--joints", "assumed") as daemon:
@@ -196,24 +168,6 @@ def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_
     shared_daemon.client.ask("resume")
 
 
-def test_a_hold_is_answered_while_a_skill_is_being_made(shared_daemon: Any) -> None:
-    along = [0.5 + 0.005 * i for i in range(30)]  # the tool goes along with the hand
-    many = [
-        msgspec.structs.replace(HANDOVER, name=f"place {i}", left=(x, 0.0, 0.1), tool=(x, *HANDOVER.tool[1:]))
-        for i, x in enumerate(along)
-    ]
-    replies = shared_daemon.session.get(
-        "thirdhand/via_points", payload=requests.encode_json(requests.Add(tuple(many))), timeout=30
-    )
-    begin = time.monotonic()
-    shared_daemon.client.ask("hold")
-    held_s = time.monotonic() - begin
-    shared_daemon.client.ask("resume")
-    assert all(reply.ok is not None for reply in replies)
-    assert held_s < 1.0
-    shared_daemon.client.ask("via_points", {"op": "clear"})
-
-
 def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     at = ("--connect", shared_daemon.endpoint)
     assert thirdhand("hold", *at).returncode == 0
@@ -224,8 +178,7 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     reset = told("reset", *at)
     assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
     place = ("--left", ".62", "-.28", ".3", "--right", ".98", ".32", ".06", "--tool", ".62", "-.28", ".3")
-    added = told("via-points", "add", "my place", *place, *at)
-    assert added.returncode == 0, added.stderr
+    added = succeeded("via-points", "add", "my place", *place, *at)
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
     again = told("via-points", "add", "my place", *place, *at)
@@ -234,10 +187,8 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
         True,
     )
     assert "1 via-point in force" in told("via-points", "list", *at).stdout
-    refused = told("via-points", "remove", "other", *at)
-    assert refused.returncode == 1
-    assert "in force: my place" in refused.stderr
-    assert told("via-points", "clear", *at).returncode == 0
+    assert_refused(1, "in force: my place", "via-points", "remove", "other", *at)
+    succeeded("via-points", "clear", *at)
     carried = json.loads(told("status", "--json", *at).stdout)
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
 
@@ -311,17 +262,6 @@ def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill:
     assert tool.position(controller.state) is None
 
 
-def test_recorded_hands_are_played_as_a_tracker_would(shared_daemon: Any) -> None:
-    demonstration = str(RECORDINGS / "demonstration-6.mcap")
-    played = told("play", demonstration, "--speed", "10", "--connect", shared_daemon.endpoint)
-    assert played.returncode == 0, played.stderr
-    status = shared_daemon.client.status()
-    assert set(status.hand_age_ms) == {"left", "right"}
-    assert status.rejected.get("not_finite", 0) == 0
-    assert "of the left hand" in played.stderr
-    assert "the daemon's loop received" in played.stderr
-
-
 def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -335,9 +275,7 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
 def test_the_client_on_the_page_of_the_wire_works(shared_daemon: Any) -> None:
     code = (ROOT / "docs" / "wire.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
     code = code.replace("tcp/127.0.0.1:7447", shared_daemon.endpoint)
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
-    )
+    done = python(code)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0] in ("hold", "follow")

@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,12 +20,13 @@ from zenoh_ros2_sdk.session import ZenohSession
 from service.cli.cells import HEADS
 from service.cli.main import main
 from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
-from service.contract import cdr, channels, requests, ros2, ros2msg
+from service.contract import cdr, channels, requests, ros2
 from service.contract.messages import PoseStamped
-from service.core.frame import definitions
 from support.cell import LEFT, RIGHT, until
+from support.cell_commands import started
 from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
+from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
 
 NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
@@ -110,18 +110,12 @@ def test_cells_are_watched_as_lines_and_one_that_ends_is_gone() -> None:
         open_session(connect=endpoints(router)) as daemon,
     ):
         token = daemon.liveliness().declare_token(channels.presence("lab/a", str(daemon.zid())))
-        command = [sys.executable, "-m", "service", "status", "--all", "--watch", "--connect", endpoints(router)[0]]
-        watching = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-        try:
-            assert watching.stdout is not None
+        with started("status", "--all", "--watch", "--connect", endpoints(router)[0]) as watching:
             assert watching.stdout.readline() == "lab/a  no status  it is starting, is busy, or denies access\n"
             token.undeclare()
             assert watching.stdout.readline() == "lab/a  gone\n"
             watching.send_signal(signal.SIGINT)
             assert "interrupted" in watching.communicate(timeout=20)[1]
-        finally:
-            watching.kill()
-            watching.communicate()
 
 
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,8 +124,11 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: 
     assert "of the left hand, " in (said := capsys.readouterr().err)
     assert "the daemon's loop received" in said
     client = Client(lab.session, NAMES[1])
-    assert client.status().received["hands/left"] > 3
-    stuck = requests.encode_json(client.status())
+    status = client.status()
+    assert status.received["hands/left"] > 3
+    assert set(status.hand_age_ms) == {"left", "right"}
+    assert status.rejected.get("not_finite", 0) == 0
+    stuck = requests.encode_json(status)
     with pytest.raises(UnreachableError, match="nobody listens to nowhere/hands/left"):
         Tracker(lab.session, "nowhere", timeout_s=0.1)
     with (
@@ -169,15 +166,8 @@ def test_what_a_storage_kept_passes_for_no_daemon(lab: Lab, capsys: pytest.Captu
 @pytest.fixture(scope="module")
 def ros(lab: Lab) -> Iterator[dict[str, Any]]:
     """Where a ROS 2 node finds the domain."""
-    at = {"domain_id": ROS2_DOMAIN, "router_ip": "127.0.0.1", "router_port": int(lab.endpoint.rpartition(":")[2])}
-    yield at
+    yield port(lab.endpoint, ROS2_DOMAIN)
     ZenohSession.get_instance().close()
-
-
-def typed(kind: str) -> dict[str, str]:
-    """What a ROS 2 node knows of a message type."""
-    definition = ros2msg.schema(kind, definitions(len(JOINT_NAMES)))
-    return {"msg_type": kind, "msg_definition": definition, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
 
 
 def test_ros2_lists_the_topics_of_every_cell_with_their_types(ros: dict[str, Any]) -> None:
@@ -195,20 +185,10 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
     pose = typed("geometry_msgs/msg/PoseStamped")
     hands = [ROS2Publisher(f"/{cell}/hands/{side}", **pose, **ros) for side in ("left", "right")]
     store = hands[0].session_mgr.store.types
-    header, stamp, place, point, turn = (
-        store[name]
-        for name in (
-            "std_msgs/msg/Header",
-            "builtin_interfaces/msg/Time",
-            "geometry_msgs/msg/Pose",
-            "geometry_msgs/msg/Point",
-            "geometry_msgs/msg/Quaternion",
-        )
-    )
+    place, point, turn = (store[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Point", "Quaternion"))
 
     def follows() -> bool:
-        now_ns = time.time_ns()
-        at = header(stamp=stamp(sec=now_ns // 10**9, nanosec=now_ns % 10**9), frame_id="base")
+        at = header(store, "base")
         for hand, (x, y, z) in zip(hands, (LEFT, RIGHT), strict=True):
             hand.publish(
                 header=at, pose=place(position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0))

@@ -87,15 +87,6 @@ def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Store
     assert event.value.digest == wanted.digest
 
 
-def test_what_is_taught_is_in_force_again_after_a_restart(cell: Cell, skill: Skill) -> None:
-    cell.client.add(PLACES[:2], tolerance=0.04)
-    assert SavedViaPoints(cell.settings).read(skill) == (PLACES[:2], 0.04)
-    cell.client.ask("via_points", {"op": "clear"})
-    restored = SavedViaPoints(cell.settings).read(skill)
-    assert restored is not None
-    assert restored[0] == ()
-
-
 def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
     cell.client.add(PLACES)
     saved = cell.folder / "state" / cell.settings.cell
@@ -195,6 +186,20 @@ def test_a_request_is_refused_whole_and_with_a_reason(
 
 
 @pytest.mark.parametrize(
+    ("suffix", "request_"),
+    [
+        ("via_points", {"op": "list", "a - at `$.x`": 1}),
+        ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}),
+        ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}),
+    ],
+)
+def test_a_field_whose_name_looks_like_a_path_is_unknown(
+    taught_cell: Cell, suffix: str, request_: dict[str, Any]
+) -> None:
+    assert "unknown field" in taught_cell.refusal(suffix, request_)
+
+
+@pytest.mark.parametrize(
     "payload", [None, b"hold!", {"now": True}, {"by": 5}, b'{"by": "a", "by": "b"}', b" " * 262_145, b"[" * 100_000]
 )
 def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) -> None:
@@ -266,12 +271,6 @@ def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_pa
     assert str(outside) not in str(refused.value)
     assert cell.kinds() == []
     assert cell.failures == []
-
-
-def test_a_skill_file_that_is_none_is_refused_and_all_stays(taught_cell: Cell) -> None:
-    (taught_cell.folder / "broken.npz").write_bytes(b"nothing")
-    assert "broken.npz: not a skill" in taught_cell.refusal("skill", {"name": "broken"})
-    (taught_cell.folder / "broken.npz").unlink()
 
 
 def test_the_stage_of_the_task_is_told_by_client_and_command(

@@ -5,30 +5,26 @@ hands of any tracker are; the recording replays exactly.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
-from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Publisher
-from zenoh_ros2_sdk.session import ZenohSession
 
 from service.client import endpoints, open_session
 from service.contract import cdr, channels, ros2
 from service.contract.messages import Quaternion, Transform, Vector3
-from service.contract.roles import access_control
-from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.replay import replay
 from service.settings.config import parse
 from service.trackers.capture import Capture
 from support.cell import LEFT, RIGHT, Daemon, serving, until
-from support.certificates import make_certificates
+from support.ros2_nodes import guarded, header, port, typed
 
 DOMAIN = 13
 KIND = "tf2_msgs/msg/TFMessage"
@@ -53,7 +49,6 @@ source = "assumed"
 [files]
 state = "{{state}}"
 """
-TYPES = get_typestore(Stores.ROS2_JAZZY)
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 OTHERS = [Transform("base_link", f"link_{i}", (0.1, 0.2, 0.3), STRAIGHT) for i in range(48)]
 
@@ -63,23 +58,13 @@ def of_left(at: Vector3 = LEFT, turn: Quaternion = STRAIGHT, parent: str = "worl
     return Transform(parent, "left_wrist", (at[0] - 0.5, at[1], at[2]), turn)
 
 
-@pytest.fixture
-def router() -> Iterator[zenoh.Session]:
-    with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as session:
-        yield session
-        ZenohSession.get_instance().close()
-
-
 class Wrists:
     """Publishes two wrists on /tf at 100 Hz until closed: the left one by a session among the links
     of a robot, the right one by a node of its own.
     """
 
     def __init__(self, at: str) -> None:
-        text, _ = TYPES.generate_msgdef(KIND, ros_version=2)
-        more = {"msg_type": KIND, "msg_definition": text, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[KIND]}"}
-        port = {"domain_id": DOMAIN, "router_ip": "127.0.0.1", "router_port": int(at.rpartition(":")[2])}
-        self.node = ROS2Publisher("/tf", **more, **port)
+        self.node = ROS2Publisher("/tf", **typed(KIND), **port(at, DOMAIN))
         self.session = open_session(connect=[at])
         self.times = 1  # each message of the left wrist is preceded by so many of other frames
         self._end, self._thread = threading.Event(), threading.Thread(target=self._publish)
@@ -87,17 +72,15 @@ class Wrists:
 
     def _publish(self) -> None:
         types = self.node.session_mgr.store.types
-        header, stamp = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
-        vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-        transform, stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
+        names = ("Vector3", "Quaternion", "Transform", "TransformStamped")
+        vector, quaternion, transform, stamped = (types[f"geometry_msgs/msg/{name}"] for name in names)
         while not self._end.wait(0.01):
             now_ns = time.time_ns()
             for _ in range(self.times):
                 self.session.put(KEY, cdr.encode_transforms(now_ns, OTHERS))
             self.session.put(KEY, cdr.encode_transforms(now_ns, [*OTHERS[:24], of_left(), *OTHERS[24:]]))
             at = transform(vector(*(1000.0 * value for value in RIGHT)), quaternion(*STRAIGHT))
-            when = stamp(sec=now_ns // 10**9, nanosec=now_ns % 10**9)
-            self.node.publish(transforms=[stamped(header(when, "mocap"), "right_wrist", at)])
+            self.node.publish(transforms=[stamped(header(types, "mocap"), "right_wrist", at)])
 
     def __enter__(self) -> Wrists:
         return self
@@ -170,35 +153,28 @@ def assert_refused(daemon: Daemon, session: zenoh.Session) -> None:
 
 def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
     """Behind certificates: a tracker publishes them, and a recorder hears them."""
-    secrets = make_certificates(tmp_path)
     settings = parse(CELL.format(router="tcp/127.0.0.1:1", state=tmp_path), origin="tf.toml")
-    guarded = {**NETWORK_BOUNDS, **access_control(settings.cell, (), DOMAIN, [*ros2.of_settings(settings.ros2)])}
-    with open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=guarded) as session:
-        at = endpoints(session)
-        with (
-            open_session(connect=at, certificate=secrets / "recorder") as recorder,
-            open_session(connect=at, certificate=secrets / "tracker") as tracker,
-            open_session(connect=at, certificate=secrets / "observer") as observer,
-        ):
-            captured = Capture(recorder, settings.cell, settings)
-            right, tool = Transform("/mocap", "/right_wrist", (1.0, 2.0, 3.0), STRAIGHT), (0.4, 0.0, 0.2)
-            frames = [of_left(), right, Transform("base", "iron", tool, STRAIGHT)]
+    topics = [*ros2.of_settings(settings.ros2)]
+    right, tool = Transform("/mocap", "/right_wrist", (1.0, 2.0, 3.0), STRAIGHT), (0.4, 0.0, 0.2)
+    frames = [of_left(), right, Transform("base", "iron", tool, STRAIGHT)]
+    sessions = guarded(tmp_path, settings.cell, DOMAIN, topics, "recorder", "tracker", "observer")
+    with (
+        sessions as (_, recorder, tracker, observer),
+        contextlib.closing(Capture(recorder, settings.cell, settings)) as captured,
+    ):
 
-            def is_complete() -> bool:
-                observer.put(KEY, cdr.encode_transforms(2, [of_left((0.0, 0.0, 0.0))]))
-                tracker.put(KEY, cdr.encode_transforms(1, frames))
-                tracker.put(KEY, cdr.encode_transforms(1, frames)[:-1])
-                captured.collect()
-                return not captured.missing and len(captured.malformed) == 3
+        def is_complete() -> bool:
+            observer.put(KEY, cdr.encode_transforms(2, [of_left((0.0, 0.0, 0.0))]))
+            tracker.put(KEY, cdr.encode_transforms(1, frames))
+            tracker.put(KEY, cdr.encode_transforms(1, frames)[:-1])
+            captured.collect()
+            return not captured.missing and len(captured.malformed) == 3
 
-            try:
-                until(is_complete, "the frames were not heard")
-                found = {key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES}
-                assert [(one.stamp_ns, one.frame_id, one.position) for one in found.values()] == [
-                    (1, "world", of_left().translation),
-                    (1, "mocap", (1.0, 2.0, 3.0)),
-                    (1, "base", tool),
-                ]
-                np.testing.assert_allclose(captured.samples["hands/right"][-1].at, (0.001, 0.002, 0.003))
-            finally:
-                captured.close()
+        until(is_complete, "the frames were not heard")
+        found = {key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES}
+        assert [(one.stamp_ns, one.frame_id, one.position) for one in found.values()] == [
+            (1, "world", of_left().translation),
+            (1, "mocap", (1.0, 2.0, 3.0)),
+            (1, "base", tool),
+        ]
+        np.testing.assert_allclose(captured.samples["hands/right"][-1].at, (0.001, 0.002, 0.003))

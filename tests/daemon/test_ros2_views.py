@@ -4,8 +4,8 @@ diagnostics, on the topics that the settings name.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +13,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import zenoh
-from rosbags.typesys import Stores, get_typestore
 from zenoh import ext
 from zenoh_ros2_sdk import ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
-from zenoh_ros2_sdk.session import ZenohSession
 
 from service.client import endpoints, open_session
 from service.contract import cdr, ros2
 from service.contract.messages import JointState, Transform
-from service.contract.roles import access_control
 from service.core.frame import blank, frame_layout
 from service.core.transforms import Frames
 from service.daemon.ros2_domain import Ros2Domain
-from service.daemon.single_instance import NETWORK_BOUNDS
 from service.files.shipped import cell_of
 from service.settings.config import Settings, parse, robot_description
 from support.cell import Tracker, serving, until
-from support.certificates import make_certificates
+from support.ros2_nodes import TYPES, guarded, port, typed
 from support.wam import JOINT_NAMES
 
 DOMAIN = 12
@@ -50,7 +46,6 @@ ros2_domain = {DOMAIN}
 [files]
 state = "{{state}}"
 """
-TYPES = get_typestore(Stores.ROS2_JAZZY)
 POSTURE = np.array(Settings().arm.posture) + 0.05
 
 
@@ -75,25 +70,16 @@ class LikeRmw:
         )
 
 
-@pytest.fixture
-def router() -> Iterator[zenoh.Session]:
-    with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as session:
-        yield session
-        ZenohSession.get_instance().close()
-
-
 @pytest.mark.thorough
 def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path, router: zenoh.Session) -> None:
     (at,) = endpoints(router)
     (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=at, state=tmp_path))
-    port = {"domain_id": DOMAIN, "router_ip": "127.0.0.1", "router_port": int(at.rpartition(":")[2])}
     latched = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
     heard: dict[str, list[Any]] = {}
 
     def listen(topic: str, kind: str, **more: Any) -> ROS2Subscriber:
-        text, _ = TYPES.generate_msgdef(kind, ros_version=2)
-        known = {"msg_type": kind, "msg_definition": text, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
-        return ROS2Subscriber(topic, callback=heard.setdefault(topic, []).append, **known, **port, **more)
+        take = heard.setdefault(topic, []).append
+        return ROS2Subscriber(topic, callback=take, **typed(kind), **port(at, DOMAIN), **more)
 
     with open_session(connect=[at]) as node:
         early = {topic: LikeRmw(node, topic) for topic in ("/robot_description", "/tf_static")}
@@ -191,24 +177,16 @@ def test_frames_of_every_shipped_arm_are_one_tree_from_base(arm: str) -> None:
 
 def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:
     """An observer, and not a tracker."""
-    secrets = make_certificates(tmp_path)
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
     topics = list(ros2.of_settings(settings.ros2))
-    guarded = {**NETWORK_BOUNDS, **access_control(settings.cell, (), DOMAIN, topics)}
-    listen = ["tls/127.0.0.1:0"]
-    with open_session(listen=listen, certificate=secrets / "daemon", more=guarded) as session:
-        failures: list[str] = []
-        domain = Ros2Domain(session, settings, topics, failed=failures.append)
-        at = endpoints(session)
-        try:
-            with (
-                open_session(connect=at, certificate=secrets / "observer") as observer,
-                open_session(connect=at, certificate=secrets / "tracker") as tracker,
-            ):
-                seen, unseen = ([LikeRmw(one, topic) for topic in ("/robot_description", "/tf_static")]
-                                for one in (observer, tracker))  # fmt: skip
-                until(lambda: all(one.told for one in seen), "an observer was not told")
-                assert not any(one.told for one in unseen)
-        finally:
-            domain.close()
+    failures: list[str] = []
+    sessions = guarded(tmp_path, settings.cell, DOMAIN, topics, "observer", "tracker")
+    with sessions as (daemon, observer, tracker):
+        domain = Ros2Domain(daemon, settings, topics, failed=failures.append)
+        with contextlib.closing(domain):
+            seen, unseen = (
+                [LikeRmw(one, topic) for topic in ("/robot_description", "/tf_static")] for one in (observer, tracker)
+            )
+            until(lambda: all(one.told for one in seen), "an observer was not told")
+            assert not any(one.told for one in unseen)
         assert failures == []

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from service.cli.usage import added_in
-from service.client import RefusedError
 from service.contract.requests import RequestError
 from service.core.skill.skill import Skill
 from service.daemon.saved_stage import MAX_RESTART_S, SavedStage
@@ -98,36 +97,6 @@ def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
     assert files_in(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"{",
-        b"[]",
-        b"[" * 200_000,
-        b'{"a":' * 200_000,
-        b"3",
-        b"\xff\xff",
-        b"{}",
-        b'{"learned_from": "x"}',
-        b'{"learned_from": "x", "request": 3}',
-        b'{"request": {"points": 1}}',
-    ],
-)
-def test_a_damaged_file_is_set_aside_and_reported(
-    saved: SavedViaPoints, skill: Skill, content: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = saved.path(skill)
-    path.parent.mkdir(parents=True)
-    path.write_bytes(content)
-    assert saved.read(skill) is None
-    aside = path.with_suffix(".damaged")
-    assert (aside.read_bytes(), path.exists()) == (content, False)
-    assert f"the taught via-points in {path} cannot be used" in caplog.text
-    assert f"is kept as {aside}" in caplog.text
-    assert saved.read(skill) is None  # once is enough
-
-
 def test_via_points_that_this_skill_cannot_go_through_are_set_aside(
     saved: SavedViaPoints, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -156,10 +125,12 @@ def test_a_file_that_somebody_edited_is_set_aside(
 ) -> None:
     keep(saved, adapted(skill, POINTS, tolerance=0.03))
     whole = saved.path(skill).read_text()
-    for text, why in ((whole.replace("0.03", "0.04"), "was edited"), (whole.replace("checksum", "sum"), "checksum")):
+    edited = [whole.replace("0.03", "0.04"), whole.replace("checksum", "sum"), "{}", '{"learned_from": "x"}']
+    edited += ['{"learned_from": "x", "request": 3}', '{"request": {"points": 1}}']
+    for text in edited:
         saved.path(skill).write_text(text)
         assert saved.read(skill) is None
-        assert why in caplog.text
+        assert "the checksum is wrong, so the file was edited" in caplog.text
         caplog.clear()
     saved.path(skill).write_text(json.dumps(json.loads(whole)))  # laid out in another way
     assert saved.read(skill) == (POINTS, 0.03)
@@ -253,12 +224,11 @@ def test_it_is_kept_for_its_skill_and_for_a_while(settings: Settings, skill: Ski
     old = file.stat().st_mtime - MAX_RESTART_S - 1.0
     os.utime(file, (old, old))
     assert saved.read(skill) == ""
-    for spoilt in ("{", "[]", json.dumps({"learned_from": skill.learned_from, "via_point": 3})):
-        file.write_text(spoilt)
-        assert saved.read(skill) == ""
+    file.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": 3}))
+    assert saved.read(skill) == ""
 
 
-def damage(path: Path, how: str) -> None:
+def damage(path: Path, how: str | bytes) -> None:
     """Puts something in a file's place that cannot be used."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if how == "a folder":
@@ -271,10 +241,13 @@ def damage(path: Path, how: str) -> None:
     elif how == "a link to itself":
         path.symlink_to(path)
     else:
-        path.write_bytes({"deep brackets": b"[" * 200_000, "no text": b"\xff\xfe", "another kind": b"[3]"}[how])
+        assert isinstance(how, bytes)
+        path.write_bytes(how)
 
 
-REASONS = {
+DEEP = b"[" * 200_000
+CONTENTS = (b"", b"{", b"[]", b"[3]", b"3", DEEP, b'{"a":' * 200_000, b"\xff\xff")
+REASONS: dict[str | bytes, tuple[str, ...]] = {
     "a folder": ("Is a directory; a file needed, and that is a folder",),
     "a pipe": ("it is not a file",),
     "a huge file": (f"it has {1 << 40} bytes, at most {MAX_STATE_BYTES} accepted",),
@@ -282,11 +255,9 @@ REASONS = {
 }
 
 
-@pytest.mark.parametrize(
-    "how", ["deep brackets", "no text", "another kind", "a folder", "a pipe", "a huge file", "a link to itself"]
-)
+@pytest.mark.parametrize("how", [*REASONS, *CONTENTS], ids=lambda how: str(how)[:20])
 def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
-    how: str, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
+    how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = state_folder(settings)
     saved_points, stage = SavedViaPoints(settings), folder / "stage.json"
@@ -298,7 +269,11 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
         (reason,) = re.findall(rf"{path} cannot be used: (.*); the file is kept", caplog.text)
         assert reason in REASONS.get(how, (NOT_OURS,))
         assert not os.path.lexists(path)
-        assert os.path.lexists(path.with_suffix(".damaged"))
+        aside = path.with_suffix(".damaged")
+        assert f"is kept as {aside}" in caplog.text
+        assert os.path.lexists(aside)
+        assert not isinstance(how, bytes) or aside.read_bytes() == how
+    assert saved_points.read(skill) is None  # once is enough
     SavedStage(settings).keep(skill, ("handover", "glass"), 0.9)
     assert SavedStage(settings).read(skill) == "handover"
 
@@ -307,31 +282,17 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
     settings = Settings(files=Files(state=str(tmp_path / "state")))
     folder, points = state_folder(settings), SavedViaPoints(settings).path(skill)
     for path in (folder / "stage.json", points, folder / "daemon.lock"):
-        damage(path, "deep brackets")
+        damage(path, DEEP)
     with serving(tmp_path, "--joints", "assumed") as daemon:
         log = daemon.log.read_text()
         assert "Traceback" not in log
         assert f"{folder / 'stage.json'} cannot be used" in log
         assert f"{points} cannot be used" in log
-        daemon.client.set_stage("glass")
-        daemon.until(lambda now: (folder / "stage.json").exists())
-    with serving(tmp_path, "--joints", "assumed") as daemon:
-        assert "cannot be used" not in daemon.log.read_text()
-        assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
-        said = daemon.log.read_text()
-        assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
-        assert daemon.end() == 0
-        assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")
-
-
-def test_a_daemon_is_told_the_stage_and_knows_it_after_a_restart(tmp_path: Path) -> None:
-    with serving(tmp_path) as daemon:
-        with pytest.raises(RefusedError, match=r"no via-point 'shelf' of the task. There are: start, handover, glass"):
-            daemon.client.set_stage("shelf")
         assert daemon.client.status().stage == ()
         assert daemon.client.set_stage("glass").mode == "hold"
-        assert daemon.until(lambda now: now["stage"] == ["glass", "soldering"])["stage_belief"] == 1.0
-    with serving(tmp_path) as daemon:
+        assert daemon.until(lambda now: (folder / "stage.json").exists() and now["stage"])["stage_belief"] == 1.0
+    with serving(tmp_path, "--joints", "assumed") as daemon:
+        assert "cannot be used" not in daemon.log.read_text()
         assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
         said = daemon.log.read_text()
         assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1

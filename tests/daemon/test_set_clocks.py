@@ -13,6 +13,7 @@ import zenoh
 
 from service.contract import cdr
 from support.cell import Daemon, Tracker, serving, told, until
+from support.cell_commands import succeeded
 
 LIBRARY = next(iter(glob.glob("/usr/lib/*/faketime/libfaketimeMT.so.1")), "")
 OFFSETS_S = (0.3, 0.0, 3600.0, 0.0, 10 * 365 * 86_400.0)  # of the clock: set ahead and back in turn
@@ -42,11 +43,9 @@ def follows(daemon: Daemon, tick: int) -> None:
 def assert_replays(folder: Path) -> None:
     """Assert that the recordings in a folder replay identically."""
     files = sorted(map(str, folder.glob("*.mcap")))
-    done = told("replay", "--exact", *files)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = succeeded("replay", "--exact", *files)
     assert "identical" in done.stdout
-    report = told("report", *files)
-    assert report.returncode == 0, report.stderr
+    succeeded("report", *files)
 
 
 @pytest.mark.skipif(not LIBRARY, reason="needs libfaketime: on Debian, apt install libfaketime")

@@ -40,6 +40,11 @@ def joints(stamp_ns: int, position: tuple[float, ...] = POSTURE, names: tuple[st
     return JointState(stamp_ns, names, position, (0.0,) * len(position))
 
 
+def resting_hands(stamp_ns: int) -> list[tuple[str, PoseStamped]]:
+    """A sample of each hand."""
+    return [("left", pose(stamp_ns, LEFT)), ("right", pose(stamp_ns, RIGHT))]
+
+
 class Cell:
     """A controller and its sources, told message by message, a tick each."""
 
@@ -106,11 +111,11 @@ class Cell:
 )
 def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: Any, cause: Cause, words: str) -> None:
     cell = Cell(skill)
-    cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)))
+    cell.tell(*resting_hands(S))
     cell.tell((source, message))
     refused = cell.controller.intake.refused[source, cause]
     assert refused[:2] == (cause, message)
-    cell.tell(("left", pose(2 * S, LEFT)), ("right", pose(2 * S, RIGHT)))
+    cell.tell(*resting_hands(2 * S))
     assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEY_OF_SOURCE[source]])).why
 
 
@@ -131,7 +136,7 @@ def test_an_arm_that_measures_positions_only_is_ready_and_followed(skill: Skill,
     cell = Cell(skill)
     for k in range(1, 200):
         state = joints(k)._replace(velocity=unmeasured, effort=(math.nan,) * 7)
-        cell.tell(("arm", state), ("left", pose(k, LEFT)), ("right", pose(k, RIGHT)))
+        cell.tell(("arm", state), *resting_hands(k))
     told = cell.status(0.4)
     assert (told.mode, told.rejected) == ("follow", {})
 
@@ -153,8 +158,7 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
 def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: int) -> None:
     cell, told_of = Cell(skill), set()
     for k in range(2500):
-        hands = [("left", pose(k + 1, LEFT)), ("right", pose(k + 1, RIGHT))]
-        cell.tell(("arm", joints(k + 1)), *hands * (k % (500 // rate_hz) == 0))
+        cell.tell(("arm", joints(k + 1)), *resting_hands(k + 1) * (k % (500 // rate_hz) == 0))
         told = cell.status(k / 500)
         if k > 1000 and told.reason == "stale_hand":
             told_of.add(told.because)
@@ -173,7 +177,7 @@ def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(skill: Skill,
     cell = Cell(skill)
     for k in range(1, 100):
         state = joints(k, (*POSTURE, 1.0), (*JOINT_NAMES, named_twice))
-        cell.tell(("arm", state), ("left", pose(k, LEFT)), ("right", pose(k, RIGHT)))
+        cell.tell(("arm", state), *resting_hands(k))
         told = cell.status(k / 500)
     assert (told.mode, told.reason) == ("hold", "arm_not_ready")
     assert f"['{named_twice}'] named more than once among 8; one position each needed" in told.because
@@ -285,7 +289,7 @@ def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
 
 def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     cell = Cell(skill)
-    cell.tell(("left", pose(S, LEFT)), ("right", pose(S, RIGHT)), ("left", pose(1, (900.0, 0.0, 0.0))))
+    cell.tell(*resting_hands(S), ("left", pose(1, (900.0, 0.0, 0.0))))
     assert cell.status(1.0).sources["left"].cause == "out_of_range"
     for k in range(1500):
         seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1200 else ()
@@ -363,7 +367,7 @@ def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill
     for k in range(5 * batch_ticks):
         stamp_ns = 1 + k * period_ns
         if k % 7 == 0:
-            waiting += [("left", pose(stamp_ns, LEFT)), ("right", pose(stamp_ns, RIGHT))]
+            waiting += resting_hands(stamp_ns)
         is_sent = k % batch_ticks == batch_ticks - 1
         cell.tell(("arm", joints(stamp_ns)), *(waiting[-8:] if is_sent else ()), at_ns=stamp_ns)
         if is_sent:

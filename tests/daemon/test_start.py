@@ -30,6 +30,8 @@ from service.process.priority import AHEAD_NICE
 from service.settings.config import Files, Settings
 from service.settings.network import Network
 from support.cell import LISTENING, serving
+from support.cell_commands import python
+from support.cell_commands import started as command_started
 from support.paths import ROOT
 
 COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
@@ -107,9 +109,7 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     (tmp_path / "cell.toml").write_text(
         f'[network]\nlisten = ["{endpoint}"]\n[files]\nstate = "{tmp_path / "state"}"\n'
     )
-    command = [sys.executable, "-m", "service", "serve", "--log", "json", "--config", str(tmp_path / "cell.toml")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as service:
-        assert service.stderr is not None
+    with command_started("serve", "--log", "json", "--config", str(tmp_path / "cell.toml")) as service:
         begun_s = time.monotonic()
         assert "starting: importing" in service.stderr.readline()  # first of all
         answers: list[str] = []
@@ -141,10 +141,8 @@ def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that
         pytest.skip("this user may not put a process ahead of others")
     files = f'[files]\nstate = "{tmp_path / "state"}"\nrecord = "{tmp_path / "recordings"}"\n'
     (tmp_path / "cell.toml").write_text(LISTENING + files)
-    command = [sys.executable, "-m", "service", "serve", "--config", str(tmp_path / "cell.toml")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as service:
+    with command_started("serve", "--config", str(tmp_path / "cell.toml"), stderr=subprocess.DEVNULL) as service:
         begun = set()
-        assert service.stdout is not None
         while not select.select([service.stdout], [], [], 0.02)[0]:
             begun.add(os.getpriority(os.PRIO_PROCESS, service.pid))
         kept: dict[str, int] = {}
@@ -223,9 +221,7 @@ def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: 
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
     at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = f"import sys\nfrom service.cli.main import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}sys.exit(code)"], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = python(f"{code}sys.exit(code)")
     assert done.returncode == 1
     assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
     assert "Traceback" not in done.stderr
@@ -236,7 +232,8 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
 )
 def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
     code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    done = python(code)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_daemon_that_can_cache_nothing_compiles_itself_and_starts(tmp_path: Path) -> None:

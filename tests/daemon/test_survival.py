@@ -22,31 +22,9 @@ from service.daemon.launch import free_port
 from service.daemon.single_instance import Lock
 from service.daemon.supervised_thread import supervised
 from service.files.replay import replay
-from support.cell import Daemon, Tracker, serving, thirdhand
+from support.cell import Daemon, Tracker, serving, thirdhand, until
 from support.paths import ROOT
-
-SABOTAGE = """
-import pathlib
-from service.core import controller
-from service.daemon import daemon
-from service.daemon import queryables
-
-def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
-    honest = getattr(owner, name)
-    def method(*arguments, **more):
-        if (mark := folder / name).exists():
-            if mark.read_text() == "once":
-                mark.unlink()
-            raise RuntimeError(f"{{name}} is sabotaged")
-        return honest(*arguments, **more)
-    setattr(owner, name, method)
-
-sabotaged(daemon.CellStatus, "status")
-sabotaged(controller.Controller, "step")
-sabotaged(daemon, "outgoing")
-sabotaged(queryables.RequestQueue, "enqueue")
-sabotaged(daemon.Daemon, "note")
-"""
+from support.sabotage import SABOTAGE, fail
 
 
 def children(pid: int) -> list[int]:
@@ -62,13 +40,8 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def gone(pids: list[int], within_s: float) -> bool:
-    end = time.monotonic() + within_s
-    while any(map(is_running, pids)):
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.05)
-    return True
+def until_gone(pids: list[int], within_s: float) -> None:
+    until(lambda: not any(map(is_running, pids)), "processes are left", within_s=within_s)
 
 
 def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Path) -> None:
@@ -91,8 +64,7 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
             "outgoing": lambda: None,
         }.items():
             daemon.until(lambda status: status["mode"] == "follow")
-            (tmp_path / "mark").write_text("once")
-            (tmp_path / "mark").rename(tmp_path / name)
+            fail(tmp_path, name, "once")
             with contextlib.suppress(UnreachableError):  # it is not answered, and that is all
                 provoke()
             daemon.until(is_at_fault)
@@ -116,11 +88,11 @@ def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> 
         started = children(daemon.process.pid)
         daemon.until(lambda status: status["tick"] > 0)
         assert "a second daemon of this cell is only detected through Zenoh" in daemon.log.read_text()
-        (tmp_path / "step").write_text("always")
+        fail(tmp_path, "step")
         assert daemon.process.wait(20) == 1
         assert "step is sabotaged" in daemon.log.read_text()
         assert "the arm gets no more commands" in daemon.log.read_text()
-        assert gone(started, 10)
+        until_gone(started, 10)
 
 
 def test_watched_work_begins_again_until_it_ends_by_itself() -> None:
@@ -277,9 +249,9 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
         os.kill(busy, signal.SIGSTOP)  # it hears of nothing
         daemon.process.kill()
         daemon.process.wait()
-        assert gone([pid for pid in started if pid != busy], 20)
+        until_gone([pid for pid in started if pid != busy], 20)
         os.kill(busy, signal.SIGCONT)
-        assert gone([busy], 10)
+        until_gone([busy], 10)
     (recording,) = records.glob("*.mcap")
     assert replay(recording).exact
 
@@ -307,7 +279,7 @@ def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     running.kill()
     running.wait()
     running.stdout.close()
-    assert gone([busy], 5)
+    until_gone([busy], 5)
 
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:

@@ -58,19 +58,18 @@ class Manager:
 
 
 @pytest.fixture
-def manager(tmp_path: Path) -> Iterator[Manager]:
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
+    """The manager of the daemons that the test starts."""
     found = Manager(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
     with found.socket:
         yield found
 
 
 @pytest.mark.thorough
-def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
-    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(manager: Manager, tmp_path: Path) -> None:
     mark = tmp_path / "mark"
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
     arguments = ("--joints", "assumed")
     before = STANDS_STILL.format(mark=str(mark))
     with serving(tmp_path, *arguments, "--hold", before=before) as daemon, Tracker(daemon.session):
@@ -116,12 +115,8 @@ own_answers.DEAF_AFTER_S, own_answers.ASK_EVERY_S = 1.5, 0.3
 
 
 @pytest.mark.thorough
-def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(
-    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(manager: Manager, tmp_path: Path) -> None:
     mark = tmp_path / "mark"
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
     with serving(tmp_path, "--joints", "assumed", before=DEAF.format(mark=str(mark))) as daemon:
         for _ in range(10):  # more than two of its own requests
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
@@ -207,7 +202,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
-    manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    manager: Manager, tmp_path: Path
 ) -> None:
     disk, filled = tmp_path / "disk", tmp_path / "disk" / "filled"
     disk.mkdir()
@@ -220,8 +215,6 @@ def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
         with contextlib.suppress(OSError), filled.open("wb", buffering=0) as file:
             while file.write(bytes(4096)):
                 pass
-        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
         with serving(tmp_path, "--joints", "assumed", "--record", str(disk / "records")) as daemon:
             checked = told(
                 "serve", "--check", "--config", str(tmp_path / "cell.toml"), "--record", str(disk / "records")

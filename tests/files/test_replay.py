@@ -8,7 +8,6 @@ import functools
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,8 @@ from sim.closed_loop import joints_event
 from sim.golden import ENCODED, ENCODED_SPEED, refresh
 from sim.scene import Scene
 from sim.script import HandScript
-from support.cell import told
+from support.cell import thirdhand, told
+from support.cell_commands import assert_refused, succeeded
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS
 from support.recorded import thin
@@ -37,16 +37,9 @@ from support.wam import URDF
 GOLDEN = RECORDINGS / "golden.mcap"
 
 
-def command(*arguments: str, timeout_s: float = 110, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "service", "replay", *arguments],
-        capture_output=True, text=True, timeout=timeout_s, check=False,
-        env=os.environ | environment, cwd=RECORDINGS.parent,
-    )  # fmt: skip
-
-
 def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked_for() -> None:
-    done = command(str(GOLDEN), OPENBLAS_NUM_THREADS="2", OMP_NUM_THREADS="2", MKL_NUM_THREADS="2")
+    two = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
+    done = thirdhand("replay", str(GOLDEN), timeout=110, env=os.environ | two)
     assert (done.returncode, done.stdout) == (0, "10000 ticks, 10000 frames identical\n"), done.stderr
 
 
@@ -154,12 +147,6 @@ def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_was_recorded_replays_identically(recorded: Path) -> None:
-    result = replay(recorded)
-    assert result.exact
-    assert result.text() == "1000 ticks, 1000 frames identical"
-
-
 def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:
     recording = Recording.open(recorded)
     steps = list(recording.steps())
@@ -174,7 +161,7 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
     assert not result.exact
     assert result.within_tolerance
     assert "first difference at tick 600: joints by 1e-09" in result.text()
-    assert told("replay", str(path)).returncode == 0
+    succeeded("replay", str(path))
     exact = told("replay", str(path), "--exact")
     assert exact.returncode == 1
     assert "first difference at tick 600" in exact.stdout
@@ -220,6 +207,9 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
     assert f"gap after tick {gap.after}, before tick {gap.before}: damage at byte" in result.text()
     exact = told("replay", str(path), "--exact")
     assert (exact.returncode, "checksum" in exact.stdout or "damage" in exact.stdout) == (1, True)
+    with pytest.raises(RecordingError, match=r"--output cannot be written: gap after tick \d+"):
+        replay(path, output=tmp_path / "whole.mcap")
+    assert [file.name for file in tmp_path.iterdir()] == ["damaged.mcap"]
 
 
 def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
@@ -264,8 +254,7 @@ def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
     )
     assert [frame.tobytes() for frame in whole] == [frame.tobytes() for frame in were]
     assert [tick for tick, frame in enumerate(kept) if frame is not None] == [0, 500]
-    same = told("replay", str(output), "--output", str(output))
-    assert (same.returncode, "a file other than the recording" in same.stderr) == (1, True)
+    assert_refused(1, "a file other than the recording", "replay", str(output), "--output", str(output))
     assert replay(output).exact
 
 
@@ -282,22 +271,3 @@ def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(checked: Pat
     result = replay(path)
     assert (result.ticks, result.identical, result.exact) == (1000, 999, False)
     assert "first difference at tick 601: its checksum\nlargest differences: none in the frames" in result.text()
-
-
-def test_what_is_decided_behind_a_gap_is_not_written_as_if_there_were_none(recorded: Path, tmp_path: Path) -> None:
-    data = bytearray(recorded.read_bytes())
-    data[len(data) * 3 // 4] ^= 0xFF  # in a chunk of messages
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"--output cannot be written: gap after tick \d+"):
-        replay(damaged, output=tmp_path / "whole.mcap")
-    assert [path.name for path in tmp_path.iterdir()] == ["damaged.mcap"]
-
-
-def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
-    done = told("replay", str(RECORDINGS / "demonstration-1.mcap"))
-    assert done.returncode == 1
-    assert "not a recording of thirdhand" in done.stderr
-    done = told("replay", str(tmp_path / "missing.mcap"))
-    assert done.returncode == 1
-    assert "missing.mcap" in done.stderr

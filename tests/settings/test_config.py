@@ -175,13 +175,9 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[network] revoked, entry 2",
             "with a number, like tracker-2",
         ),
-        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, nan]", "[hands] base_from_tracker", ""),
-        ("[hands]\nbase_from_tracker = [nan, 0, 0, 0, 0, 0, 1]", "[hands] base_from_tracker", ""),
-        ("[tool]\nplate_from_tool = [inf, 0, 0, 0, 0, 0, 1]", "[tool] plate_from_tool", ""),
-        ("[hands]\nstale_ms = inf", "[hands] stale_ms", ""),
-        ("[arm]\nsilent_ms = inf", "[arm] silent_ms", ""),
-        ("[tool]\nmax_speed = inf", "[tool] max_speed", ""),
-        ("[reach]\nmin_z = nan", "[reach] min_z", ""),
+        ("[tool]\nplate_from_tool = [101, 0, 0, 0, 0, 0, 1]", "[tool] plate_from_tool", "100 m or less on each axis"),
+        ("[hands]\nbase_from_tracker = [101, 0, 0, 0, 0, 0, 1]", "[hands] base_from_tracker", "100 m or less on each"),
+        ("[tool]\nfollow = 'fast'", "[tool] follow", "'fast' given; calmly, closely, default accepted"),
         ("[reach]\ninner = 0.9\nouter = 0.5", "[reach] inner", ""),
     ],
 )
@@ -228,7 +224,8 @@ def test_what_follows_from_another_error_is_not_told() -> None:
 
 
 def test_a_toml_error_is_told_with_its_place() -> None:
-    assert refusal("rate_hz = 500\nhands = [").startswith("cell.toml: ")
+    for text in ("rate_hz = 500\nhands = [", f"rate_hz = {'9' * 4301}", f"rate_hz = {'9' * 9000}"):
+        assert refusal(text).startswith("cell.toml: ")
     assert "line 2" in refusal("rate_hz = 500\nhands = = 3\n")
 
 
@@ -311,7 +308,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from leaves(inner, (*path, key))
 
 
-@pytest.mark.parametrize("number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf])
+@pytest.mark.parametrize("number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf, math.nan])
 def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float) -> None:
     usual = msgspec.json.decode(msgspec.json.encode(Settings()))
     paths = list(leaves(usual))
@@ -348,12 +345,6 @@ def test_a_text_of_another_encoding_is_read_or_named(
         assert decode_request(data[:3] + b'{"op": "list"}', ViaPointsRequest) == List()
 
 
-@pytest.mark.parametrize("section", ["tool", "hands"])
-def test_a_tool_or_tracker_farther_away_than_any_is_refused(section: str) -> None:
-    name = {"tool": "plate_from_tool", "hands": "base_from_tracker"}[section]
-    assert "100 m or less on each axis" in refusal(f"[{section}]\n{name} = [101.0, 0, 0, 0, 0, 0, 1]")
-
-
 def test_a_key_of_many_parts_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "\n" + ".".join(["a"] * 20_000) + " = 1"
     assert "line 2 has 19999 dots, at most 1000 accepted" in refusal(text)
@@ -388,11 +379,6 @@ def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, m
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert again == msgspec.structs.replace(read, network=Network(), files=Files())
     assert robot_description(again) == robot_description(read)
-
-
-def test_a_certificate_lies_beside_the_configuration(tmp_path: Path) -> None:
-    text = "[network]\nlisten = ['tls/0.0.0.0:1']\ncertificate = 'secrets/daemon'"
-    assert parse(text, origin="cell.toml", folder=tmp_path).network.certificate == str(tmp_path / "secrets/daemon")
 
 
 def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
@@ -439,7 +425,6 @@ def test_follow_chooses_between_lag_and_calm_motion() -> None:
     assert tools[1] == Settings().tool
     assert tools[0].room > tools[1].room > tools[2].room
     assert tools[0].jerk == tools[1].jerk > tools[2].jerk
-    assert "[tool] follow: 'fast' given; calmly, closely, default accepted" in refusal('[tool]\nfollow = "fast"')
 
 
 LAB = """
@@ -486,8 +471,3 @@ def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
-
-
-@pytest.mark.parametrize("digits", [4301, 9000])
-def test_a_number_with_too_many_digits_is_refused_with_the_name_of_its_file(digits: int) -> None:
-    assert refusal(f"rate_hz = {'9' * digits}").startswith("cell.toml: ")

@@ -13,23 +13,13 @@ from numpy.typing import NDArray
 
 from service.core.arm.stage import Arm
 from service.files.shipped import ARMS, cell_of
-from service.settings.config import Settings, load, parse, robot_description
+from service.settings.config import Settings, parse, robot_description
 from service.settings.file_content import SettingsError
 from service.settings.reachable import Shell, workspace_of
 from service.settings.urdf import Urdf
-from support.paths import ROOT
 from support.turning import sliding_cell
+from support.ur5_cell import CELL, UR5, cell_in
 
-UR5 = (ROOT / "service" / "arms" / "ur5.urdf").read_text(encoding="utf-8")
-CELL = """
-[arm]
-urdf = "arm.urdf"
-plate = "tool0"
-posture = [-0.407, -1.676, 2.118, -2.755, -1.287, 0.0]
-[joints]
-acceleration = [10.0, 10.0, 10.0, 10.0, 10.0, 10.0]
-jerk = [500.0, 500.0, 500.0, 500.0, 500.0, 500.0]
-"""
 MOUNTS = {
     "as it is": None,
     "0.6 m to the right": ("0 -0.6 0", "0 0 0"),
@@ -45,12 +35,6 @@ def mounted(text: str, xyz: str, rpy: str) -> str:
         f'<link name="world"/><joint name="mount" type="fixed"><parent link="world"/><child link="base_link"/>'
         f'<origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>',
     )
-
-
-def cell_in(folder: Path, text: str, more: str = "") -> Settings:
-    (folder / "arm.urdf").write_text(text)
-    (folder / "cell.toml").write_text(CELL + more)
-    return load(folder / "cell.toml")
 
 
 def reached(cell: Settings, points: NDArray[np.float64]) -> float:

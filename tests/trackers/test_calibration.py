@@ -4,16 +4,14 @@ command over Zenoh, whose settings a daemon then maps with.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import functools
 import os
 import re
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from tomllib import loads as load_toml
 from typing import Any
@@ -51,6 +49,7 @@ from service.trackers.calibration.solver import (
 )
 from sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
 from support.cell import serving, told
+from support.cell_commands import assert_refused, started, succeeded
 from support.paths import ROOT
 
 SECONDS, SEEDS = 40.0, range(8)
@@ -443,34 +442,6 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize(("text", "words"), FILES.values(), ids=FILES)
-def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text(text)
-    path.chmod(0o640)
-    link = tmp_path / "link.toml"
-    link.symlink_to(path)
-    before = load(path)
-    kept = write(link, hand_settings(FOUND, "webxr"), RECORD)
-    after = load(path)
-    assert after.hands.base_from_tracker == FOUND.base_from_tracker
-    assert after.hands.frame == "webxr"
-    unchanged = msgspec.structs.replace(after.hands, frame="", base_from_tracker=before.hands.base_from_tracker)
-    assert unchanged == msgspec.structs.replace(before.hands, frame="")
-    assert msgspec.structs.replace(after, hands=before.hands) == before
-    changed = path.read_text()
-    assert [line for line in text.splitlines() if "#" in line and "hands" not in line and "frame" not in line
-            and "position" not in line and "eye" not in line and line not in changed] == []  # fmt: skip
-    assert [word for word in words if word not in changed] == []
-    assert kept.read_text() == text
-    assert path.stat().st_mode & 0o777 == 0o640
-    assert link.is_symlink()
-    assert recorded(path, after) == RECORD
-    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(
-        ["cell.calibration.json", "cell.toml", kept.name, "link.toml"]
-    )
-
-
 TRACKERS = {
     "a table": "[trackers.mocap]  # ours\n",
     "a table between others": "[trackers.a]\n[tool]\nradius = 0.03\n[trackers.mocap]  # ours\n[trackers.b]\n",
@@ -478,27 +449,47 @@ TRACKERS = {
     "dotted keys": 'trackers.mocap.unit = "mm"  # ours\n',
     "a name with a slash": '[hands]\nframe = "webxr"\n[trackers."rig/1.b"]  # ours\n',
 }
+CHANGED = [(*file, "") for file in FILES.values()]
+CHANGED += [(text, ["# ours"], "rig/1.b" if "rig" in text else "mocap") for text in TRACKERS.values()]
 
 
-@pytest.mark.parametrize("text", TRACKERS.values(), ids=TRACKERS)
-def test_the_table_of_a_tracker_is_changed_and_nothing_else(text: str, tmp_path: Path) -> None:
-    path, tracker = tmp_path / "cell.toml", "rig/1.b" if "rig" in text else "mocap"
+@pytest.mark.parametrize(
+    ("text", "words", "tracker"), CHANGED, ids=[*FILES, *(f"{name} of a tracker" for name in TRACKERS)]
+)
+def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], tracker: str, tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
     path.write_text(text)
+    path.chmod(0o640)
+    link = tmp_path / "link.toml"
+    link.symlink_to(path)
     before = load(path)
-    record = msgspec.structs.replace(RECORD, frame=tracker)
-    write(path, hand_settings(FOUND, ""), record, tracker)
+    values = hand_settings(FOUND, "" if tracker else "webxr")
+    record = msgspec.structs.replace(RECORD, frame=tracker or "webxr")
+    kept = write(link, values, record, tracker)
     after = load(path)
-    assert after.trackers[tracker].base_from_tracker == FOUND.base_from_tracker
-    there = msgspec.structs.replace(after.trackers[tracker], base_from_tracker=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    assert msgspec.structs.replace(after, trackers=after.trackers | {tracker: there}) == before
-    assert "# ours" in path.read_text()
+    changed = path.read_text()
+    mapping, mapping_before = (one.trackers[tracker] if tracker else one.hands for one in (after, before))
+    assert mapping.base_from_tracker == FOUND.base_from_tracker
+    restored = msgspec.structs.replace(mapping, base_from_tracker=mapping_before.base_from_tracker)
+    if tracker:
+        assert msgspec.structs.replace(after, trackers=after.trackers | {tracker: restored}) == before
+        with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist"):
+            recorded(path, after)
+        table = {"trackers": {tracker: {"base_from_tracker": list(FOUND.base_from_tracker)}}}
+        assert load_toml(lines(values, tracker)) == table
+    else:
+        assert after.hands.frame == "webxr"
+        restored = msgspec.structs.replace(restored, frame=before.hands.frame)
+        assert msgspec.structs.replace(after, hands=restored) == before
+        assert [line for line in text.splitlines() if "#" in line and "hands" not in line and "frame" not in line
+                and "position" not in line and "eye" not in line and line not in changed] == []  # fmt: skip
+    assert [word for word in words if word not in changed] == []
+    assert kept.read_text() == text
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert link.is_symlink()
     assert recorded(path, after, tracker) == record
-    assert record_path(path, tracker).parent == tmp_path
-    with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist"):
-        recorded(path, after)
-    assert load_toml(lines(hand_settings(FOUND, ""), tracker)) == {
-        "trackers": {tracker: {"base_from_tracker": list(FOUND.base_from_tracker)}}
-    }
+    names = [record_path(path, tracker).name, "cell.toml", kept.name, "link.toml"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(names)
 
 
 def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path: Path) -> None:
@@ -603,11 +594,9 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     text = (ROOT / "service" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
     (tmp_path / "cell.toml").write_text(text)
     file = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
-    asked = told(*file)
-    assert (asked.returncode, "both hands arrive: give the one that is at the tool" in asked.stderr) == (1, True)
+    assert_refused(1, "both hands arrive: give the one that is at the tool", *file)
     cell = [*file, "--hand", "left"]
-    done = told(*cell)
-    assert done.returncode == 0, done.stderr
+    done = succeeded(*cell)
     assert "left hand     held, 40 s, 398 samples, 0 outliers" in done.stdout
     assert "residual       1.0 mm rms" in done.stdout
     assert "delay          0 ms" in done.stdout
@@ -632,15 +621,15 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
         (("--hand", "right"), 1, "hands/left moves with the tool, with a residual of 1 mm: if the left hand holds it"),
         (("--at", "0", "0", "0"), 2, "points are touched in a running cell: --from needs no --at"),
     ):
-        done = told(*cell, *more)
-        assert (done.returncode, words in done.stderr) == (code, True), done.stderr
+        assert_refused(code, words, *cell, *more)
     assert load(tmp_path / "cell.toml").hands.base_from_tracker[0] == pytest.approx(1.44)
     without = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "ur5", "--hand", "left")
     assert 'Write this into the cell\'s settings; --config FILE does it:\n[hands]\nframe = "mocap"' in without.stdout
-    wrong_arm = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam")
-    assert "has no joints/state of the joints wam/base_yaw_joint" in wrong_arm.stderr
-    hands = told("calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
-    assert (hands.returncode, "has no joints/state of the joints" in hands.stderr) == (1, True), hands.stderr
+    words = "has no joints/state of the joints"
+    assert_refused(
+        1, f"{words} wam/base_yaw_joint", "calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam"
+    )
+    assert_refused(1, words, "calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
 
 
 def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tmp_path: Path) -> None:
@@ -649,8 +638,7 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
     cell.write_text(text)
     recording(tmp_path / "led.mcap", held_by("mocap"), path_of("wam", 0).joints, Settings(), "webxr")
     command = ["calibrate", "--from", led, "--config", str(cell)]
-    done = told(*command, "--hand", "left")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(*command, "--hand", "left")
     assert "\n[trackers.mocap]\nbase_from_tracker = [" in done.stdout
     np.testing.assert_allclose(load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002)
     assert load(cell).hands == HandSettings(frame="webxr")
@@ -659,38 +647,14 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
     assert (done.returncode, done.stdout) == (0, "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"), (
         done.stderr
     )
-    done = told(*command, "--check", "--hand", "right")
-    assert (done.returncode, "cell.calibration.json does not exist" in done.stderr) == (1, True), done.stderr
+    assert_refused(1, "cell.calibration.json does not exist", *command, "--check", "--hand", "right")
     record_path(cell).write_bytes(record_path(cell, "mocap").read_bytes().replace(b'"mocap"', b'"webxr"'))
-    done = told(*command, "--check")
-    assert done.returncode == 1
-    assert "hands are of two trackers, 'mocap' and 'webxr': give the hand that holds the tool by --hand" in done.stderr
-    assert told(*command, "--check", "--hand", "left").returncode == 0
+    words = "hands are of two trackers, 'mocap' and 'webxr': give the hand that holds the tool by --hand"
+    assert_refused(1, words, *command, "--check")
+    succeeded(*command, "--check", "--hand", "left")
     cell.write_text(text.replace("mocap", "optitrack"))
-    done = told(*command, "--hand", "left")
-    assert (done.returncode, "hands/left is in frame 'mocap', which has no table" in done.stderr) == (1, True)
+    assert_refused(1, "hands/left is in frame 'mocap', which has no table", *command, "--hand", "left")
     assert load(cell).hands == HandSettings(frame="webxr")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--held", "--at", "0", "0", "0"], 2, "not allowed with argument"),
-        (["--check"], 2, "--check compares with the last calibration of a cell: give its settings by --config FILE"),
-        (["--at", "0", "0", "0"], 2, "1 points given; 4 or more needed"),
-        (["--at", "0", "0", "6"], 2, "6 given, -5 to 5 m needed"),
-        (["--accept", "0"], 2, "0 given, 0.1 to 200 mm needed"),
-        (["--hand", "both"], 2, "invalid choice"),
-        (["--config", "nowhere.toml"], 1, "cannot read configuration nowhere.toml"),
-        (["--from", "nowhere.mcap"], 1, "nowhere.mcap"),
-        (["--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
-    ],
-)
-def test_what_cannot_be_meant_is_said(arguments: list[str], code: int, words: str) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli.calibrate.CONNECT_TIMEOUT_S", 0.2)
-        done = told("calibrate", *arguments)
-    assert (done.returncode, words in done.stderr) == (code, True), done.stderr
 
 
 class LedCell:
@@ -731,21 +695,8 @@ class LedCell:
         self._session.close()
 
 
-@contextlib.contextmanager
-def calibrating(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """The command as a process with a keyboard."""
-    command = [sys.executable, "-m", "service", "calibrate", *arguments]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, cwd=ROOT, **pipes) as process:  # type: ignore[call-overload]
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def line_with(process: subprocess.Popen[str], words: str) -> str:
     """The next line on standard error with these words."""
-    assert process.stderr is not None
     seen = []
     while line := process.stderr.readline():
         seen.append(line)
@@ -755,7 +706,6 @@ def line_with(process: subprocess.Popen[str], words: str) -> str:
 
 
 def press_enter(process: subprocess.Popen[str]) -> None:
-    assert process.stdin is not None
     process.stdin.write("\n")
     process.stdin.flush()
 
@@ -773,7 +723,7 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
     cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
     arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
     with (
-        calibrating("--config", str(cell), "--listen", endpoint) as process,
+        started("calibrate", "--config", str(cell), "--listen", endpoint) as process,
         LedCell(endpoint, Settings(), arm) as hand,
     ):
         line_with(process, "hold the tool and lead it")
@@ -808,7 +758,7 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
         points = ["--config", str(cell), "--connect", daemon.endpoint]
         for point in POINTS:
             points += ["--at", *map(str, point)]
-        with calibrating(*points) as process:
+        with started("calibrate", *points) as process:
             for number, point in enumerate(POINTS, 1):
                 led_cell.touched = point
                 line_with(process, f"{number}: touch ({point[0]:g}, ")
@@ -823,6 +773,5 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
 
 
 def test_without_hands_or_arm_the_command_says_what_is_missing() -> None:
-    done = told("calibrate", "--listen", f"tcp/127.0.0.1:{free_port()}", "--wait", "0")
-    assert done.returncode == 1
-    assert "not received: hands/left or hands/right, joints/state. Are tracker and arm running" in done.stderr
+    words = "not received: hands/left or hands/right, joints/state. Are tracker and arm running"
+    assert_refused(1, words, "calibrate", "--listen", f"tcp/127.0.0.1:{free_port()}", "--wait", "0")

@@ -8,11 +8,7 @@ import contextlib
 import http.client
 import json
 import math
-import os
 import re
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,37 +17,22 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-import zenoh
 
 from service.cli.demo import EVENT_TITLES
 from service.client import RefusedError, UnreachableError
-from service.contract.cdr import decode_pose
-from service.contract.messages import BASE, PoseStamped
+from service.contract.messages import BASE
 from service.trackers.browser_hands import NO_TOKEN
 from sim.scene import HAND_ORIENTATION
 from support import chromium
-from support.cell import Daemon, serving, thirdhand
+from support.cell import Daemon, serving, until
+from support.cell_commands import started
 from support.chromium import Tab
 from support.dragging import Person
-from support.paths import ROOT
+from support.page_hands import Heard
 
 TIMEOUT_S = 90
 MAX_SPEED_M_S = 0.6
 pytestmark = pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
-
-
-class Received:
-    """The poses of hands that a subscriber receives, by side."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self.poses: dict[str, list[PoseStamped]] = {"left": [], "right": []}
-        self._subscriber = session.declare_subscriber("thirdhand/hands/*", self._take)
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        self.poses[str(sample.key_expr).rpartition("/")[2]].append(decode_pose(sample.payload.to_bytes()))
-
-    def newest(self, side: str) -> tuple[float, float, float]:
-        return self.poses[side][-1].position
 
 
 @pytest.fixture(scope="module")
@@ -63,21 +44,12 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 @pytest.fixture(scope="module")
 def url(daemon: Daemon) -> Iterator[str]:
     """The address that `thirdhand hands --mouse` prints; it ends by SIGTERM without an error."""
-    command = [sys.executable, "-m", "service", "hands", "--mouse", "--listen", "127.0.0.1:0"]
-    command += ["--connect", daemon.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as server:
-        clock = threading.Timer(5 * TIMEOUT_S, server.kill)
-        clock.start()
-        try:
-            assert server.stdout is not None
-            assert server.stderr is not None
-            yield server.stdout.readline().strip()
-            server.terminate()
-            assert server.wait(TIMEOUT_S) == 0
-            assert re.search(r"\d+ messages with hands published, \d+ lost, 0 too late", server.stderr.read())
-        finally:
-            clock.cancel()
-            server.kill()
+    arguments = ("hands", "--mouse", "--listen", "127.0.0.1:0", "--connect", daemon.endpoint)
+    with started(*arguments, within_s=5 * TIMEOUT_S) as server:
+        yield server.stdout.readline().strip()
+        server.terminate()
+        assert server.wait(TIMEOUT_S) == 0
+        assert re.search(r"\d+ messages with hands published, \d+ lost, 0 too late", server.stderr.read())
 
 
 @contextlib.contextmanager
@@ -92,31 +64,28 @@ def person_at(
         yield Person(tab)
 
 
-def until_arrived(received: Received, side: str, to: tuple[float, float, float], within_m: float) -> None:
-    end = time.monotonic() + 10
-    while math.dist(received.newest(side), to) > within_m:
-        assert time.monotonic() < end, (received.newest(side), to)
-        time.sleep(0.02)
+def until_arrived(received: Heard, side: str, to: tuple[float, float, float], within_m: float) -> None:
+    until(lambda: math.dist(received.poses[side][-1].position, to) <= within_m, f"the {side} hand is not at {to}")
 
 
 @pytest.mark.thorough
 def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_drawn(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
-    received = Received(daemon.session)
+    received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         status = daemon.until(lambda status: status["mode"] == "follow")
         assert list(status["hands_at_m"]) == ["start", "handover", "glass", "soldering"]
         for i, side in enumerate(("left", "right")):
-            assert math.dist(received.newest(side), status["hands_at_m"]["start"][i]) < 1e-3
+            assert math.dist(received.poses[side][-1].position, status["hands_at_m"]["start"][i]) < 1e-3
         goal = tuple(status["hands_at_m"]["handover"][0])
-        resting, begun = received.newest("right"), len(received.poses["left"])
+        resting, begun = received.poses["right"][-1].position, len(received.poses["left"])
         person.drag("left", goal)
         person.arrive("left", goal)
         person.arrive("left", person.hand("left", "aim"), within_m=1e-4)
         for side in ("left", "right"):
             until_arrived(received, side, person.hand(side), 1e-3)
-        assert received.newest("right") == resting
+        assert received.poses["right"][-1].position == resting
         newest = received.poses["left"][-1]
         assert (newest.frame_id, newest.orientation) == (BASE, HAND_ORIENTATION)
         assert abs(time.time_ns() - newest.stamp_ns) < 1e9
@@ -206,25 +175,25 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
 def test_a_hidden_page_sends_nothing_and_its_hands_wait_where_they_were(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
-    received = Received(daemon.session)
+    received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         daemon.until(lambda status: status["mode"] == "follow")
         person.tab.cover()
         person.tab.until("document.hidden")
         held = daemon.until(lambda status: status["mode"] == "hold")
         assert held["reason"] in ("stale_hand", "no_hands")
-        before, count = received.newest("left"), len(received.poses["left"])
+        before, count = received.poses["left"][-1].position, len(received.poses["left"])
         time.sleep(0.5)
         assert len(received.poses["left"]) == count
         person.tab.uncover()
         person.tab.until("!document.hidden")
         daemon.until(lambda status: status["mode"] == "follow")
-        assert math.dist(received.newest("left"), before) < 1e-3
+        assert math.dist(received.poses["left"][-1].position, before) < 1e-3
     daemon.until(lambda status: status["mode"] == "hold")  # the page was closed
 
 
 def test_fingers_on_a_phone_drag_both_hands_at_once_and_lift_them(daemon: Daemon, url: str, tmp_path: Path) -> None:
-    received = Received(daemon.session)
+    received = Heard(daemon.session)
     with person_at(url, tmp_path, phone=True) as person:
         tab = person.tab
         daemon.until(lambda status: status["mode"] == "follow")
@@ -282,41 +251,21 @@ def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None
         tab.until(f"at('why').textContent === {json.dumps(NO_TOKEN)}")
 
 
-@pytest.mark.thorough
-def test_open_without_a_page_for_a_mouse_is_refused() -> None:
-    done = thirdhand("demo", "--open")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "--mouse needed with it" in done.stderr
-
-
 @pytest.mark.timed
 def test_a_person_plays_the_demo_on_the_page_and_it_is_scored(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "service", "demo", "--mouse", "--rate", "100", "--json"]
-    command += ["--output", str(tmp_path / "out")]
+    arguments = ("demo", "--mouse", "--rate", "100", "--json", "--output", str(tmp_path / "out"))
     errors = tmp_path / "said"
-    with (
-        errors.open("w") as said,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True, cwd=ROOT, env=os.environ) as demo,
-    ):
-        clock = threading.Timer(3 * TIMEOUT_S, demo.kill)
-        clock.start()
-        try:
-            end = time.monotonic() + TIMEOUT_S
-            while not (found := re.search(r"http://\S+", errors.read_text())):
-                assert time.monotonic() < end, errors.read_text()
-                time.sleep(0.1)
-            with person_at(found[0], tmp_path) as person:
-                while not person.tab.ask("!!ended"):
-                    for goal in person.goals():
-                        if math.dist(person.hand(goal.side), goal.at) > 0.01:
-                            person.drag(goal.side, goal.at)
-                            person.arrive(goal.side, goal.at)
-                    time.sleep(0.2)
-                assert "3 of 3 events reached" in person.tab.ask("at('mode').textContent")
-            report = json.loads(demo.communicate(timeout=TIMEOUT_S)[0])
-        finally:
-            clock.cancel()
-            demo.kill()
+    with errors.open("w") as said, started(*arguments, within_s=3 * TIMEOUT_S, stderr=said) as demo:
+        found = until(lambda: re.search(r"http://\S+", errors.read_text()), "it names no page", within_s=TIMEOUT_S)
+        with person_at(found[0], tmp_path) as person:
+            while not person.tab.ask("!!ended"):
+                for goal in person.goals():
+                    if math.dist(person.hand(goal.side), goal.at) > 0.01:
+                        person.drag(goal.side, goal.at)
+                        person.arrive(goal.side, goal.at)
+                time.sleep(0.2)
+            assert "3 of 3 events reached" in person.tab.ask("at('mode').textContent")
+        report = json.loads(demo.communicate(timeout=TIMEOUT_S)[0])
     assert demo.returncode == 0, errors.read_text()
     assert report["success"]
     for name in EVENT_TITLES:

@@ -42,6 +42,7 @@ from service.trackers.capture import (
 )
 from sim.scene import Scene
 from sim.teach import perform
+from support.cell import until
 from support.paths import ROOT
 
 SETTINGS = Settings(
@@ -59,11 +60,12 @@ def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
 
 def heard(taken: Capture, count: int) -> None:
     """Waits until so many messages came."""
-    end = time.monotonic() + 10
-    while sum(map(len, taken.samples.values())) + sum(taken.malformed.values()) < count:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+
+    def is_complete() -> bool:
         taken.collect()
+        return sum(map(len, taken.samples.values())) + sum(taken.malformed.values()) >= count
+
+    until(is_complete)
 
 
 def test_a_take_holds_what_came_and_the_tool_by_the_joints(
@@ -72,10 +74,8 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     hearing, told = sessions
     taken, joints = Capture(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
     publishers = {key: told.declare_publisher(f"bench/{key}") for key in taken.samples}
-    end, sent = time.monotonic() + 10, []
-    while not all(publisher.matching_status.matching for publisher in publishers.values()):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: all(publisher.matching_status.matching for publisher in publishers.values()))
+    sent = []
     for i in range(30):
         stamp = 10**18 + i * 10_000_000
         for side, y in (("left", -300.0), ("right", 300.0)):
@@ -315,53 +315,19 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert not uncut(path).exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        ([], 2, "either the name of a take or --list needed"),
-        (["a", "--list"], 2, "either the name of a take or --list needed"),
-        (["--list", "--folder", "nofolder"], 1, "nofolder does not exist: a folder of takes needed (--folder)"),
-        (["../a", "--show"], 2, "accepted as a take's name"),
-        (["a", "--delete"], 1, "no take 'a' in "),
-        (["there"], 1, "exists already: give another name, or --delete it first"),
-        (["a", "--plot", "a.jpg"], 2, "a.jpg: a name that ends in .png needed, like a.png"),
-        (["a", "--trim", "3", "1"], 2, "needed, the first below the second"),
-        (["a", "--places", "PLACES"], 1, "points, entry 2, name: 'glass' given twice, names once each needed"),
-        (["a", "--connect", "tcp/127.0.0.1:1"], 1, "Without a daemon, use --listen tcp/127.0.0.1:7447"),
-    ],
-)
-def test_what_cannot_be_meant_is_said(
-    tmp_path: Path, arguments: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "there.mcap").write_bytes(b"")
-    glass = {"name": "glass", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0]}
-    (tmp_path / "places.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
-    arguments = [str(tmp_path / "places.json") if one == "PLACES" else one for one in arguments]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli.record.CONNECT_TIMEOUT_S", 0.2)
-        folder = [] if "--folder" in arguments else ["--folder", str(tmp_path)]
-        assert main(["record", *arguments, *folder]) == code
-    assert words in capsys.readouterr().err
-
-
-def test_a_time_out_of_its_range_is_refused_by_the_parser(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(["record", "a", "--rest", "nan"])
-    assert "--rest: nan given, 0.2 to 60 s needed" in capsys.readouterr().err
-
-
 def test_hands_are_passed_on_by_a_daemons_session(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
     """Whoever takes a demonstration as a client of a daemon hears what another client publishes."""
     daemon, tracker = sessions
     with open_session(connect=endpoints(daemon), more={"mode": "client"}) as client:
         taken = Capture(client, "bench", SETTINGS)
         publisher = tracker.declare_publisher(channels.key("bench", "hands/left"))
-        end = time.monotonic() + 10
-        while not taken.samples["hands/left"]:
-            assert time.monotonic() < end
+
+        def is_heard() -> bool:
             publisher.put(cdr.encode_pose(PoseStamped(1, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
-            time.sleep(0.02)
             taken.collect()
+            return bool(taken.samples["hands/left"])
+
+        until(is_heard)
         taken.close()
 
 

@@ -1,0 +1,35 @@
+"""Parts of a daemon that fail when a test wants them to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+# A part fails while a file of its name is in the folder, or "once" if that is what the file says.
+SABOTAGE = """
+import pathlib
+from service.core import controller
+from service.daemon import daemon
+from service.daemon import queryables
+
+def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
+    honest = getattr(owner, name)
+    def method(*arguments, **more):
+        if (mark := folder / name).exists():
+            if mark.read_text() == "once":
+                mark.unlink()
+            raise RuntimeError(f"{{name}} is sabotaged")
+        return honest(*arguments, **more)
+    setattr(owner, name, method)
+
+sabotaged(daemon.CellStatus, "status")
+sabotaged(controller.Controller, "step")
+sabotaged(daemon, "outgoing")
+sabotaged(queryables.RequestQueue, "enqueue")
+sabotaged(daemon.Daemon, "note")
+"""
+
+
+def fail(folder: Path, part: str, how: str = "always") -> None:
+    """Have a part of a sabotaged daemon fail from now on, or once."""
+    (folder / "mark").write_text(how)
+    (folder / "mark").rename(folder / part)
