@@ -70,7 +70,8 @@ def test_the_tutorial_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path))
+    for kind in ("STATE", "CONFIG"):  # another HOME would have another cache, and compile
+        monkeypatch.setenv(f"XDG_{kind}_HOME", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     shell = Shell()
     try:
