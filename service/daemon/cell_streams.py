@@ -6,6 +6,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time 
 TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
 EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
 LEAP_STEPS = 5.0  # a hand that was lost appears this many steps away; one that rested goes on from where it was
-STEP_SHARE = 0.02  # of a new step in the mean: over 50 samples
+SMOOTH_SHARE = 0.05  # of the median step: with noise, one step in 10 000 is as small
 LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
@@ -108,13 +109,13 @@ class Arrivals:
 class FrozenHand:
     """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
 
-    A program's hands rest exactly: if most rests so far ended without a leap, repeated poses are
-    accepted, as `learn` does in takes.
+    A program's hands rest exactly: repeated poses are accepted if the hand came to rest smoothly,
+    or if most rests so far ended without a leap, as `learn` does in takes.
     """
 
     def __init__(self) -> None:
         self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
-        self._step = 0.0  # mean distance between poses that differ, in the tracker's unit
+        self._steps: deque[float] = deque(maxlen=50)  # distances between poses that differ, in the tracker's unit
         self._repeated_ns = 0  # stamp of its newest repetition
         self._varies_since_ns = 0  # stamp since which each sample differs from the one before
         self._is_tracked = False
@@ -128,14 +129,15 @@ class FrozenHand:
         elif (pose.position, pose.orientation) == (before.position, before.orientation):
             self._repeated_ns = self._varies_since_ns = pose.stamp_ns
             lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
-            return self._is_tracked and lasts_s >= FROZEN_S and 2 * self._leaps >= self._rests
+            if not self._is_tracked or lasts_s < FROZEN_S or 2 * self._leaps < self._rests:
+                return False
+            return self._steps[-1] > SMOOTH_SHARE * median(self._steps)
         else:
             step = math.dist(pose.position, before.position)
-            if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
+            if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S and self._steps:
                 self._rests += 1
-                self._leaps += step > LEAP_STEPS * self._step
-            elif math.isfinite(step):
-                self._step += STEP_SHARE * (step - self._step)
+                self._leaps += step > LEAP_STEPS * median(self._steps)
+            self._steps.append(step)
             self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)  # its clock may be set back
             self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
         self._pose = pose

@@ -63,6 +63,10 @@ def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
     for begins_at_rest in (True, False):
         assert not len(refused(np.concatenate([*program(rate_hz, begins_at_rest=begins_at_rest)]), rate_hz))
     assert not len(refused(np.tile(LEFT, (1000, 1)), rate_hz))
+    share = np.linspace(0.0, 1.0, round(3 * rate_hz))
+    along = 0.4 * (10 * share**3 - 15 * share**4 + 6 * share**5)  # with the least jerk, and no rest before
+    stop = np.concatenate([along[1:], np.full(round(2 * rate_hz), along[-1])])
+    assert not len(refused(np.outer(stop, (1.0, 0.5, 0.0)), rate_hz))
 
 
 def test_noise_is_never_frozen() -> None:
