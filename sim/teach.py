@@ -40,7 +40,6 @@ TEACH_EXAMPLE = """example:
   thirdhand learn demonstrations/demonstration-*.mcap --output soldering.npz
 """
 REST_BEFORE_S = 0.5  # rest before a published demonstration
-UNREPEATED_M = 1e-9  # a tracker measures no pose twice, bit for bit, also of hands that rest
 REST_AFTER_S = 3.0  # rest after a published demonstration
 TRAY = (0.95, -0.15, 0.12)  # [m] the left hand visits this place twice
 RIGHT_REST = (0.95, 0.35, 0.07)  # [m] the right hand rests here
@@ -187,7 +186,6 @@ def publish(
             stamp_ns = time.time_ns()
             for publisher, pose in zip(publishers, poses(t), strict=True):
                 row = pose.tolist()
-                row[0] += UNREPEATED_M * (step % 2)
                 publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))))
             step += 1
             time.sleep(max(0.0, begin - before_s + step / rate_hz - time.monotonic()))

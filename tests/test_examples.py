@@ -53,7 +53,7 @@ def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, caps
                 break
         received = daemon.client.status().received
     assert ended.keys() == modules.keys()
-    assert received.keys() == {"hands/left", "hands/right", "joints/state", "joints/guided"}
+    assert received.keys() == {"hands/left", "hands/right", "joints/state", "joints/guided", "objects"}
     assert "thirdhand: follow" in said
     assert "commands arrive, at tick " in said
     assert "were none of this arm's" not in said

@@ -43,7 +43,7 @@ class Fed:
         self.view.is_paused = False
         self.last = 0
         until = time.monotonic() + TIMEOUT_S
-        while self.view.url is None:
+        while not self.view.url:
             assert time.monotonic() < until
             time.sleep(0.01)
         self.url, self._ticks = self.view.url, ticks(1_000_000)
