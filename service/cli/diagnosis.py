@@ -13,8 +13,8 @@ import msgspec
 
 from service.cli.status import AHEAD_MS, disk, hours_until_full
 from service.contract.channels import BY_KEY, key
-from service.contract.evidence import Evidence, explained, lasting, two_places
-from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, what_to_do, word
+from service.contract.evidence import Evidence, explained, lasting, two_places, unit_advice
+from service.contract.incidents import SOURCE_NAMES, Condition, in_brief, input_name, what_to_do, word
 from service.contract.messages import Vector3
 from service.contract.records import SIDES, Cause, Reason
 from service.contract.requests import Source, Status
@@ -228,7 +228,7 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
-    source, what = now.inputs[name], SOURCE_NAMES.get(name, name)
+    source, what = now.inputs[name], input_name(name)
     seconds = max((now.time_ns - before.time_ns) / 1e9, 0.1)
     earlier, arriving_hz = before.inputs.get(name, Source()).rejected, max(source.rate_hz, 1.0)
     rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
@@ -253,7 +253,7 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
 def _unit_advice(source: Source) -> str:
     """The remedy if the rejected samples seem to be in another unit; empty otherwise."""
     if source.unit and source.cause in ("", word(Cause.OUT_OF_RANGE)):
-        return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{source.unit}"'
+        return unit_advice(source.unit)
     return ""
 
 

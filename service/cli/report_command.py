@@ -73,19 +73,22 @@ def report(args: argparse.Namespace) -> int:
 def _report_many(args: argparse.Namespace) -> int:
     """Report on more recordings than anyone reads one by one: a row for each, and totals."""
     recordings = [one for _, one in of_each(args, "reading", overview)]
+    if not recordings:
+        return 1
     console = plain_console()
-    for table in overviews(recordings) if recordings else ():
+    shown = [*overviews(recordings)]
+    for table in shown:
         print_table(console, table)
-    if args.csv and recordings:
+    if args.csv:
         args.csv.mkdir(parents=True, exist_ok=True)
-        for table in (*overviews(recordings), every_figure(recordings)):
+        for table in (*shown, every_figure(recordings)):
             _write(args.csv / f"{table.name}.csv", table)
         console.print(Text(printable(f"tables in {args.csv}")))
-    if args.html and recordings:
+    if args.html:
         from service.report.page import page_of_many  # its import is slow
 
         with whole(args.html) as part:
-            part.write_text(page_of_many(recordings), encoding="utf-8")
+            part.write_text(page_of_many(shown), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
     return 0 if len(recordings) == len(args.files) else 1
 

@@ -18,7 +18,7 @@ from service.cli.usage import reached
 from service.client import Client, UnreachableError, decoded, why_silent
 from service.contract import channels
 from service.contract.evidence import lasting
-from service.contract.incidents import SOURCE_NAMES, in_brief, what_happened, what_to_do, word
+from service.contract.incidents import SOURCE_NAMES, in_brief, input_name, what_happened, what_to_do, word
 from service.contract.records import SIDES, Flag
 from service.contract.requests import Source, Status
 from service.process import interrupt
@@ -253,4 +253,4 @@ def _turned(now: Status) -> str:
 def _rejected(name: str, source: Source) -> str:
     newest = f" (newest as {source.cause}: {source.refused})" if source.refused else ""
     counts = ", ".join(f"{count} {cause}" for cause, count in source.rejected.items())
-    return f"{SOURCE_NAMES.get(name, name)} {counts}{newest}"
+    return f"{input_name(name)} {counts}{newest}"

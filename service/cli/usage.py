@@ -152,9 +152,9 @@ def reached(args: argparse.Namespace, timeout_s: float | None = CONNECT_TIMEOUT_
     return reaching(args).session(timeout_s=timeout_s, at_once=timeout_s is not None)
 
 
-def inputs_session(args: argparse.Namespace, timeout_s: float, settings: Settings | None = None) -> zenoh.Session:
-    """A session that receives what trackers and arm publish: a client of the daemon or router, or
-    with --listen one to which they connect. Raises UnreachableError.
+def inputs_session(args: argparse.Namespace, timeout_s: float, settings: Settings) -> zenoh.Session:
+    """A session that receives what trackers and arm publish: a client of the cell's daemon or of a
+    router, or with --listen one to which they connect. Raises UnreachableError.
     """
     listen = [args.listen] if args.listen else []
     reach = reaching(args, settings)

@@ -132,7 +132,7 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
                 closer = what_to_do(Condition.DELAYED)
         case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
             found = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"
-            closer = f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{unit}"'
+            closer = unit_advice(unit)
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
             found = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
             if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:
@@ -226,8 +226,12 @@ def _unseen(seen: Evidence) -> str:
 
 def _unit_of_all(seen: Evidence) -> str:
     """The unit in which the positions of all hands that arrive seem to be; empty otherwise."""
-    units = {source.unit for name, source in seen.sources.items() if name in SIDES and source.rate_hz}
+    units = {hand.unit for hand in _hands(seen) if hand.rate_hz}
     return units.pop() if len(units) == 1 else ""
+
+
+def _hands(seen: Evidence) -> list[Source]:
+    return [seen.sources[side] for side in SIDES if side in seen.sources]
 
 
 def _jumps(seen: Evidence, side: str) -> bool:
@@ -247,6 +251,11 @@ def _contest(seen: Evidence) -> str:
             return ""
         what = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis, {seen.scatter_mm:.0f} accepted"
     return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
+
+
+def unit_advice(unit: str) -> str:
+    """The remedy for positions that seem to be in another unit than that of the settings."""
+    return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{unit}"'
 
 
 def two_places(source: Source) -> str:
@@ -342,8 +351,7 @@ def _is_of_a_busy_machine(reason: Reason, seen: Evidence) -> bool:
     """True if a busy machine may have caused the reason, and nothing closer did."""
     if reason not in OF_A_BUSY_MACHINE or (reason is Reason.ARM_ERROR and _contradiction(seen)):
         return False
-    sources = [seen.sources[name] for name in OF_A_BUSY_MACHINE[reason] if name in seen.sources]
-    if reason is Reason.STALE_HAND and any(source.fresh or source.batches_ms for source in sources):
+    if reason is Reason.STALE_HAND and any(hand.fresh or hand.batches_ms for hand in _hands(seen)):
         return False  # a machine that is late is late with both hands
     return not _rejected_remedy(seen, *OF_A_BUSY_MACHINE[reason])
 

@@ -322,6 +322,11 @@ if missing := {word(member) for kind in (Mode, Reason, Flag, Cause, Condition) f
     raise NotImplementedError(f"no incident is described for {', '.join(sorted(missing))}")
 
 
+def input_name(key: str) -> str:
+    """The name of a hand or of the arm for people; of any other input, its key."""
+    return SOURCE_NAMES.get(key, key)
+
+
 def title(named: str) -> str:
     """The title of what a word stands for; empty for any other word."""
     return BY_WORD[named].title if named in BY_WORD else ""

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
-from service.contract.incidents import MALFORMED, SOURCE_NAMES, Condition, in_full, what_to_do, word
+from service.contract.incidents import MALFORMED, Condition, in_full, input_name, what_to_do, word
 from service.contract.joint_states import measured
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
@@ -171,7 +171,7 @@ class InputMonitor:
         """Lines for the log: the first rejection of each cause at once, then counts."""
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
-            history, name = self._histories[source], SOURCE_NAMES.get(source, source)
+            history, name = self._histories[source], input_name(source)
             logged, found = history.logged, history.found
             if now.apart_mm and not history.is_apart_logged:
                 history.is_apart_logged = True

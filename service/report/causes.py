@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from service.contract.evidence import Evidence, Explanation, explained
-from service.contract.incidents import ORDERS, SOURCE_NAMES, word
+from service.contract.incidents import ORDERS, input_name, word
 from service.contract.records import SIDES, Cause, Flag, Mode, Reason
 from service.contract.requests import Source
 from service.report.columns import Columns
@@ -64,7 +64,7 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
     if rejected := ", ".join(f"{more[cause]} {word(cause)}" for cause in Cause if more[cause] > 0):
         yield f"rejected in the second before: {rejected}"
     for name, cause, refused in _refused(columns, int(frames["tick"][first]), tick):
-        yield f"{SOURCE_NAMES.get(name, name)}: rejected as {cause}: {refused}"
+        yield f"{input_name(name)}: rejected as {cause}: {refused}"
     timing = columns.timing[(columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)]
     if len(timing):
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from service.contract.printable import printable
 from service.contract.records import SIDES, Mode
 from service.core.frame import Vector
-from service.report.report import Overview, Report
-from service.report.tables import Table, comparison, names_of, overviews, summary, tables
+from service.report.report import Report
+from service.report.tables import Table, comparison, names_of, summary, tables
 from service.settings import palette
 
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
@@ -61,10 +61,10 @@ def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda 
     return _document(title, parts)
 
 
-def page_of_many(recordings: Sequence[Overview]) -> str:
-    """The page on many recordings, as HTML: a row for each, and totals."""
-    title = f"Report on {len(recordings)} recordings"
-    return _document(title, [f"<h1>{title}</h1>", *map(_table, overviews(recordings))])
+def page_of_many(shown: Sequence[Table]) -> str:
+    """The page on many recordings, as HTML, with the tables of their overviews."""
+    title = f"Report on {len(shown[0].rows)} recordings"
+    return _document(title, [f"<h1>{title}</h1>", *map(_table, shown)])
 
 
 def _document(title: str, parts: Sequence[str]) -> str:

@@ -122,27 +122,26 @@ class Figure(NamedTuple):
 
 
 class Overview(NamedTuple):
-    """What a table of many recordings needs of one: its figures, without its ticks."""
+    """One recording among many: its figures by their names, without its ticks."""
 
     path: Path
     cell: str
     week: str  # of its begin, by ISO 8601: 2026-W48
     begins: str
-    lasts_s: float
-    figures: tuple[Figure, ...]
+    figures: Mapping[str, Figure]
 
     def value(self, name: str) -> float:
         """A figure's value; 0 if it is not known."""
-        return next((figure.value or 0.0 for figure in self.figures if figure.name == name), 0.0)
+        return self.figures[name].value or 0.0
 
     @property
     def holds_s(self) -> dict[str, float]:
         """Time in holds [s] by reason, without those that did not occur."""
         start = f"{word(Mode.HOLD)}: "
         return {
-            figure.name.removeprefix(start): figure.value
-            for figure in self.figures
-            if figure.name.startswith(start) and figure.value
+            name.removeprefix(start): figure.value
+            for name, figure in self.figures.items()
+            if name.startswith(start) and figure.value
         }
 
 
@@ -154,9 +153,10 @@ class Report:
         following = frames[frames["mode"] == Mode.FOLLOW]
         sent = frames[frames["commanded"] > 0]
         lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
-        begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC)  # by the system clock
         self.path, self.columns = recording.path, columns
-        self.begins = begins if len(frames) else "never: it holds no tick"  # by the system clock
+        self.begins = begins.strftime("%Y-%m-%d %H:%M:%S UTC") if len(frames) else "never: it holds no tick"
+        self.week = begins.strftime("%G-W%V") if len(frames) else "never"
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
         self.offer = offer_of(columns.skills[-1].skill) if columns.skills else ""  # of its last skill
         self.lasts_s = lasts_s
@@ -199,11 +199,9 @@ class Report:
         return min((p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None)
 
     def overview(self) -> Overview:
-        """What a table of many recordings needs of this one."""
-        begins = datetime.fromtimestamp(self.columns.start_ns / 1e9, tz=UTC)
-        week = begins.strftime("%G-W%V") if len(self.columns.frames) else "never"
+        """The figures of this recording, and where they belong among those of many."""
         cell = self.columns.recording.settings.cell
-        return Overview(Path(self.path), cell, week, self.begins, self.lasts_s, tuple(self.figures()))
+        return Overview(Path(self.path), cell, self.week, self.begins, {one.name: one for one in self.figures()})
 
     def figures(self) -> Iterator[Figure]:
         """The numbers for a comparison of recordings."""

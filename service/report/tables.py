@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -235,19 +235,17 @@ def comparison(reports: Sequence[Report]) -> Iterator[Table]:
         return
     one, other = reports
     names = names_of([one.path, other.path])
-    yield side_by_side(names, list(one.figures()), list(other.figures()))
+    yield side_by_side(names, one.overview().figures, other.overview().figures)
     settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(one, other))
     if settings:
         yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
 
 
-def side_by_side(names: Sequence[str], one: Sequence[Figure], other: Sequence[Figure]) -> Table:
+def side_by_side(names: Sequence[str], one: Mapping[str, Figure], other: Mapping[str, Figure]) -> Table:
     """Figures of two recordings and their differences, without those that are 0 in both."""
-    first = {figure.name: figure for figure in one}
-    second = {figure.name: figure for figure in other}
     rows = []
-    for name, known in (second | first).items():
-        values = [figures[name].value if name in figures else None for figures in (first, second)]
+    for name, known in {**other, **one}.items():
+        values = [figures[name].value if name in figures else None for figures in (one, other)]
         if any(values):
             row = (_with_unit(known), *(_value(known, value) for value in values))
             rows.append((*row, _difference(known, *values)))
@@ -259,11 +257,12 @@ def overviews(recordings: Sequence[Overview]) -> Iterator[Table]:
     rows = []
     names = names_of([one.path for one in recordings])
     for name, one in zip(names, recordings, strict=True):
-        followed = _share(one.value("follow"), one.lasts_s)
+        lasts_s = one.value("duration")
+        followed = _share(one.value("follow"), lasts_s)
         held = f"{sum(one.holds_s.values()):.1f}"
-        of = {figure.name: figure for figure in one.figures}
-        others = [_value(of[shown], of[shown].value) for shown in IN_A_ROW]
-        rows.append((name, f"{one.lasts_s:.1f}", followed, held, *others))
+        figures = [one.figures[shown] for shown in IN_A_ROW]
+        others = [_value(figure, figure.value) for figure in figures]
+        rows.append((name, f"{lasts_s:.1f}", followed, held, *others))
     heads = ("recording", "for [s]", "follow [%]", "hold [s]", *IN_A_ROW.values())
     yield Table("recordings", "Recordings", heads, tuple(rows))
     yield _totals(recordings)
@@ -276,7 +275,7 @@ def _totals(recordings: Sequence[Overview]) -> Table:
         groups.setdefault((one.cell, one.week), []).append(one)
     rows = []
     for (cell, week), those in sorted(groups.items()):
-        lasts_s = sum(one.lasts_s for one in those)
+        lasts_s = sum(one.value("duration") for one in those)
         followed_s = sum(one.value("follow") for one in those)
         faults = sum(one.value("faults") for one in those)
         held_s: Counter[str] = Counter()
@@ -291,11 +290,10 @@ def _totals(recordings: Sequence[Overview]) -> Table:
 
 def every_figure(recordings: Sequence[Overview]) -> Table:
     """A row for each recording with all its figures."""
-    known = {figure.name: figure for one in recordings for figure in one.figures}
+    known = {name: figure for one in recordings for name, figure in one.figures.items()}
     rows = []
     for one in recordings:
-        of = {figure.name: figure for figure in one.figures}
-        values = (_value(known[name], of[name].value if name in of else None) for name in known)
+        values = (_value(known[name], one.figures[name].value if name in one.figures else None) for name in known)
         rows.append((str(one.path), one.cell, one.week, one.begins, *values))
     heads = ("recording", "cell", "week", "begins", *map(_with_unit, known.values()))
     return Table("figures", "All figures", heads, tuple(rows), numbers=4)

@@ -328,8 +328,8 @@ def lead(
     show: Callable[[str], None],
     warn: Callable[[str], None],
 ) -> str:
-    """Collect while the tool is led; return the reason for the end. `warn` is told when a stream
-    ends or continues, `show` how far it is.
+    """Collect while the tool is led; return the reason for the end. `show` receives the progress,
+    `warn` a message when a stream ends or continues.
 
     It ends once the accuracy is half of `accept_m`, after LED_S once it is accepted, when
     `is_ended`, or after `longest_s`.
@@ -341,8 +341,8 @@ def lead(
         live.collect()
         if is_ended():
             return "ended by the operator"
-        if live.ended != ended:
-            ended = live.ended
+        before, ended = ended, live.ended
+        if ended != before:
             warn(f"{' and '.join(ended)} no longer arrives" if ended else "all streams arrive again")
         if now_s - shown_s < SHOW_EVERY_S:
             continue
