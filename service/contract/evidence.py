@@ -128,7 +128,7 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
             found, closer = _unseen(seen), _rejected_remedy(seen, *SIDES)
             if not closer and reason is Reason.STALE_HAND and any(_rate_too_low(seen, side) for side in SIDES):
                 closer = what_to_do(Condition.HANDS_TOO_RARE)
-            elif any(source.batches_ms for source in seen.sources.values()):
+            elif not closer and any(hand.batches_ms for hand in _hands(seen)):
                 closer = what_to_do(Condition.DELAYED)
         case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
             found = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.contract.evidence import explained
+from service.contract.evidence import Evidence, explained
+from service.contract.incidents import what_to_do
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
-from service.contract.records import Cause
-from service.contract.requests import Percentiles, Status
+from service.contract.records import Cause, Reason
+from service.contract.requests import Percentiles, Source, Status
 from service.core.controller import Controller
 from service.core.frame import Event, Frame, Tick, blank, frame_layout
 from service.core.intake import KEPT
@@ -357,6 +358,12 @@ def test_a_hand_that_jumps_away_is_explained_by_its_tracker(skill: Skill) -> Non
     assert (told.mode, told.reason) == ("hold", "far_from_demonstrations")
     assert told.because.startswith("the left hand jumped in the last second; ")
     assert told.remedy.startswith("look for reflections")
+
+
+def test_what_is_rejected_in_batches_is_told_the_remedy_of_its_rejection() -> None:
+    refused = Source(rate_hz=60.0, age_ms=300.0, cause="wrong_frame", refused="frame 'camera'", batches_ms=200.0)
+    remedy = explained(Reason.STALE_HAND, Evidence(sources={"left": refused})).what_to_do
+    assert remedy == what_to_do("wrong_frame")
 
 
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
