@@ -27,7 +27,7 @@ _SETTING = re.compile(r"\{(\w+)\.(\w+) (\S+)\}")
 # Incidents that are no reason, flag or cause: findings of `doctor`, and closer causes of others.
 Condition = enum.StrEnum(
     "Condition",
-    "MALFORMED CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
+    "MALFORMED FROZEN CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
     "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL PORT_CLOSED NO_WAY "
@@ -243,6 +243,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.MALFORMED, None, "malformed",
             "bytes that are not the message of their key; they are counted by key",
             "publish the type and encoding that docs/wire.md lists for the key"),
+        Incident(Condition.FROZEN, None, "hand frozen",
+            "the pose of a hand was the same, bit for bit, for 0.5 s while its stamps went on: its tracker has lost it",
+            "bring the hand into the tracker's view; it is accepted again as soon as its pose changes"),
         Incident(Condition.CLOCK_STEPPED, None, "clock stepped",
             "the source's clock was set, ahead or back",
             "correct the publisher's clock; samples are accepted again after the source was silent"),
@@ -317,6 +320,7 @@ def word(member: Member) -> str:
 
 
 MALFORMED = word(Condition.MALFORMED)
+FROZEN = word(Condition.FROZEN)
 BY_WORD = {word(row.member): row for rows in INCIDENTS.values() for row in rows}
 if missing := {word(member) for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind} - {"", *BY_WORD}:
     raise NotImplementedError(f"no incident is described for {', '.join(sorted(missing))}")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from service.client import publisher
 from service.contract import cdr, channels, ros2
 from service.contract.joint_states import JointStates
 from service.contract.messages import JointState, PoseStamped, WireError
+from service.contract.records import SIDES
 from service.core.frame import Event, Frame, Record
 from service.daemon.ros2_domain import Ros2Domain
 from service.settings.config import Settings
@@ -22,6 +25,11 @@ from service.settings.config import Settings
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
+TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
+EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
+LEAP_STEPS = 5.0  # a hand that was lost appears this many steps away; one that rested goes on from where it was
+SMOOTH_SHARE = 0.05  # of the median step: with noise, one step in 10 000 is as small
 LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
 ARM_STATE = "joints/state"
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
@@ -39,11 +47,11 @@ MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all n
 class Arrivals:
     """Statistics of the messages received on one channel. The loop writes, other threads read."""
 
-    __slots__ = ("_delays", "at_ns", "count", "malformed", "newest", "why")
+    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "why")
 
     def __init__(self) -> None:
         self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, arrival - stamp [ns]
-        self.count = self.malformed = self.at_ns = 0
+        self.count = self.malformed = self.frozen = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
 
@@ -98,6 +106,45 @@ class Arrivals:
         self.malformed += 1
 
 
+class FrozenHand:
+    """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
+
+    A program's hands rest exactly: repeated poses are accepted if the hand came to rest smoothly,
+    or if most rests so far began with its stream or ended without a leap, as `learn` does in takes.
+    """
+
+    def __init__(self) -> None:
+        self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
+        self._steps: deque[float] = deque(maxlen=50)  # distances between poses that differ, in the tracker's unit
+        self._repeated_ns = 0  # stamp of its newest repetition
+        self._varies_since_ns = 0  # stamp since which each sample differs from the one before
+        self._is_tracked = False
+        self._rests = self._leaps = 0
+
+    def is_frozen(self, pose: PoseStamped) -> bool:
+        """True if a sample repeats the pose of a lost hand."""
+        before = self._pose
+        if before is None:
+            self._varies_since_ns = pose.stamp_ns
+        elif (pose.position, pose.orientation) == (before.position, before.orientation):
+            self._repeated_ns = self._varies_since_ns = pose.stamp_ns
+            lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
+            if not self._is_tracked or lasts_s < FROZEN_S or 2 * self._leaps < self._rests:
+                return False
+            return self._steps[-1] > SMOOTH_SHARE * median(self._steps)
+        else:
+            step = math.dist(pose.position, before.position)
+            if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
+                self._rests += 1
+                self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
+            self._steps.append(step)
+            self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)  # its clock may be set back
+            self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
+        self._pose = pose
+        self._repeated_ns = pose.stamp_ns
+        return False
+
+
 class CellStreams:
     """A cell's subscribers and publishers, also in the ROS 2 domain if its settings name one.
 
@@ -116,6 +163,7 @@ class CellStreams:
         cell, domain = settings.cell, settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
+        self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [channel.key for channel in heard(settings)]
         keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
@@ -187,8 +235,12 @@ class CellStreams:
                     return None
                 if state is not message:
                     message, payload = state, cdr.encode_joints(state)
-            event = self.newest[suffix] = Event(suffix, payload, message)
             arrivals.take(message, at_ns)
+            hand = self._frozen.get(suffix)
+            if hand and hand.is_frozen(message):
+                arrivals.frozen += 1
+                return None
+            event = self.newest[suffix] = Event(suffix, payload, message)
             return event
         except WireError as error:
             arrivals.refuse(str(error))

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from service.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
-from service.contract.incidents import MALFORMED, Condition, in_full, input_name, what_to_do, word
+from service.contract.incidents import FROZEN, MALFORMED, Condition, in_full, input_name, what_to_do, word
 from service.contract.joint_states import measured
 from service.contract.messages import JointState, PoseStamped, WireError
 from service.contract.records import SOURCES, Cause
@@ -92,12 +92,15 @@ class InputMonitor:
         while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
             history.clocks.popleft()
         since_s, before = history.counts[0]
-        rejected = {MALFORMED: arrivals.malformed} if arrivals.malformed else {}
+        counted = {MALFORMED: arrivals.malformed, FROZEN: arrivals.frozen}
+        rejected = {cause: count for cause, count in counted.items() if count}
         if intake is not None:
             counts = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
             rejected = {word(cause): int(n) for cause, n in counts if n} | rejected
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
-            if cause == MALFORMED or intake is None:
+            if cause == FROZEN:
+                history.found[cause] = explained(Condition.FROZEN)
+            elif cause == MALFORMED or intake is None:
                 history.found[cause] = explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
             else:
                 refused = intake.refused[name, Cause[cause.upper()]]

@@ -293,6 +293,19 @@ def test_jumping_and_noisy_hands_never_make_a_command_outside_the_limits_nor_a_f
     assert (seen["flags"] & Flag.SPEED_LIMITED).any()
 
 
+@pytest.mark.parametrize("wrong_s", [0.05, 0.08])
+@pytest.mark.parametrize("jump_m", [0.25, 0.3, 0.5])
+def test_hands_that_jump_again_and_again_hold_once(taught: Skill, jump_m: float, wrong_s: float) -> None:
+    hands = np.tile((LEFT, RIGHT), (4000, 1, 1))
+    time_s = np.arange(len(hands)) * PERIOD_S
+    is_jumped = (time_s > 2.0) & (time_s < 4.0) & (time_s % 0.2 < wrong_s)
+    hands[is_jumped, 0, 0] += jump_m
+    hands += np.random.default_rng(4).normal(0, 3e-4, hands.shape)
+    seen = followed(taught, led(hands, every=5))
+    assert modes(seen).count(("hold", "far_from_demonstrations")) == 1
+    assert (seen["reason"] != Reason.FAR_FROM_DEMONSTRATIONS)[2200:].all()
+
+
 def test_an_unsure_skill_is_told_by_a_flag_and_moves_the_arm_as_a_sure_one_does(taught: Skill) -> None:
     ticks = list(ticks_of(HandScript(Scene(), seed=5)))[:1500]
     skills = [replace(taught, regions=Regions(scale)) for scale in (1e-4, 1e4)]

@@ -40,6 +40,7 @@ class Decision:
             # The time that a joint needs for 100 times the distance at which a way may begin.
             way_timeout_s=100.0 * tuning.intake.joint_jump_rad / speeds_of_ways(settings)[1],
             end_share=tuning.intake.end_share,
+            jumpy_s=tuning.intake.hand_still_s,  # a hand that comes to rest after a jump does so within this time
             too_fast_s=1.5 * tuning.intake.confirmed_s,  # one late command is shorter
             **tuning.decision._asdict(),
             freed_share=3.0 * tuning.decision.progress_share,  # more than chance

@@ -99,7 +99,7 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
       follow yet.
     * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share
-      threshold.
+      threshold, or a hand has jumped within the last jumpy_s.
     * AMBIGUOUS: the stage of the task is not known.
     """
     state = states[0]
@@ -118,8 +118,14 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
         return NO_HANDS if unseen else STALE_HAND
     if conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
         return STALE_HAND
-    ease = parameters[0].end_share if state.reason == FAR else 1.0
-    return FAR if gate_m > ease * threshold else AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
+    if gate_m > threshold:
+        return FAR
+    if state.reason == FAR:
+        jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
+        is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
+        if is_jumpy or gate_m > parameters[0].end_share * threshold:
+            return FAR
+    return AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
 
 
 @compiled
