@@ -10,14 +10,14 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-import sim.__main__
-from service.cli import main
+import thirdhand_sim.__main__
+from thirdhand import command_line as main
 
 PAGE = Path(__file__).with_name("command-line.md")
 REACH = "how the daemon is reached"  # title of the group of options that most commands share
 HEAD = """# The command line
 
-<!-- Written by `python docs/command_line_page.py` from service/cli/main.py: change it there. -->
+<!-- Written by `python docs/command_line_page.py` from service/thirdhand/command_line.py: change it there. -->
 
 Every command of `thirdhand`, with all its options. `thirdhand COMMAND --help` prints the same text.
 
@@ -40,7 +40,7 @@ the environment variable, else from the file `~/.config/thirdhand/client.toml`
 def page() -> str:
     """The text of the page."""
     top = main.parser()
-    commands = _subparsers(top) | {"sim": sim.__main__.parser()}
+    commands = _subparsers(top) | {"sim": thirdhand_sim.__main__.parser()}
     parts = [HEAD]
     for title, names in main.GROUPS.items():
         parts.append(f"| {title} | {', '.join(f'[`{name}`](#thirdhand-{name})' for name in names)} |\n")

@@ -15,16 +15,16 @@ import msgspec
 import numpy as np
 from matplotlib import pyplot as plt
 
-from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick, Vector
-from service.core.skill.skill import Skill
-from service.files.shipped import shipped_skill
-from service.learning.corrections import corrected, correction_at
-from service.learning.via_points import adapted
-from service.settings.config import Settings, robot_description
-from service.settings.palette import LEFT, TOOL
-from sim.closed_loop import START_NS, hand_event
-from sim.scene import Scene
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import Frame, Tick, Vector
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.settings.palette import LEFT, TOOL
+from thirdhand.skills.corrections import corrected, correction_at
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.closed_loop import START_NS, hand_event
+from thirdhand_sim.scene import Scene
 
 PICTURE = Path(__file__).with_name("correct.png")
 DPI = 90

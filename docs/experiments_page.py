@@ -18,10 +18,15 @@ from typing import Any
 
 import jinja2
 
-from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.evidence import RESULTS, result_of, staleness, tree
-from sim.experiments.partners import verdict
-from sim.experiments.people.moving_hands import MOST_LATE_S, PRECISE_M, UNSEEN_S
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.evidence import (
+    RESULTS,
+    result_of,
+    staleness,
+    tree,
+)
+from thirdhand_sim.lab.partners import verdict
+from thirdhand_sim.lab.people.moving_hands import MOST_LATE_S, PRECISE_M, UNSEEN_S
 
 HERE = Path(__file__).parent
 WIDTH = 100

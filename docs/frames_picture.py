@@ -18,11 +18,11 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
-from service.core.arm.stage import Arm
-from service.core.geometry import place, rotation
-from service.core.separation.body import body_of
-from service.settings import palette
-from service.settings.config import Settings, robot_description
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.geometry import place, rotation
+from thirdhand.core.separation.body import body_of
+from thirdhand.settings import palette
+from thirdhand.settings.config import Settings, robot_description
 
 PICTURE = Path(__file__).with_name("frames.png")
 TRACKER = (1.2, 0.0, 0.9, 0.683, 0.683, -0.183, -0.183)  # `base_from_tracker` of first-tracker.md

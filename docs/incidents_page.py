@@ -9,9 +9,15 @@ from pathlib import Path
 
 import jinja2
 
-from service.contract.incidents import INCIDENTS, Condition, Incident, filled, word
-from service.contract.records import Mode
-from service.settings.config import Settings
+from thirdhand.contract.incidents import (
+    INCIDENTS,
+    Condition,
+    Incident,
+    filled,
+    word,
+)
+from thirdhand.contract.records import Mode
+from thirdhand.settings.config import Settings
 
 PAGE = Path(__file__).with_name("incidents.md")
 

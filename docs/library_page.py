@@ -1,5 +1,5 @@
 """`python docs/library_page.py` writes the two pages on Python from docstrings: library.md on
-`kmp`, and client.md on `service.client`.
+`kmp`, and client.md on `thirdhand.client`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import kmp
 from kmp import estimator, orientation
-from service import client
-from service.contract import requests
+from thirdhand import client
+from thirdhand.contract import requests
 
 HERE = Path(__file__).parent
 LIBRARY = """# The library `kmp`
@@ -33,7 +33,7 @@ The picture shows a primitive with two outputs. The mean passes through the via-
 regions are narrow where the demonstrations agree. The tutorial of kmp draws it step by step."""
 CLIENT = """# The Python client
 
-<!-- Written by `python docs/library_page.py` from the docstrings in service/client: change it there. -->
+<!-- Written by `python docs/library_page.py` from the docstrings in service/thirdhand/client: change it there. -->
 
 This page lists what a program in Python needs to talk to a running daemon. Most programs need only
 a connection:
@@ -49,18 +49,14 @@ with thirdhand.connect() as cell:  # address, cell and certificate as for the co
 ```
 
 All names are those of `import thirdhand`; the project itself has the same names in
-`service.client`. The programs in [examples](../examples) use them, and [the wire](wire.md)
+`thirdhand.client`. The programs in [examples](../examples) use them, and [the wire](wire.md)
 describes the messages behind them.
 
 Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
 radians, or in metres if they slide.
 
-A program on another machine needs only the client. In a clone, `pip install ./service/client`
-installs the distribution `thirdhand-client`, for Python 3.10 or later on Linux, macOS and Windows,
-with `eclipse-zenoh` and `msgspec`. `pip wheel --no-deps ./service/client` builds its wheel. If
-`thirdhand` is installed too, its own client is imported; the two share no file. With the client
-alone, Python finds the package `service` only after `import thirdhand`, and a package of your own
-must not have this name.
+A program on another machine needs only the client: `pip install .` in a clone installs it, for
+Python 3.11 or later on Linux, macOS and Windows, with `eclipse-zenoh` and `msgspec`.
 
 ![The frames of a cell: base, plate, tool, tracker and both hands](frames.png)"""
 KMP_GROUPS = {
@@ -78,7 +74,7 @@ CLIENT_GROUPS = {
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
     "Errors": ("UnreachableError", "StartingError", "UncertainError", "RefusedError", "SettingsError"),
 }
-VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of service.contract.requests
+VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of thirdhand.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
 INSIDE = {"to_plot", "inner"}
 RETURNED = {
@@ -104,8 +100,8 @@ def _library() -> str:
 
 
 def _client() -> str:
-    """The page on `service.client`."""
-    parts = [CLIENT, *_groups(CLIENT_GROUPS, client), "## Values, `service.contract.requests`"]
+    """The page on `thirdhand.client`."""
+    parts = [CLIENT, *_groups(CLIENT_GROUPS, client), "## Values, `thirdhand.contract.requests`"]
     parts += [part for name in VALUES for part in _described(name, getattr(requests, name))]
     return "\n\n".join(parts) + "\n"
 

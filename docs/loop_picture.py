@@ -16,8 +16,8 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 
-from service.contract.channels import BY_KEY
-from service.settings.config import Settings
+from thirdhand.contract.channels import BY_KEY
+from thirdhand.settings.config import Settings
 
 PICTURE = Path(__file__).with_name("loop.png")
 WIDTH, HEIGHT = 1.9, 0.8  # of a box

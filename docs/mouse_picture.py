@@ -26,7 +26,17 @@ def main(path: Path = PICTURE) -> None:
     """Play the demo until its second event, and save what the page shows as PNG."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        command = [sys.executable, "-m", "service", "demo", "--mouse", "--rate", "100", "--output", str(folder / "out")]
+        command = [
+            sys.executable,
+            "-m",
+            "thirdhand",
+            "demo",
+            "--mouse",
+            "--rate",
+            "100",
+            "--output",
+            str(folder / "out"),
+        ]
         with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT) as demo:
             watchdog = threading.Timer(TIMEOUT_S, demo.kill)
             watchdog.start()

@@ -4,7 +4,7 @@ skill refined by three takes of a person, have the tool from where that person's
 
 from __future__ import annotations
 
-from service.process import one_blas_thread  # noqa: F401
+from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
 from pathlib import Path
@@ -16,13 +16,18 @@ mpl.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
 
-from service.core.frame import Vector
-from service.learning.learn import learn
-from service.learning.skill_file import StoredSkill
-from service.settings.palette import TOOL
-from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, left_out, predicted
-from sim.experiments.reached import taught
-from sim.made_tasks import takes
+from thirdhand.core.frame import Vector
+from thirdhand.settings.palette import TOOL
+from thirdhand.skills.skill_file import StoredSkill
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.lab.people.left_out import (
+    JUDGED_HZ,
+    LeftOut,
+    left_out,
+    predicted,
+)
+from thirdhand_sim.lab.reached import taught
+from thirdhand_sim.made_tasks import takes
 
 PICTURE = Path(__file__).with_name("own-takes.png")
 DPI = 90

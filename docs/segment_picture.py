@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-from service.core.frame import structured
-from service.core.skill.stages import STAGE, along_way, on_way
+from thirdhand.core.frame import structured
+from thirdhand.core.skill.stages import STAGE, along_way, on_way
 
 PICTURE = Path(__file__).with_name("segment.png")
 DPI = 90

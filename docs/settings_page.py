@@ -16,12 +16,12 @@ from typing import Any
 import msgspec
 from msgspec import inspect as types
 
-from service.settings import config
+from thirdhand.settings import config
 
 PAGE = Path(__file__).with_name("settings.md")
 HEAD = """# Settings
 
-<!-- Written by `python docs/settings_page.py` from service/settings/config.py: change it there. -->
+<!-- Written by `python docs/settings_page.py` from service/thirdhand/settings/config.py: change it there. -->
 
 This page lists every setting of a cell, with its default and the values that are accepted. Write
 the settings that you want to change into a TOML file, and start the daemon with it: `thirdhand

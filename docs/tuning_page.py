@@ -10,9 +10,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from service.core.skill import tuning as skill_tuning
-from service.core.tuning import TUNING
-from sim.experiments.evidence import RESULTS, result_of, staleness, tree
+from thirdhand.core.skill import tuning as skill_tuning
+from thirdhand.core.tuning import TUNING
+from thirdhand_sim.lab.evidence import (
+    RESULTS,
+    result_of,
+    staleness,
+    tree,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"
@@ -20,13 +25,13 @@ STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision")  # the
 RECORD = re.compile(r"\s*# (\S+) to (\S+)\. More: (.+)\. Less: (.+)\.")
 HEAD = """# Tuned numbers
 
-<!-- Written by `python docs/tuning_page.py` from service/core/*/tuning.py: change it there. -->
+<!-- Written by `python docs/tuning_page.py` from service/thirdhand/core/*/tuning.py: change it there. -->
 
 The core has {count} tuned numbers, in the file `tuning.py` of each stage. Numbers that follow from
 the settings, from the arm or from other numbers are not among them.
 
 The range and the effects of more and less are what we expect. The last three columns are measured,
-at half and at twice the number: `python -m sim.experiments sensitivity` compares short sessions
+at half and at twice the number: `python -m thirdhand_sim.lab sensitivity` compares short sessions
 with those at the tuned value.
 
 * *Motion*: change of the error and of the jerk of a tool that follows moving hands [%].
@@ -57,7 +62,7 @@ class Number(NamedTuple):
 def numbers_of(stage: str) -> Iterator[Number]:
     """The tuned numbers of a stage, which are those with a range in the line above."""
     values = vars(skill_tuning) if stage == "skill" else getattr(TUNING, stage)._asdict()
-    lines = (ROOT / "service" / "core" / stage / "tuning.py").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "service" / "thirdhand" / "core" / stage / "tuning.py").read_text(encoding="utf-8").splitlines()
     for node in ast.walk(ast.parse("\n".join(lines))):
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and (record := RECORD.fullmatch(lines[node.lineno - 2])):
             name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)

@@ -9,8 +9,8 @@ import contextlib
 import math
 import time
 
-from service.client import Follower, client_settings
-from service.settings.config import Settings
+from thirdhand.client import Follower, client_settings
+from thirdhand.settings.config import Settings
 
 PERIOD_S = 0.005
 

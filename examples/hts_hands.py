@@ -16,9 +16,9 @@ import sys
 import time
 from collections.abc import Iterator
 
-from service.client import client_settings, publisher
-from service.contract.cdr import encode_pose
-from service.contract.messages import PoseStamped
+from thirdhand.client import client_settings, publisher
+from thirdhand.contract.cdr import encode_pose
+from thirdhand.contract.messages import PoseStamped
 
 FRAME = "hts"
 PORT = 9000

@@ -14,9 +14,9 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from service.client import client_settings
-from service.contract.cdr import encode_pose
-from service.contract.messages import PoseStamped
+from thirdhand.client import client_settings
+from thirdhand.contract.cdr import encode_pose
+from thirdhand.contract.messages import PoseStamped
 
 FRAME = "optitrack"
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from service.arms.drive import Measured, follow
-from service.arms.playback import SpeedLimits
-from service.client import client_settings
-from service.settings.config import Settings, load
+from thirdhand.arms.drive import Measured, follow
+from thirdhand.arms.playback import SpeedLimits
+from thirdhand.client import client_settings
+from thirdhand.settings.config import Settings, load
 
 
 class FakeArm:

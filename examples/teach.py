@@ -7,8 +7,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 
-from service.client import Client, RefusedError, client_settings
-from service.contract.requests import ViaPoint
+from thirdhand.client import Client, RefusedError, client_settings
+from thirdhand.contract.requests import ViaPoint
 
 HANDOVER = ViaPoint(
     "example",

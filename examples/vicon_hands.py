@@ -17,9 +17,9 @@ import time
 from collections.abc import Iterator, Mapping
 from math import cos, sin
 
-from service.client import client_settings, publisher
-from service.contract.cdr import encode_pose
-from service.contract.messages import PoseStamped, Quaternion
+from thirdhand.client import client_settings, publisher
+from thirdhand.contract.cdr import encode_pose
+from thirdhand.contract.messages import PoseStamped, Quaternion
 
 FRAME = "vicon"
 PORT = 51001

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.process import one_blas_thread  # noqa: F401
+from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import os
@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from service.core.skill.skill import Skill
-from service.files.replay import replay
-from service.learning.skill_file import decoded
-from service.process.child import python
-from service.viewer import vulkan
 from support import forked, tiers
 from support.paths import RECORDINGS, ROOT
+from thirdhand.core.skill.skill import Skill
+from thirdhand.process.child import python
+from thirdhand.recordings.replay import replay
+from thirdhand.skills.skill_file import decoded
+from thirdhand.viewer import vulkan
 
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
@@ -33,8 +33,8 @@ PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
 PREPARE = """
-from service.cli.prepare import compiled_for
-from service.files.shipped import SHIPPED_SKILL, cell_of, recordings
+from thirdhand.cli.prepare import compiled_for
+from thirdhand.recordings.shipped import SHIPPED_SKILL, cell_of, recordings
 for arm in ("wam", "ur5"):
     print(compiled_for(cell_of(arm), recordings() / SHIPPED_SKILL), flush=True)
 """
@@ -48,8 +48,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(_Instantly(config), "instantly")
-        command, environment = python("-c", PREPARE)
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(python("-c", PREPARE), stdout=subprocess.DEVNULL)
         config.stash[PREPARING] = process
         config.add_cleanup(process.kill)
     config.add_cleanup(forked.close)

@@ -14,7 +14,7 @@ import os
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # before anything imports Numba
 
-from service.process import one_blas_thread  # noqa: F401
+from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import sys
@@ -23,21 +23,34 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from service.client import endpoints, open_session, publisher
-from service.contract import cdr
-from service.contract.messages import BASE, Attachment, JointState, PoseStamped
-from service.contract.records import SIDES, SOURCES, Mode
-from service.core.controller import Controller, outgoing, run
-from service.core.frame import Event, Frame, Tick, Vector
-from service.daemon import daemon
-from service.daemon.cell_streams import Arrivals, CellStreams
-from service.daemon.input_monitor import KEY_OF_SOURCE
-from service.files.shipped import shipped_skill
-from service.settings.config import Settings, robot_description
+from thirdhand.client import endpoints, open_session, publisher
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import (
+    BASE,
+    Attachment,
+    JointState,
+    PoseStamped,
+)
+from thirdhand.contract.records import SIDES, SOURCES, Mode
+from thirdhand.core.controller import Controller, outgoing, run
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Tick,
+    Vector,
+)
+from thirdhand.daemon import daemon
+from thirdhand.daemon.cell_streams import Arrivals, CellStreams
+from thirdhand.daemon.input_monitor import KEY_OF_SOURCE
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
 
 ROOT = Path(__file__).parents[1]
 LOOP = str(Path(daemon.__file__))  # this file does what the loop there does
-ARITHMETIC = {str(ROOT / "service/core/vectors.py"), str(ROOT / "kmp/elementary.py")}  # left out, as operators are
+ARITHMETIC = {
+    str(ROOT / "service/thirdhand/core/vectors.py"),
+    str(ROOT / "kmp/elementary.py"),
+}  # left out, as operators are
 PERIODS = 80
 
 

@@ -17,15 +17,15 @@ import kmp
 from support import tiers
 from support.paths import ROOT
 
-PACKAGES = ("kmp", "service", "sim")
+PACKAGES = {"kmp": "", "thirdhand": "service", "thirdhand_sim": "sim"}  # and the folder of each
 OUTSIDE = {
     *("time", "threading", "os", "socket", "subprocess", "datetime", "random", "asyncio", "multiprocessing"),
     *("signal", "logging", "sched", "queue", "zenoh", "mcap", "rerun", "pybullet", "mujoco"),
 }
 VAGUE = {"utils", "util", "common", "base", "manager", "helper", "helpers", "node", "interface", "misc"}
 PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
-MODULES = sorted(path for package in (*PACKAGES, "tests") for path in (ROOT / package).rglob("*.py"))
-PURE = sorted(path for room in ("core", "contract") for path in (ROOT / "service" / room).rglob("*.py"))
+MODULES = sorted(path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py"))
+PURE = sorted(path for room in ("core", "contract") for path in (ROOT / "service" / "thirdhand" / room).rglob("*.py"))
 ENTRY_POINTS = [
     path
     for path in MODULES
@@ -58,9 +58,9 @@ NAMED_TWICE = """
 PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
     "what comes from outside": (
         {
-            "service/core/intake/stage.py": "import time",
-            "service/contract/cdr.py": "import numpy",
-            "service/learning/learn.py": "import mcap",
+            "service/thirdhand/core/intake/stage.py": "import time",
+            "service/thirdhand/contract/cdr.py": "import numpy",
+            "service/thirdhand/workbench/learning/learn.py": "import mcap",
             "kmp/mixture.py": "import msgspec",
         },
         {
@@ -72,22 +72,22 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
     ),
     "the order of rooms": (
         {
-            "service/core/frame.py": "from service.daemon.clock import Deadlines",
-            "service/contract/channels.py": "from service.core.frame import Tick",
-            "service/scribe/scribe.py": "from service.daemon.clock import Deadlines",
-            "service/daemon/clock.py": "from service.cli.usage import UsageError",
-            "service/core/skill/skill.py": "from service.learning.learn import learn",
-            "kmp/mixture.py": "from service.settings.config import Settings",
-            "service/settings/config.py": "from sim.scene import Scene",
+            "service/thirdhand/core/frame.py": "from thirdhand.daemon.clock import Deadlines",
+            "service/thirdhand/contract/channels.py": "from thirdhand.core.frame import Tick",
+            "service/thirdhand/scribe/scribe.py": "from thirdhand.daemon.clock import Deadlines",
+            "service/thirdhand/daemon/clock.py": "from thirdhand.cli.usage import UsageError",
+            "service/thirdhand/core/skill/skill.py": "from thirdhand.workbench.learning.learn import learn",
+            "kmp/mixture.py": "from thirdhand.settings.config import Settings",
+            "service/thirdhand/settings/config.py": "from thirdhand_sim.scene import Scene",
         },
         {
-            "sim may use service and kmp, service may use kmp, never back",
-            "inside the service, each room imports only the rooms below it",
+            "the simulation may use the service, the service the method, never back",
+            "the workbench may use the run-time, never back, and each room the rooms below it",
         },
     ),
     "a module outside of every room": (
-        {"service/somewhere_else.py": '"""A module."""'},
-        {"inside the service, each room imports only the rooms below it"},
+        {"service/thirdhand/somewhere_else.py": '"""A module."""'},
+        {"the workbench may use the run-time, never back, and each room the rooms below it"},
     ),
 }
 
@@ -110,8 +110,11 @@ def imported(path: Path) -> set[str]:
 
 def modules_imported(folder: Path) -> dict[str, set[str]]:
     """The modules of PACKAGES that each module imports, also in functions and for types alone."""
-    paths = [path.relative_to(folder) for package in PACKAGES for path in (folder / package).rglob("*.py")]
-    names = {".".join(path.with_suffix("").parts).removesuffix(".__init__"): folder / path for path in paths}
+    names: dict[str, Path] = {}
+    for package, place in PACKAGES.items():
+        for path in (folder / place / package).rglob("*.py"):
+            module = ".".join(path.relative_to(folder / place).with_suffix("").parts)
+            names[module.removesuffix(".__init__")] = path
     found: dict[str, set[str]] = {}
     for module, path in names.items():
         imports: set[str] = set()
@@ -144,7 +147,7 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
         timeout=120,
         check=False,
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder), "COLUMNS": "200"},
+        env=os.environ | {"PYTHONPATH": f"{folder}:{folder / 'service'}:{folder / 'sim'}", "COLUMNS": "200"},
     )
 
 
@@ -161,12 +164,15 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert circle(imports) == []
 
 
-@pytest.mark.parametrize("late", ["def f():\n    import service.a", "if TYPE_CHECKING:\n    from service.a import A"])
+@pytest.mark.parametrize(
+    "late", ["def f():\n    import thirdhand.a", "if TYPE_CHECKING:\n    from thirdhand.a import A"]
+)
 def test_a_circle_is_found_also_in_functions_and_for_types_alone(late: str, tmp_path: Path) -> None:
-    (tmp_path / "service").mkdir()
-    for name, text in (("a", "from service import b"), ("b", "from service.c import C"), ("c", late)):
-        (tmp_path / "service" / f"{name}.py").write_text(text, encoding="utf-8")
-    assert set(circle(modules_imported(tmp_path))) == {"service.a", "service.b", "service.c"}
+    folder = tmp_path / "service" / "thirdhand"
+    folder.mkdir(parents=True)
+    for name, text in (("a", "from thirdhand import b"), ("b", "from thirdhand.c import C"), ("c", late)):
+        (folder / f"{name}.py").write_text(text, encoding="utf-8")
+    assert set(circle(modules_imported(tmp_path))) == {"thirdhand.a", "thirdhand.b", "thirdhand.c"}
 
 
 @pytest.mark.parametrize(("lines", "broken"), PLANTED.values(), ids=PLANTED)
@@ -174,8 +180,8 @@ def test_lines_that_break_a_contract_are_found_and_named(
     lines: dict[str, str], broken: set[str], tmp_path: Path
 ) -> None:
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    for package in PACKAGES:
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("kmp", "service", "sim"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for path, line in lines.items():
         with (tmp_path / path).open("a", encoding="utf-8") as file:
             file.write(f"\n{line}\n")
@@ -183,7 +189,7 @@ def test_lines_that_break_a_contract_are_found_and_named(
     assert done.returncode == 1, done.stdout
     assert broken <= set(re.findall(r"^(.*) BROKEN(?: \(.*\))?$", done.stdout, re.MULTILINE)), done.stdout
     for path, line in lines.items():
-        module = path.removesuffix(".py").replace("/", ".")
+        module = path.removesuffix(".py").removeprefix("service/").replace("/", ".")
         brought = f" -> {line.split()[1]} (l." if "import" in line else "\n"
         assert f"- {module}{brought}" in re.sub("-  +", "- ", done.stdout), done.stdout
 
@@ -202,7 +208,7 @@ def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_lib
     names = ((node, getattr(node, "module", None) or node.names[0].name) for node in imports)
     first = next(node for node, name in names if name.split(".")[0] not in sys.stdlib_module_names)
     assert isinstance(first, ast.ImportFrom)
-    assert (first.module, [name.name for name in first.names]) == ("service.process", ["one_blas_thread"])
+    assert (first.module, [name.name for name in first.names]) == ("thirdhand.process", ["one_blas_thread"])
 
 
 def test_the_mathematics_imports_nothing_but_mathematics() -> None:
@@ -285,14 +291,14 @@ def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
     """Tuned numbers in tuning.py, compiled functions in step.py, the class in stage.py; no stage
     imports another one's step.
     """
-    core = ROOT / "service" / "core"
+    core = ROOT / "service" / "thirdhand" / "core"
     stages = sorted(path.parent for path in core.glob("*/stage.py"))
     assert len(stages) == 7
     for stage in stages:
         assert {"step.py", "stage.py"} <= {path.name for path in stage.glob("*.py")}
         for path in stage.glob("*.py"):
             text = path.read_text(encoding="utf-8")
-            others = [s.name for s in stages if s != stage and f"service.core.{s.name}.step import" in text]
+            others = [s.name for s in stages if s != stage and f"thirdhand.core.{s.name}.step import" in text]
             assert not others, f"{named(path)} imports the step of {others}"
             loose = re.findall(r"^([A-Z][A-Z0-9_]+) = [-\d.e]+ *(?:#|$)", text, re.MULTILINE)
             assert path.name == "tuning.py" or not [n for n in loose if n not in STRUCTURAL], f"{named(path)}: {loose}"

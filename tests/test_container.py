@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 import yaml
 
-from service.cli.main import parser
-from service.settings.config import Settings, parse
 from support.installed import wheel_of
 from support.paths import ROOT
+from thirdhand.command_line import parser
+from thirdhand.settings.config import Settings, parse
 
 EXAMPLES = ROOT / "examples"
 IMAGE = (EXAMPLES / "Containerfile").read_text(encoding="utf-8")
@@ -40,9 +40,9 @@ def test_the_image_installs_this_distribution_as_tested_and_runs_its_commands_wi
     assert IMAGE.index("USER 10001") < IMAGE.index("ENTRYPOINT")
     assert instruction("ENTRYPOINT") == ["thirdhand"]
     served = parser().parse_args(instruction("CMD"))
-    assert (served.run, served.hold, served.log) == ("cli.serve.serve", True, "json")
+    assert (served.run, served.hold, served.log) == ("thirdhand.cli.serve.serve", True, "json")
     checked = parser().parse_args(instruction("HEALTHCHECK")[1:])
-    assert (checked.run, checked.exit_code) == ("cli.status.status", True)
+    assert (checked.run, checked.exit_code) == ("thirdhand.cli.status.status", True)
 
 
 def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) -> None:
@@ -63,8 +63,8 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
 def test_the_services_are_commands_of_this_version_and_reach_each_other() -> None:
     services, configs = COMPOSE["services"], COMPOSE["configs"]
     cell, metrics = (parser().parse_args(services[name]["command"]) for name in ("cell", "metrics"))
-    assert (cell.run, cell.hold) == ("cli.serve.serve", True)
-    assert metrics.run == "cli.metrics.metrics"
+    assert (cell.run, cell.hold) == ("thirdhand.cli.serve.serve", True)
+    assert metrics.run == "thirdhand.workbench.cli.metrics.metrics"
     settings = parse(configs["bench"]["content"], origin="compose.yaml")
     assert isinstance(settings, Settings)
     assert [str(cell.config)] == [one["target"] for one in services["cell"]["configs"]]

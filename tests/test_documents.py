@@ -14,18 +14,18 @@ import msgspec
 import numpy as np
 import pytest
 
-import sim.__main__
-from service.cli import main
-from service.contract import incidents, requests, ros2
-from service.contract.channels import CHANNELS, Channel, topic
-from service.contract.messages import BASE
-from service.contract.roles import ROLES
-from service.core.arm.stage import Arm
-from service.core.frame import FRAME, TIMING_FIELDS
-from service.scribe.scribe import Scribe
-from service.settings.config import Settings, robot_description
-from service.viewer.blueprint import plot_views
+import thirdhand_sim.__main__
 from support.paths import ROOT
+from thirdhand import command_line as main
+from thirdhand.contract import incidents, requests, ros2
+from thirdhand.contract.channels import CHANNELS, Channel, topic
+from thirdhand.contract.messages import BASE
+from thirdhand.contract.roles import ROLES
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.frame import FRAME, TIMING_FIELDS
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.viewer.blueprint import plot_views
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
 MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]
@@ -182,7 +182,9 @@ def options(parser: argparse.ArgumentParser) -> set[str]:
     return {*parser._option_string_actions}.union(*map(options, commands(parser).values()))  # noqa: SLF001
 
 
-OPTIONS = {name: options(found) for name, found in (commands(main.parser()) | {"sim": sim.__main__.parser()}).items()}
+OPTIONS = {
+    name: options(found) for name, found in (commands(main.parser()) | {"sim": thirdhand_sim.__main__.parser()}).items()
+}
 TABLES = {name: set(found) for name, found in msgspec.to_builtins(Settings()).items() if isinstance(found, dict)}
 
 

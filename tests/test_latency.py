@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from service.contract import channels
-from service.files.replay import replay
-from service.timing import benchmark
 from support.cell import Tracker, serving, thirdhand
+from thirdhand.contract import channels
+from thirdhand.recordings.replay import replay
+from thirdhand.workbench.timing import benchmark
 
 pytestmark = pytest.mark.timed
 SECONDS, RATE_HZ = 5.0, 500
@@ -27,10 +27,10 @@ SECONDS, RATE_HZ = 5.0, 500
 MOST_WORK, MOST_LATENCY, MOST_MISSED = 14.0, 1.4, 0.03
 MOST_LATE = {"p50": 0.02, "p99": 0.5}  # shares of a period; a busy thread exceeds one of them, seldom both
 PLANTED = """
-from service.process import one_blas_thread
+from thirdhand.process import one_blas_thread
 import sys, threading, time
-from service.cli.main import main
-from service.daemon.cell_streams import CellStreams
+from thirdhand.command_line import main
+from thirdhand.daemon.cell_streams import CellStreams
 
 def busy(seconds):
     until = time.perf_counter() + seconds

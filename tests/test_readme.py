@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from support.cell import serving
-from support.installed import CLIENT, isolated, unpacked, wheel_of
+from support.installed import isolated, unpacked, wheel_of
 from support.paths import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -25,7 +25,7 @@ def program() -> str:
 
 def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(tmp_path: Path) -> None:
     assert len([line for line in program().splitlines() if line]) <= 10
-    site = unpacked(wheel_of(CLIENT, tmp_path), tmp_path / "site")
+    site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
     with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = {"THIRDHAND_CONNECT": daemon.endpoint, "HOME": str(tmp_path)}
         for _ in range(3):  # a busy machine may leave the hands stale, or the skill worker without time

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 import kmp
-from service import client
-from service.cli.main import GROUPS
-from sim.experiments import sensitivity
-from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.people.moving_hands import SMALL_KINDS
 from support.paths import ROOT
+from thirdhand import client
+from thirdhand.command_line import GROUPS
+from thirdhand_sim.lab import sensitivity
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.people.moving_hands import SMALL_KINDS
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings") for path in folder.glob("*.md"))
@@ -35,7 +35,7 @@ DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a p
     *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `service.client`, for the service's own programs
+INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `thirdhand.client`, for the service's own programs
 
 
 def program(name: str) -> ModuleType:

@@ -4,10 +4,7 @@ shows no picture and no link that leads nowhere there.
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -17,9 +14,6 @@ from hatchling.builders.wheel import WheelBuilder
 
 from support.paths import ROOT
 
-EXPERIMENTS = ROOT / "sim" / "experiments"
-VENDORED = Path("service") / "_vendor"
-
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -27,40 +21,19 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(built)
 
 
-def test_it_holds_service_bench_and_recordings_and_no_other_distributions_files(wheel: Path) -> None:
+def test_it_holds_service_bench_and_recordings_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        held = set(archive.namelist())
-    sources = {
-        str(path.relative_to(ROOT) if name != "kmp" else VENDORED / path.relative_to(ROOT))
-        for name in ("kmp", "service", "sim")
-        for path in (ROOT / name).rglob("*.py")
-        if not path.is_relative_to(EXPERIMENTS)
-    }
-    sources.remove("service/client/thirdhand.py")  # as the package of that name
-    assert sources | {"thirdhand/__init__.py", "thirdhand/py.typed"} <= held
-    arms = {f"service/arms/{name}" for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")}
-    assert arms | {"service/recordings/soldering.npz"} <= held
-    shown = {f"service/recordings/people/{path.name}" for path in (ROOT / "recordings" / "people").iterdir()}
-    assert shown <= held
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+    folders = (ROOT / "service", ROOT / "sim")
+    sources = {str(path.relative_to(folder)) for folder in folders for path in folder.rglob("*.py")}
+    sources = {name for name in sources if not name.startswith("thirdhand_sim/lab/")}
+    arms = {f"thirdhand/arms/{name}" for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")}
+    people = {f"thirdhand/shipped/people/{path.name}" for path in (ROOT / "recordings" / "people").iterdir()}
+    assert sources | arms | people | {"thirdhand/shipped/soldering.npz", "thirdhand/py.typed"} <= held
+    assert {name for name in held if name.endswith(".py")} == sources
     assert wheel.stat().st_size < 1.8e6
-    assert {name.split("/")[0] for name in held if ".dist-info/" not in name} == {"service", "sim", "thirdhand"}
-    besides = {name for name in held if name.startswith(str(VENDORED)) and not name.endswith(".py")}
-    assert besides == {str(VENDORED / "kmp" / "py.typed")}
+    assert {name.split("/")[0] for name in held} == {"thirdhand", "thirdhand_sim"}
     assert [name for name in held if name.endswith(("golden.mcap", ".png", ".webp", ".svg"))] == []
-
-
-def test_installed_it_has_its_own_kmp_whichever_is_installed_beside(wheel: Path, tmp_path: Path) -> None:
-    site, other = tmp_path / "site", tmp_path / "other" / "kmp"
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site)
-    other.mkdir(parents=True)
-    (other / "__init__.py").write_text("raise RuntimeError('of another version')")
-    environment = os.environ | {"PYTHONPATH": f"{other.parent}:{site}"}
-    code = "import service, kmp; from kmp import KMP; print(service.__file__, kmp.__file__)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.split() == [str(site / "service" / "__init__.py"), str(site / VENDORED / "kmp" / "__init__.py")]
 
 
 def test_how_to_cite_it_is_told_with_its_version_and_the_papers_it_follows(wheel: Path) -> None:
@@ -72,12 +45,11 @@ def test_how_to_cite_it_is_told_with_its_version_and_the_papers_it_follows(wheel
     assert paper["title"] in (ROOT / "kmp" / "README.md").read_text(encoding="utf-8").replace("\n", " ")
 
 
-def test_it_does_without_the_experiments(wheel: Path) -> None:
+def test_nothing_in_it_needs_the_lab(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        held = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
-    assert [name for name in held if name.startswith("sim/experiments")] == []
-    assert [name for name, text in held.items() if re.search(r"(from|import) sim(\.| import )experiments", text)] == []
-    assert EXPERIMENTS.is_dir()
+        texts = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+    lab = re.compile(r"(from|import) thirdhand_sim(\.| import )lab")
+    assert [name for name, text in texts.items() if lab.search(text)] == []
 
 
 def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(wheel: Path) -> None:

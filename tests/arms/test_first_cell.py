@@ -12,22 +12,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.arms.first_cell import DEMO_TOOL_M, Proposal, proposed, written
-from service.arms.plate import plate_of, turn_of_tool
-from service.arms.rates import rates
-from service.core.arm.stage import Arm
-from service.core.separation.stage import Separation
-from service.files.shipped import shipped_skill
-from service.learning.via_points import adapted
-from service.settings.arm_description import description
-from service.settings.config import load, robot_description
-from service.settings.urdf import Urdf, UrdfError
-from sim.experiments.rehearsal import rehearse
-from sim.scene import Scene
-from sim.script import HandScript
 from support.paths import ROOT
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.separation.stage import Separation
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.arm_description import description
+from thirdhand.settings.config import load, robot_description
+from thirdhand.settings.urdf import Urdf, UrdfError
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.first_cell.first_cell import (
+    DEMO_TOOL_M,
+    Proposal,
+    proposed,
+    written,
+)
+from thirdhand.workbench.first_cell.plate import plate_of, turn_of_tool
+from thirdhand.workbench.first_cell.rates import rates
+from thirdhand_sim.lab.rehearsal import rehearse
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
-SHIPPED = ROOT / "service" / "arms"
+SHIPPED = ROOT / "service" / "thirdhand" / "arms"
 SAWYER = Path(__file__).with_name("sawyer.urdf")
 
 

@@ -20,17 +20,22 @@ import pytest
 import zenoh
 from zenoh.handlers import RingChannel
 
-from service.arms.drive import follow
-from service.arms.simulated import SimulatedArm
-from service.client import Client, UnreachableError, endpoints, open_session
-from service.contract import cdr
-from service.daemon.launch import free_port
-from service.settings.config import Settings
-from sim.scene import Scene
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
+from thirdhand.arms.drive import follow
+from thirdhand.arms.simulated import SimulatedArm
+from thirdhand.client import (
+    Client,
+    UnreachableError,
+    endpoints,
+    open_session,
+)
+from thirdhand.contract import cdr
+from thirdhand.daemon.launch import free_port
+from thirdhand.settings.config import Settings
+from thirdhand_sim.scene import Scene
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
 STILL_RADPS = 0.02  # of a measured joint at rest
@@ -48,7 +53,7 @@ class Following:
     """A running `thirdhand follow`, and what it says."""
 
     def __init__(self, *arguments: str) -> None:
-        command = [sys.executable, "-m", "service", "follow", *arguments]
+        command = [sys.executable, "-m", "thirdhand", "follow", *arguments]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT)
         self.said: list[str] = []
         self._reader = threading.Thread(target=self._read)

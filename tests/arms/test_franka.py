@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from service.arms import franka
-from service.arms.drive import DriveError
-from service.arms.playback import Playback
-from service.client import Command
-from service.core.arm.stage import Arm
-from service.core.limiter.stage import Limiter
-from service.settings.config import JointSettings, Settings, robot_description
 from support.franka_cell import STANDS, assert_allowed, cell, fr3, robot, simulated
+from thirdhand.arms import franka
+from thirdhand.arms.drive import DriveError
+from thirdhand.arms.playback import Playback
+from thirdhand.client import Command
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.limiter.stage import Limiter
+from thirdhand.settings.config import JointSettings, Settings, robot_description
 
 TICK, PERIOD = 0.002, franka.FRANKA_PERIOD_S  # [s]
 Vector = npt.NDArray[np.float64]

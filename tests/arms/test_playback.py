@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.arms.playback import REJOIN_AFTER_S, REJOIN_RAD, Playback
-from service.client import BRAKE_AFTER_S, Command
-from service.core.limiter.stage import Limiter
-from service.settings.config import JointSettings
+from thirdhand.arms.playback import REJOIN_AFTER_S, REJOIN_RAD, Playback
+from thirdhand.client import BRAKE_AFTER_S, Command
+from thirdhand.core.limiter.stage import Limiter
+from thirdhand.settings.config import JointSettings
 
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from service.settings.config import Settings, load
 from support.cell import told
 from support.cell_commands import succeeded
 from support.paths import ROOT
 from support.turning import sliding_cell
+from thirdhand.settings.config import Settings, load
 
-UR5 = ROOT / "service" / "arms" / "ur5.urdf"
+UR5 = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.cli.arm_lag import Lag, lag
-from service.settings.config import Settings
 from support.examples import example
+from thirdhand.cli.arm_lag import Lag, lag
+from thirdhand.settings.config import Settings
 
 NAMES = ("a", "b", "c")
 SERVOS = ("delay", "servo")

@@ -14,14 +14,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from service.cli.bundle import without_keys
-from service.cli.main import main
-from service.files.mcap_reader import Messages
-from service.files.replay import replay
-from service.settings.config import Settings
 from support.cell import Tracker, serving, thirdhand, told
 from support.cell_commands import succeeded
 from support.certificates import make_certificates
+from thirdhand.command_line import main
+from thirdhand.recordings.mcap_reader import Messages
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import Settings
+from thirdhand.workbench.cli.bundle import without_keys
 
 SECRET = "c2VjcmV0LWtleQ"  # the planted parameter of an endpoint
 KEY = "-----BEGIN EC PRIVATE KEY-----\nMHcCAQEEI-planted\n-----END EC PRIVATE KEY-----"

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.main import GROUPS, parser
-from service.contract.requests import encode_json
-from service.daemon.launch import free_port
 from support.cell import thirdhand, told
 from support.cell_commands import assert_refused, started
 from support.paths import RECORDINGS, ROOT
+from thirdhand.command_line import GROUPS, parser
+from thirdhand.contract.requests import encode_json
+from thirdhand.daemon.launch import free_port
 
 COMMANDS = [name for names in GROUPS.values() for name in names]
 RENAMED = ("--out", "--duration", "--json FILE", "--soak MIN")
@@ -41,7 +41,7 @@ def test_one_thing_has_one_word_and_an_example(command: str) -> None:
     done = told(command, "--help")
     assert (done.returncode, "example:" in (text := done.stdout)) == (0, True)
     assert not [word for word in RENAMED if re.search(rf"{word}\b", text)]
-    assert "python -m sim " not in text
+    assert "python -m thirdhand_sim " not in text
 
 
 def test_the_bench_goes_by_its_own_name() -> None:
@@ -199,7 +199,7 @@ PATHS = {
     "nobody": " ".join(NOBODY),
     "take": RECORDINGS / "demonstration-1.mcap",
     "golden": RECORDINGS / "golden.mcap",
-    "ur5": ROOT / "service" / "arms" / "ur5.urdf",
+    "ur5": ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf",
 }
 
 
@@ -209,7 +209,7 @@ def folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp()))  # else Matplotlib keeps its own folder
     for command in ("record", "calibrate"):
-        monkeypatch.setattr(f"service.cli.{command}.CONNECT_TIMEOUT_S", 0.2)
+        monkeypatch.setattr(f"thirdhand.workbench.cli.{command}.CONNECT_TIMEOUT_S", 0.2)
     working = tmp_path / "working"
     working.mkdir()
     monkeypatch.chdir(working)

@@ -18,19 +18,32 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from service.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, NEVER_THERE, SLOW_RATE_HZ, TOO_BUSY, exit_code, text
-from service.cli.main import main
-from service.client import Client, Tracker, UnreachableError, open_session
-from service.contract.records import Mode, Reason
-from service.daemon.launch import launched, played
-from service.files.recording import Recording
-from service.report.columns import read
-from service.settings.config import WAM, Settings
-from sim.scene import Scene
 from support.cell import thirdhand, until
 from support.cell_commands import started, succeeded
 from support.paths import ROOT
 from support.recorded import drawn_ticks
+from thirdhand.client import (
+    Client,
+    Tracker,
+    UnreachableError,
+    open_session,
+)
+from thirdhand.command_line import main
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.daemon.launch import launched, played
+from thirdhand.recordings.recording import Recording
+from thirdhand.settings.config import WAM, Settings
+from thirdhand.workbench.cli.demo import (
+    DEMO_ATTEMPTS,
+    EVENT_TITLES,
+    NEVER_THERE,
+    SLOW_RATE_HZ,
+    TOO_BUSY,
+    exit_code,
+    text,
+)
+from thirdhand.workbench.report.columns import read
+from thirdhand_sim.scene import Scene
 
 timed = pytest.mark.timed
 SCENE = """
@@ -43,7 +56,7 @@ seed = 7
 
 def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
     """The report of a demo that succeeds."""
-    command = [sys.executable, "-m", "service", "demo", "--json", *arguments]
+    command = [sys.executable, "-m", "thirdhand", "demo", "--json", *arguments]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=320, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -210,7 +223,7 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
             raise UnreachableError(report["busy"])
         return report
 
-    monkeypatch.setattr("service.cli.demo.run", run)
+    monkeypatch.setattr("thirdhand.workbench.cli.demo.run", run)
     assert main(["demo", "--output", str(tmp_path)]) == code
     assert len(reports) - len(list(left)) == runs <= DEMO_ATTEMPTS
     assert [path.name for path in tmp_path.glob("*.*")] == [f"{runs - 1}.mcap"]

@@ -12,12 +12,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.cli.diagnosis import Y_UP, Finding, findings
-from service.cli.status import line, rows
-from service.contract.incidents import what_to_do
-from service.contract.requests import ANY_DIRECTION, Percentiles, Source, Status, ToolLimits
-from service.core.geometry import rotation
-from service.settings.config import converted
+from thirdhand.cli.diagnosis import Y_UP, Finding, findings
+from thirdhand.cli.status import line, rows
+from thirdhand.contract.incidents import what_to_do
+from thirdhand.contract.requests import (
+    ANY_DIRECTION,
+    Percentiles,
+    Source,
+    Status,
+    ToolLimits,
+)
+from thirdhand.core.geometry import rotation
+from thirdhand.settings.config import converted
 
 NONE = Percentiles()
 GOOD = Source(rate_hz=100.0, age_ms=4.0, fresh=True, clock_ms=1.5, frame="base")

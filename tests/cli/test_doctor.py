@@ -16,16 +16,16 @@ from types import ModuleType
 import pytest
 import zenoh
 
-from service.arms.drive import follow
-from service.cli.main import main
-from service.client import endpoints, open_session
-from service.contract import cdr, messages
-from service.daemon.launch import launched
-from service.daemon.single_instance import occupy
-from service.settings.config import Settings
 from support.cell import LEFT, Daemon, Tracker, until
 from support.cell_commands import started
 from support.examples import example
+from thirdhand.arms.drive import follow
+from thirdhand.client import endpoints, open_session
+from thirdhand.command_line import main
+from thirdhand.contract import cdr, messages
+from thirdhand.daemon.launch import launched
+from thirdhand.daemon.single_instance import occupy
+from thirdhand.settings.config import Settings
 
 NEAR_LEFT = (0.95, -0.30, 0.08)  # a hand that moves a little: an arm that is late is not far off
 PATIENT = """# Threads of a busy test may be late.

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from service.contract.explain import in_file, in_words
 from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
+from thirdhand.contract.explain import in_file, in_words
 
 INTERNAL = re.compile(r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at 0x|\b(?:OS|Type|Value|Key|Validation)Error")
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]

@@ -8,7 +8,9 @@ import pytest
 
 from support.cell_commands import python
 
-WAITS = "from service.cli.keys import EnterPressed; p = EnterPressed(); print(p(), p.listens, p(), p.listens)"
+WAITS = (
+    "from thirdhand.workbench.cli.keys import EnterPressed; p = EnterPressed(); print(p(), p.listens, p(), p.listens)"
+)
 INPUTS = {"closed": "False False False False", "empty": "False False False False", "a line": "True True False False"}
 
 

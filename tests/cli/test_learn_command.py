@@ -8,16 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.files.demonstration_reader import write_demonstration
-from service.learning.records import Figures
-from service.learning.skill_file import decoded
-from service.learning.stored_demonstrations import stored_demonstrations
-from sim.scene import Scene
-from sim.teach import demonstrations
 from support.cell import thirdhand, told
 from support.cell_commands import succeeded
 from support.fine_motion import fine
 from support.paths import RECORDINGS
+from thirdhand.skills.skill_file import decoded
+from thirdhand.skills.stored_demonstrations import stored_demonstrations
+from thirdhand.workbench.learning.records import Figures
+from thirdhand.workbench.takes.demonstration_reader import write_demonstration
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import demonstrations
 
 
 @pytest.fixture(scope="module")

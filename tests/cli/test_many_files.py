@@ -10,26 +10,26 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import tune
-from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick
-from service.core.skill.skill import Skill
-from service.files.recording import Recorder
-from service.report.tracking import TrackingFigures
-from service.report.variants import CHANGES, VariantFigures, pooled
-from sim.scene import Scene
-from sim.script import HandScript
 from support.cell import told
 from support.cell_commands import succeeded
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS, ROOT
 from support.wam import URDF
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import Frame, Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recorder
+from thirdhand.workbench.cli import tune
+from thirdhand.workbench.report.tracking import TrackingFigures
+from thirdhand.workbench.report.variants import CHANGES, VariantFigures, pooled
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 NAMES = ("a.mcap", "b.mcap", "broken.mcap", "c.mcap")
 DASK = """
 import sys
 from distributed import LocalCluster
-from service.cli.main import main
+from thirdhand.command_line import main
 if __name__ == "__main__":
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         code = main([*sys.argv[1:], "--workers", f"dask:{cluster.scheduler_address}"])

@@ -19,14 +19,14 @@ from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
-from service.cli.metrics import exposed
-from service.client import Client
-from service.contract.records import Mode, Reason
-from service.contract.requests import Status
-from service.daemon.launch import free_port
 from support.cell import Tracker, serving, thirdhand, until
 from support.cell_commands import python, started
 from support.paths import ROOT
+from thirdhand.client import Client
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import Status
+from thirdhand.daemon.launch import free_port
+from thirdhand.workbench.cli.metrics import exposed
 
 RULES = ROOT / "examples" / "thirdhand.rules.yml"
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -197,6 +197,8 @@ def test_what_prevents_the_page_is_a_sentence_and_an_exit_code(tmp_path: Path) -
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         done = thirdhand("metrics", "--listen", address, "--connect", daemon.endpoint)
         assert (done.returncode, f"--listen {address}: Address already in use" in done.stderr) == (1, True)
-    code = "import sys; sys.modules['prometheus_client'] = None; from service.cli.main import main; sys.exit(main())"
+    code = (
+        "import sys; sys.modules['prometheus_client'] = None; from thirdhand.command_line import main; sys.exit(main())"
+    )
     done = python(code, "metrics")
     assert (done.returncode, "pip install 'thirdhand[metrics]'" in done.stderr) == (1, True)

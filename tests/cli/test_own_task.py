@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.main import main
-from service.contract.channels import ENDPOINT
-from service.daemon.launch import free_port
-from service.learning.skill_file import decoded
-from sim import teach
 from support.paths import ROOT
+from thirdhand.command_line import main
+from thirdhand.contract.channels import ENDPOINT
+from thirdhand.daemon.launch import free_port
+from thirdhand.skills.skill_file import decoded
+from thirdhand_sim import teach
 
 BLOCKS = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL)
 SPEED, REST_S = "4", "0.6"
@@ -37,14 +37,14 @@ class Shell:
         words = shlex.split(line.replace(ENDPOINT, self.at).replace("--rest 2", f"--rest {REST_S}"))
         words = [found for word in words for found in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
         match words:
-            case ["python", "-m", "sim.teach", *rest, "&"]:
+            case ["python", "-m", "thirdhand_sim.teach", *rest, "&"]:
                 rest += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
                 self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(rest)), daemon=True))
                 self.teachers[-1].start()
-            case ["python", "-m", "sim.teach", *rest]:
+            case ["python", "-m", "thirdhand_sim.teach", *rest]:
                 assert teach.main(rest) == 0
             case ["thirdhand", "serve", *rest, "&"]:
-                command = [sys.executable, "-m", "service", "serve", *rest, "--listen", self.at]
+                command = [sys.executable, "-m", "thirdhand", "serve", *rest, "--listen", self.at]
                 self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert self.daemon.stdout is not None
                 assert self.daemon.stdout.readline().startswith("listening on ")

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli.main import main
-from service.core.frame import blank
-from service.daemon.launch import ENGINES
-from service.files.recording import Recorder, Recording
-from service.report.page import thinned
-from service.settings import palette
-from service.settings.config import Settings
 from support.paths import RECORDINGS, ROOT
 from support.wam import STATE
+from thirdhand.command_line import main
+from thirdhand.core.frame import blank
+from thirdhand.daemon.launch import ENGINES
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.settings import palette
+from thirdhand.settings.config import Settings
+from thirdhand.workbench.report.page import thinned
 
 
 def rows(path: Path) -> list[list[str]]:
@@ -133,7 +133,7 @@ def test_a_thinned_curve_keeps_its_extremes_and_its_gaps() -> None:
 def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_holds(tmp_path: Path) -> None:
     (tmp_path / "sim.py").write_text("raise SystemExit('not this one')\n")
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "service", "sim", "--help"],
+        [sys.executable, "-P", "-m", "thirdhand", "sim", "--help"],
         capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,
         env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin"},
     )  # fmt: skip

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from service.daemon.launch import free_port
 from support.cell import serving, told
 from support.cell_commands import python, succeeded
 from support.certificates import make_certificates
 from support.paths import RECORDINGS, ROOT
 from support.sabotage import SABOTAGE, fail
+from thirdhand.daemon.launch import free_port
 
 TLS, FOREIGN = "tls/127.0.0.1:0", "tcp/192.0.2.1:7447"  # the second is an address that no machine has
 CELL = """
@@ -74,9 +74,9 @@ def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_pat
 def test_too_few_files_that_may_be_open_prevent_a_start(tmp_path: Path, option: str) -> None:
     arguments = ["serve", option, "--config", cell(tmp_path)]
     program = (
-        "import resource, service.cli.main\n"
+        "import resource, thirdhand.command_line\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (100, 100))\n"
-        f"raise SystemExit(service.cli.main.main({arguments}))"
+        f"raise SystemExit(thirdhand.command_line.main({arguments}))"
     )
     done = python(program)
     assert done.returncode == 1

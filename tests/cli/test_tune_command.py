@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import tune
-from service.report.variants import CHANGES
 from support.cell_commands import succeeded
 from support.paths import RECORDINGS
+from thirdhand.workbench.cli import tune
+from thirdhand.workbench.report.variants import CHANGES
 
 GOLDEN = str(RECORDINGS / "golden.mcap")
 TAKE = str(RECORDINGS / "demonstration-1.mcap")

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.cli.live_page import UNKNOWN
-from service.cli.view import FRESH_S, screenshot
-from service.daemon.launch import free_port
-from service.settings import palette
 from support import chromium
 from support.cell import Daemon, Tracker, serving, told
 from support.cell_commands import started
+from thirdhand.daemon.launch import free_port
+from thirdhand.settings import palette
+from thirdhand.workbench.cli.live_page import UNKNOWN
+from thirdhand.workbench.cli.view import FRESH_S, screenshot
 
 TIMEOUT_S = 90
 

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from service.client import (
+from support.cell import until
+from thirdhand.client import (
     Client,
     RefusedError,
     UncertainError,
@@ -23,12 +24,11 @@ from service.client import (
     living,
     open_session,
 )
-from service.client.presence import is_connected
-from service.contract import channels, requests
-from service.contract.requests import ViaPoint
-from service.trackers.cell_view import carried_out
-from sim.sockets import CountingRelay
-from support.cell import until
+from thirdhand.client.presence import is_connected
+from thirdhand.contract import channels, requests
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.workbench.trackers.cell_view import carried_out
+from thirdhand_sim.sockets import CountingRelay
 
 Answer = Callable[[zenoh.Query], object]
 

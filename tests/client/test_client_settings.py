@@ -12,14 +12,21 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.main import main
-from service.client import Client, Tracker, UnreachableError, client_settings, endpoints, open_session
-from service.contract import cdr
-from service.daemon.launch import free_port
-from service.settings.config import Settings
-from service.settings.file_content import SettingsError
 from support.cell import serving, thirdhand
 from support.paths import ROOT
+from thirdhand.client import (
+    Client,
+    Tracker,
+    UnreachableError,
+    client_settings,
+    endpoints,
+    open_session,
+)
+from thirdhand.command_line import main
+from thirdhand.contract import cdr
+from thirdhand.daemon.launch import free_port
+from thirdhand.settings.config import Settings
+from thirdhand.settings.file_content import SettingsError
 
 VARIABLES = ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG")
 

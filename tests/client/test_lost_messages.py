@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from service.client import Watch, endpoints, open_session
-from service.contract import channels
-from service.daemon.cell_streams import Arrivals, CellStreams
-from service.settings.config import Settings
 from support.cell import until
+from thirdhand.client import Watch, endpoints, open_session
+from thirdhand.contract import channels
+from thirdhand.daemon.cell_streams import Arrivals, CellStreams
+from thirdhand.settings.config import Settings
 
 COUNT, BYTES = 2000, 50_000  # 100 MB, more than sockets and queues hold
 

@@ -1,4 +1,4 @@
-"""`import thirdhand`: the same classes as in `service.client` however it is installed; and a
+"""`import thirdhand`: the same classes as in `thirdhand.client` however it is installed; and a
 connection's calls.
 """
 
@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.client import (
+from support.installed import isolated, unpacked, wheel_of
+from support.paths import ROOT
+from thirdhand.client import (
     Connection,
     Follower,
     SceneObject,
@@ -29,83 +31,44 @@ from service.client import (
     open_session,
     publisher,
 )
-from service.client.streams import wait_until_heard
-from service.contract import channels
-from service.contract.messages import JointState, PoseStamped
-from support.installed import CLIENT, isolated, unpacked, wheel_of
-from support.paths import ROOT
+from thirdhand.client.streams import wait_until_heard
+from thirdhand.contract import channels
+from thirdhand.contract.messages import JointState, PoseStamped
 
 DEPENDENCIES = ("zenoh", "msgspec")
 SAME = """
 import sys, thirdhand
-assert len(thirdhand.__all__) > 25
-from service import client
+from thirdhand import client
+assert len(client.__all__) > 25
 assert all(getattr(thirdhand, name) is getattr(client, name) for name in client.__all__)
 print(thirdhand.__file__, sorted({name.split(".")[0] for name in sys.modules} - sys.stdlib_module_names))
 """
-INSTALLED = {  # the projects, and the file that is then imported
-    "client": ([(CLIENT, False)], "thirdhand.py"),
-    "wheel": ([(ROOT, False)], "thirdhand/__init__.py"),
-    "editable": ([(ROOT, True)], "thirdhand/__init__.py"),
-    "client and wheel": ([(CLIENT, False), (ROOT, False)], "thirdhand/__init__.py"),
-    "client and editable": ([(CLIENT, False), (ROOT, True)], "thirdhand/__init__.py"),
-}
 
 
-@pytest.fixture(scope="module")
-def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Path, bool], Path]:
-    """The wheels by project and kind."""
-    kinds = ((CLIENT, False), (ROOT, False), (ROOT, True))
-    return {
-        (project, editable): wheel_of(project, tmp_path_factory.mktemp("wheel"), editable=editable)
-        for project, editable in kinds
-    }
-
-
-@pytest.mark.parametrize(("projects", "file"), INSTALLED.values(), ids=INSTALLED)
-def test_both_names_have_the_same_classes_and_import_nothing_else(
-    projects: list[tuple[Path, bool]], file: str, wheels: dict[tuple[Path, bool], Path], tmp_path: Path
-) -> None:
-    for project in projects:
-        unpacked(wheels[project], tmp_path)
-    done = isolated(tmp_path, SAME, *DEPENDENCIES)
+@pytest.mark.parametrize("editable", [False, True])
+def test_the_bare_distribution_is_the_client(editable: bool, tmp_path: Path) -> None:
+    site = unpacked(wheel_of(ROOT, tmp_path, editable=editable), tmp_path / "site")
+    done = isolated(site, SAME, *DEPENDENCIES)
     assert done.returncode == 0, done.stderr
     imported, _, modules = done.stdout.partition(" ")
-    assert imported == str(tmp_path / file)
-    assert set(ast.literal_eval(modules)) == {"__main__", "thirdhand", "service", *DEPENDENCIES}
-
-
-def test_the_two_distributions_share_no_file(wheels: dict[tuple[Path, bool], Path], tmp_path: Path) -> None:
-    """So that each is updated and removed without the other."""
-    folders = (unpacked(wheels[CLIENT, False], tmp_path / "client"), unpacked(wheels[ROOT, False], tmp_path / "wheel"))
-    client, whole = ({path.relative_to(one) for path in one.rglob("*") if path.is_file()} for one in folders)
-    assert len(client) > 20
-    assert client & whole == set()
-    modules = {path for path in client if path.suffix == ".py" and path.name != "thirdhand.py"}
-    assert {path.relative_to("_thirdhand_client") for path in modules} <= whole
-    metadata = (next(folders[0].glob("*.dist-info")) / "METADATA").read_text(encoding="utf-8")
+    assert imported == str((ROOT / "service" if editable else site) / "thirdhand" / "__init__.py")
+    assert set(ast.literal_eval(modules)) == {"__main__", "thirdhand", *DEPENDENCIES}
+    metadata = (next(site.glob("*.dist-info")) / "METADATA").read_text(encoding="utf-8")
     needs = [line for line in metadata.splitlines() if line.startswith("Requires-Dist: ") and ";" not in line]
     assert [line.split()[1].partition(">")[0] for line in needs] == ["eclipse-zenoh", "msgspec"]
 
 
-@pytest.mark.parametrize("module", [True, False])
-def test_another_package_of_the_name_service_is_named(
-    module: bool, wheels: dict[tuple[Path, bool], Path], tmp_path: Path
-) -> None:
-    site, other = unpacked(wheels[CLIENT, False], tmp_path / "site"), tmp_path / "own"
-    (other / ("" if module else "service")).mkdir(parents=True)
-    file = other / ("service.py" if module else "service/__init__.py")
-    file.write_text("")
-    code = f"import sys; sys.path.insert(0, {str(other)!r})\nimport service\nimport thirdhand"
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [("serve", "cell"), ("learn take.mcap --output skill.npz", "cell"), ("sim", "cell"), ("status", "cell")],
+)
+def test_a_command_whose_extra_is_missing_says_what_to_install(command: str, extra: str, tmp_path: Path) -> None:
+    site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
+    code = f"import sys\nsys.argv[1:] = {command.split()}\nfrom thirdhand.__main__ import main\nsys.exit(main())"
     done = isolated(site, code, *DEPENDENCIES)
-    assert f"ImportError: `import thirdhand` found another package named `service` ({file})" in done.stderr
-
-
-def test_the_client_alone_can_be_read_by_python_3_10(wheels: dict[tuple[Path, bool], Path], tmp_path: Path) -> None:
-    sources = list(unpacked(wheels[CLIENT, False], tmp_path).rglob("*.py"))
-    assert len(sources) > 20
-    for path in sources:
-        ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 10))
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.endswith(f"is not installed: pip install 'thirdhand[{extra}]'\n")
 
 
 # --- a connection --------------------------------------------------------------------------------
@@ -311,7 +274,7 @@ def test_a_connection_that_another_thread_closes_says_so(listener: zenoh.Session
 
 
 def test_what_nobody_hears_is_refused(cell: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.client.connection.LISTENER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("thirdhand.client.connection.LISTENER_TIMEOUT_S", 0.2)
     with pytest.raises(UnreachableError, match=r"nobody listens to bench/tool/pose: is a daemon or `thirdhand record`"):
         cell.tool((0, 0, 0))
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.client import Watch, endpoints, open_session
-from service.contract.messages import PoseStamped
 from support.cell import until
 from support.examples import example
 from support.paths import ROOT
+from thirdhand.client import Watch, endpoints, open_session
+from thirdhand.contract.messages import PoseStamped
 
 
 def test_rigid_bodies_that_are_tracked_are_hands() -> None:

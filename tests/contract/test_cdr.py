@@ -16,11 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from service.contract import cdr, channels, messages, requests
-from service.contract.channels import EVENT_NUMBERS
-from service.contract.ros2msg import schema
-from service.core.frame import definitions
 from support.wam import JOINT_NAMES
+from thirdhand.contract import (
+    cdr,
+    channels,
+    messages,
+    requests,
+)
+from thirdhand.contract.channels import EVENT_NUMBERS
+from thirdhand.contract.ros2msg import schema
+from thirdhand.core.frame import definitions
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES = ("", "b", "ba", "bas", "base", "base_", "base_l", "a/tracker/over there", "tête")

@@ -15,10 +15,10 @@ from random import Random
 
 import pytest
 
-from service.contract import cdr
-from service.contract.messages import WireError
-from service.contract.requests import RequestError
 from support.hostile_bytes import DECODERS, FOUND, REQUESTS, check, mutated, seeds
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import WireError
+from thirdhand.contract.requests import RequestError
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "1500"))
 LARGE = 2_000_000  # bytes, far more than any message has

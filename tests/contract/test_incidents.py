@@ -12,14 +12,33 @@ from pathlib import Path
 
 import pytest
 
-from service.contract.evidence import Evidence, explained
-from service.contract.incidents import BY_WORD, INCIDENTS, Condition, in_full, what_happened, what_to_do, word
-from service.contract.records import GONE_S, Cause, Flag, Mode, Reason
-from service.contract.requests import Source
-from service.core.intake import CONFIRMED_SAMPLES
-from service.core.tuning import TUNING
-from service.settings.config import ArmSettings, HandSettings, Settings, ToolSettings
 from support.paths import ROOT
+from thirdhand.contract.evidence import Evidence, explained
+from thirdhand.contract.incidents import (
+    BY_WORD,
+    INCIDENTS,
+    Condition,
+    in_full,
+    what_happened,
+    what_to_do,
+    word,
+)
+from thirdhand.contract.records import (
+    GONE_S,
+    Cause,
+    Flag,
+    Mode,
+    Reason,
+)
+from thirdhand.contract.requests import Source
+from thirdhand.core.intake import CONFIRMED_SAMPLES
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import (
+    ArmSettings,
+    HandSettings,
+    Settings,
+    ToolSettings,
+)
 
 STUCK_S = TUNING.decision.stuck_s
 TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s
@@ -39,16 +58,16 @@ def test_each_member_has_one_row_with_words_of_its_own() -> None:
 
 def test_a_new_member_does_not_import_until_it_is_described(tmp_path: Path) -> None:
     """The first step of a contributor who adds a reason, and the answer."""
-    shutil.copytree(ROOT / "service" / "contract", tmp_path / "service" / "contract")
-    (tmp_path / "service" / "__init__.py").touch()
-    records = tmp_path / "service" / "contract" / "records.py"
+    shutil.copytree(ROOT / "service" / "thirdhand" / "contract", tmp_path / "thirdhand" / "contract")
+    (tmp_path / "thirdhand" / "__init__.py").touch()
+    records = tmp_path / "thirdhand" / "contract" / "records.py"
     text = records.read_text(encoding="utf-8")
     for kind in (Mode, Reason, Flag, Cause):
         first = f"    {next(iter(kind)).name} = "
         assert text.count(first) == 1
         text = text.replace(first, f"    PLANTED_{kind.__name__.upper()} = 128\n{first}")
     records.write_text(text, encoding="utf-8")
-    command = (sys.executable, "-c", "import service.contract.incidents")
+    command = (sys.executable, "-c", "import thirdhand.contract.incidents")
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)
     planted = "planted_cause, planted_flag, planted_mode, planted_reason"
     assert done.stderr.splitlines()[-1] == f"NotImplementedError: no incident is described for {planted}"
@@ -56,18 +75,19 @@ def test_a_new_member_does_not_import_until_it_is_described(tmp_path: Path) -> N
 
 def test_a_reason_is_named_where_it_is_decided_and_explained_and_hardly_elsewhere() -> None:
     """So a new one needs `records.py`, `incidents.py` and the stage that decides it."""
+    package = ROOT / "service" / "thirdhand"
     named = {
-        (str(path.relative_to(ROOT / "service")), found)
-        for path in (ROOT / "service").rglob("*.py")
-        if not path.is_relative_to(ROOT / "service" / "core") and not path.is_relative_to(ROOT / "service" / "contract")
+        (str(path.relative_to(package)), found)
+        for path in package.rglob("*.py")
+        if path.relative_to(package).parts[0] not in ("core", "contract")
         for found in re.findall(r"\bReason\.([A-Z_]+)", path.read_text(encoding="utf-8"))
     }
     assert named == {
         ("cli/diagnosis.py", "TWO_SOURCES"),  # that `doctor` foresees
         ("daemon/daemon.py", "ARM_NOT_READY"),  # before the first tick
         ("daemon/status.py", "NONE"),
-        ("files/track_check.py", "NONE"),  # takes are checked as live hands are
-        ("files/track_check.py", "TWO_SOURCES"),
+        ("workbench/takes/track_check.py", "NONE"),  # takes are checked as live hands are
+        ("workbench/takes/track_check.py", "TWO_SOURCES"),
     }
 
 

@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from service.contract.joint_states import JointStates, measured
-from service.contract.messages import JointState, WireError
+from thirdhand.contract.joint_states import JointStates, measured
+from thirdhand.contract.messages import JointState, WireError
 
 NAMES = ("a", "b", "c")
 NAN = math.nan

@@ -12,15 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.cli.main import main
-from service.cli.serve import PrintableFormatter
-from service.client import RefusedError, decoded
-from service.contract.printable import as_markdown, printable, printable_lines, printable_values
-from service.contract.requests import Status
-from service.learning.skill_file import SkillError
-from service.learning.skill_file import decoded as skill_of
-from service.viewer.learned import about, skill_contents
 from support.wicked import WICKED, wicked_skill
+from thirdhand.cli.serve import PrintableFormatter
+from thirdhand.client import RefusedError, decoded
+from thirdhand.command_line import main
+from thirdhand.contract.printable import (
+    as_markdown,
+    printable,
+    printable_lines,
+    printable_values,
+)
+from thirdhand.contract.requests import Status
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.skills.skill_file import decoded as skill_of
+from thirdhand.viewer.learned import about, skill_contents
 
 
 @given(st.text())
@@ -45,7 +50,7 @@ def test_names_inside_a_skill_are_escaped_where_the_skill_is_read_and_drawn() ->
     assert skill_of(wicked_skill(), origin="a file").name == printable(WICKED)
     contents = skill_contents(wicked_skill())
     assert contents.name == printable(WICKED)
-    text = about(contents, 0)
+    text = about(contents)
     assert text.count(as_markdown(WICKED)) == 3  # heading, a row of the table, a warning
     assert "\x1b" not in text
     assert "<b>" not in text

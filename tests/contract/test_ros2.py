@@ -15,10 +15,10 @@ from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
-from service.contract import cdr, channels, ros2
-from service.settings.config import parse
-from service.settings.file_content import SettingsError
-from service.settings.network import Ros2
+from thirdhand.contract import cdr, channels, ros2
+from thirdhand.settings.config import parse
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.network import Ros2
 
 CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
 COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.skill.skill import Skill
-from service.learning.via_points import adapted
-from sim.scene import Scene
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import Scene
 
 
 @pytest.fixture(scope="session")

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.contract.messages import BASE
-from service.core.arm.stage import Arm
-from service.core.limiter.stage import Limiter
-from service.core.skill.skill import clamp
-from service.settings.config import ArmSettings, Settings
 from support.followed import changed
 from support.wam import JOINT_NAMES, URDF
+from thirdhand.contract.messages import BASE
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.limiter.stage import Limiter
+from thirdhand.core.skill.skill import clamp
+from thirdhand.settings.config import ArmSettings, Settings
 
 Vector = npt.NDArray[np.float64]
 

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.records import Cause, Mode, Reason
-from service.core.frame import Event, order
-from service.core.skill.skill import Skill
-from service.settings.config import Settings
 from support.in_process import Loop, arm, assert_limits_hold, stamp_ns
+from thirdhand.contract.records import Cause, Mode, Reason
+from thirdhand.core.frame import Event, order
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings
 
 SETTINGS = Settings()
 POSTURE = SETTINGS.arm.posture

@@ -14,14 +14,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.contract.records import Flag, Mode, Reason
-from service.settings.config import robot_description
 from support import bounds
 from support.arm_geometry import ArmGeometry, between_segments, points_to_box, segments_to_box
 from support.bounds import Bound, Session, broken
 from support.coal_shapes import capsule, distance
 from support.drawn_cells import ARMS, drawn_cell
 from support.drawn_session import play
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.settings.config import robot_description
 
 SEEDS: tuple[int, ...] = (0, 1, *range(3, 20), 23)
 LENGTH = {"wild_ticks": 1000, "quiet_s": 8.0, "most_quiet_ticks": 2700}

@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.records import Mode, Reason
-from service.core.frame import Event, Tick, order
-from service.core.skill.pose import CLOSED, OPEN, UNKNOWN
-from service.core.skill.skill import Skill
-from service.learning.via_points import adapted
-from service.settings.config import Settings
-from sim.scene import Scene
 from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, Loop, clutch, resting, wish
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.frame import Event, Tick, order
+from thirdhand.core.skill.pose import CLOSED, OPEN, UNKNOWN
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import Scene
 
 LOOP_RATES_HZ = (100, 250, 500, 1000)
 SENT_HZ = 10

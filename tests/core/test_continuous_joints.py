@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract.records import Cause, Mode, Reason
-from service.core.arm.stage import Arm
-from service.core.frame import Vector, order
-from service.core.geometry import quaternion_of
-from service.core.skill.skill import Skill
-from service.core.way_out import WayOut
-from service.settings.config import Settings, load, robot_description
-from sim.scene import Scene
-from sim.script import HandScript
 from support.in_process import Loop, assert_limits_hold, script_hands
 from support.turning import CONTINUOUS, NEAR_SEAM, continuous_cell
+from thirdhand.contract.records import Cause, Mode, Reason
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.frame import Vector, order
+from thirdhand.core.geometry import quaternion_of
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.way_out import WayOut
+from thirdhand.settings.config import Settings, load, robot_description
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 TURN = 2.0 * math.pi
 Counts = Callable[[Vector], Vector]

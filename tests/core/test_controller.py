@@ -10,17 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.contract import channels
-from service.contract.records import Flag, Mode, Reason
-from service.core.controller import Controller, outgoing
-from service.core.frame import Event, Tick, definitions, order
-from service.core.skill.model import Regions
-from service.core.skill.skill import Skill
-from service.learning.skill_file import decoded
-from service.learning.via_points import adapted
-from service.settings.config import Settings
-from sim.scene import TOOL_FROM_HAND, Scene
-from sim.script import HandScript
 from support.followed import changed, followed
 from support.in_process import (
     ASSUMED,
@@ -38,6 +27,22 @@ from support.in_process import (
 )
 from support.paths import RECORDINGS
 from support.wam import URDF
+from thirdhand.contract import channels
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core.controller import Controller, outgoing
+from thirdhand.core.frame import (
+    Event,
+    Tick,
+    definitions,
+    order,
+)
+from thirdhand.core.skill.model import Regions
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import TOOL_FROM_HAND, Scene
+from thirdhand_sim.script import HandScript
 
 PERIOD_S = 0.002
 POSTURE = Settings().arm.posture
@@ -56,7 +61,7 @@ def record_types(part: object) -> list[np.dtype[np.void]]:
     for value in vars(part).values():
         if isinstance(value, np.ndarray) and value.dtype.names:
             found.append(value.dtype)
-        elif type(value).__module__.startswith("service.core.") and hasattr(value, "__dict__"):
+        elif type(value).__module__.startswith("thirdhand.core.") and hasattr(value, "__dict__"):
             found += record_types(value)
     return found
 

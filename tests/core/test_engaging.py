@@ -11,17 +11,28 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.records import Flag, Mode, Reason
-from service.core.frame import Event, Tick, Vector, order
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING
-from service.settings.config import Settings, SettingsError, ToolSettings, parse, robot_description
-from sim.scene import Scene
-from sim.script import HandScript
 from support.arm_geometry import ArmGeometry
 from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, led, ticks_of
 from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core.frame import (
+    Event,
+    Tick,
+    Vector,
+    order,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import (
+    Settings,
+    SettingsError,
+    ToolSettings,
+    parse,
+    robot_description,
+)
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 BRIEF_HOLD_S = TUNING.intake.tracker_memory_s
 ENGAGED_GAP_M = TUNING.decision.stuck_gap_m

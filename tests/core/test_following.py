@@ -6,15 +6,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.messages import PoseStamped
-from service.core.frame import blank
-from service.core.intake.stage import Intake
-from service.core.setpoint.stage import SetpointGenerator
-from service.core.setpoint.tracker import tracker_gains
-from service.core.skill.model import Target
-from service.settings.config import Settings
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.core.frame import blank
+from thirdhand.core.intake.stage import Intake
+from thirdhand.core.setpoint.stage import SetpointGenerator
+from thirdhand.core.setpoint.tracker import tracker_gains
+from thirdhand.core.skill.model import Target
+from thirdhand.settings.config import Settings
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)])

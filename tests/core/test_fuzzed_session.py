@@ -9,17 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract import channels
-from service.contract.messages import WireError
-from service.contract.records import Mode
-from service.contract.requests import RequestError
-from service.core.controller import Controller, run
-from service.core.frame import Event, Frame, Tick, order
-from service.core.skill.skill import Skill
-from service.files.recording import Recorder
-from service.settings.config import Settings
 from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
 from support.wam import URDF
+from thirdhand.contract import channels
+from thirdhand.contract.messages import WireError
+from thirdhand.contract.records import Mode
+from thirdhand.contract.requests import RequestError
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Tick,
+    order,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recorder
+from thirdhand.settings.config import Settings
 
 SETTINGS = Settings()
 SECONDS, EVERY = 12.0, 5  # between samples [ticks]

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract import cdr
-from service.contract.records import Flag, Mode, Reason
-from service.core.codes import HELD_SEEN, HELD_UNSEEN
-from service.core.frame import Event, order
-from service.core.skill.skill import Skill
-from service.settings.config import Settings
 from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, assert_replays
+from thirdhand.contract import cdr
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core.codes import HELD_SEEN, HELD_UNSEEN
+from thirdhand.core.frame import Event, order
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings
 
 CELL = Settings()
 LED_RAD = 0.4  # four times the difference at which an arm that is not guided is at fault

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from service.core.frame import Vector, parameters
-from service.core.intake import MODES, STATES, mode_filter
-from service.core.intake.hand_estimator import stillness_of
-from service.core.intake.motion_model import REST, model
-from service.core.intake.stage import Intake
-from service.core.tuning import TUNING
-from service.settings.config import Settings
 from support.tracked import LEFT, PERIOD_S, Hands, follow
+from thirdhand.core.frame import Vector, parameters
+from thirdhand.core.intake import MODES, STATES, mode_filter
+from thirdhand.core.intake.hand_estimator import stillness_of
+from thirdhand.core.intake.motion_model import REST, model
+from thirdhand.core.intake.stage import Intake
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import Settings
 
 LEAST_NOISE_M = TUNING.intake.least_noise_m
 

@@ -11,14 +11,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from service.contract.messages import PoseStamped
-from service.contract.records import Cause
-from service.core.geometry import rotation
-from service.core.intake.far_away import too_far
-from service.core.intake.stage import z_reversed
-from service.settings.config import HandSettings, TrackerSettings
 from support.tracked import LEFT, RIGHT, STRAIGHT, Hands, follow
 from support.wam import JOINT_NAMES
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.contract.records import Cause
+from thirdhand.core.geometry import rotation
+from thirdhand.core.intake.far_away import too_far
+from thirdhand.core.intake.stage import z_reversed
+from thirdhand.settings.config import HandSettings, TrackerSettings
 
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear, minimize
 
-from service.core.arm.least_squares import keep_under, least_squares
-from service.core.arm.stage import Arm
-from service.core.arm.step import describe
-from service.core.decision.step import measured_error
-from service.core.frame import Vector, parameters
-from service.core.kinematics import tool_speed_after, tool_speeds
-from service.core.setpoint.step import slow_down
-from service.core.tuning import TUNING
-from service.files.shipped import cell_of
-from service.settings.config import robot_description
+from thirdhand.core.arm.least_squares import keep_under, least_squares
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.step import describe
+from thirdhand.core.decision.step import measured_error
+from thirdhand.core.frame import Vector, parameters
+from thirdhand.core.kinematics import tool_speed_after, tool_speeds
+from thirdhand.core.setpoint.step import slow_down
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import robot_description
 
 DAMPING_M2 = TUNING.arm.damping_m2
 TURN_LEVER_M = TUNING.arm.turn_lever_m

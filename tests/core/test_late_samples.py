@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.records import Cause
-from service.core.frame import Vector
-from service.core.intake.late_samples import lateness_ms
 from support.tracked import LEFT, PERIOD_S, RIGHT, Hands
+from thirdhand.contract.records import Cause
+from thirdhand.core.frame import Vector
+from thirdhand.core.intake.late_samples import lateness_ms
 
 WARM_S = 2.5  # in which a clock is found to be steady
 ZERO_NS = 1_700_000_000_000_000_000

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.core.joint_limits import approach_gain
-from service.core.limiter.stage import Limited, Limiter
-from service.settings.config import JointSettings
+from thirdhand.core.joint_limits import approach_gain
+from thirdhand.core.limiter.stage import Limited, Limiter
+from thirdhand.settings.config import JointSettings
 
 PERIOD = 0.002  # [s]
 LIMITS = JointSettings()

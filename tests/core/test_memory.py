@@ -7,15 +7,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.contract.records import Field
-from service.core.skill import ORDER, TURNS
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.memory import features, moving_features, remember, turning
-from service.core.skill.tuning import MEMORY_LAG_S, TURN_LAG_S, TURN_WEIGHT_M
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.skill_file import StoredSkill, decoded
 from support.skills import at_rest, figures_of
+from thirdhand.contract.records import Field
+from thirdhand.core.skill import ORDER, TURNS
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.memory import (
+    features,
+    moving_features,
+    remember,
+    turning,
+)
+from thirdhand.core.skill.tuning import MEMORY_LAG_S, TURN_LAG_S, TURN_WEIGHT_M
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import StoredSkill, decoded
+from thirdhand.workbench.learning.learn import learn
 
 FIELDS = (
     Field("tick", "int64"),

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
-from service.core.skill import ORDER
-from service.core.skill.model import Model, Motion, Seen
-from service.core.skill.skill import MODELS, UNTOLD, Skill
-from service.core.skill.tuning import TURN_LAG_S
-from service.learning.skill_file import decoded, with_file
-from service.learning.via_points import adapted
-from sim.scene import Scene
 from support.paths import RECORDINGS
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill import ORDER
+from thirdhand.core.skill.model import Model, Motion, Seen
+from thirdhand.core.skill.skill import MODELS, UNTOLD, Skill
+from thirdhand.core.skill.tuning import TURN_LAG_S
+from thirdhand.skills.skill_file import decoded, with_file
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import Scene
 
 FILES = {"HandsKMP": "experiments/as-paper.npz", "StagedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])

@@ -15,18 +15,18 @@ from hypothesis import example, given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.messages import PoseStamped
-from service.contract.records import Cause, Mode, Reason
-from service.core.frame import Tick, Vector, copied
-from service.core.intake import plausibility, step
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING
-from sim.people import person
-from sim.sessions import session
 from support.followed import followed
 from support.in_process import LEFT, RIGHT, led
 from support.tracked import LEFT as LEFT_SIDE
 from support.tracked import PERIOD_S, STRAIGHT, Hands
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.contract.records import Cause, Mode, Reason
+from thirdhand.core.frame import Tick, Vector, copied
+from thirdhand.core.intake import plausibility, step
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand_sim.people import person
+from thirdhand_sim.sessions import session
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
 

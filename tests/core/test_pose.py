@@ -12,24 +12,38 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
-from service.contract import cdr
-from service.core.arm.stage import Arm
-from service.core.controller import outgoing
-from service.core.frame import blank, state_layout
-from service.core.geometry import axis_of, off_target, quaternion_of, swing, turn_between, turn_on
-from service.core.limiter.stage import Limiter
-from service.core.setpoint.orientation import OrientationSetpoint
-from service.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
-from service.core.skill.skill import Skill
-from service.core.skill.tuning import GRIPPER_MOVES_S
-from service.core.tuning import TUNING
-from service.learning.via_points import adapted
-from service.settings.config import Settings
-from sim.scene import TOOL_ORIENTATION, Scene
-from sim.script import HandScript
 from support.followed import changed, followed
 from support.in_process import ticks_of
 from support.wam import FRAME, URDF
+from thirdhand.contract import cdr
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.controller import outgoing
+from thirdhand.core.frame import blank, state_layout
+from thirdhand.core.geometry import (
+    axis_of,
+    off_target,
+    quaternion_of,
+    swing,
+    turn_between,
+    turn_on,
+)
+from thirdhand.core.limiter.stage import Limiter
+from thirdhand.core.setpoint.orientation import OrientationSetpoint
+from thirdhand.core.skill.pose import (
+    CLOSED,
+    NO_GRIPPER,
+    OPEN,
+    UNKNOWN,
+    LearnedOrientation,
+    decided,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.tuning import GRIPPER_MOVES_S
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import Settings
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import TOOL_ORIENTATION, Scene
+from thirdhand_sim.script import HandScript
 
 PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
 

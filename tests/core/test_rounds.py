@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.contract.records import Mode
-from service.core.frame import Event, Vector, order
-from service.core.skill.skill import Skill
-from sim.scene import Scene
-from sim.script import HandScript
 from support.in_process import ASSUMED, Loop
+from thirdhand.contract.records import Mode
+from thirdhand.core.frame import Event, Vector, order
+from thirdhand.core.skill.skill import Skill
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 BACK_S, REST_S = 2.0, (1.5, 0.5, 1.0, 3.0, 0.5, 0.5)
 HALF = 3  # the round that is broken off half-way

@@ -21,18 +21,6 @@ from msgspec.structs import replace
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from service.contract.records import Mode, Reason
-from service.core.controller import Controller, start_state
-from service.core.frame import Tick, Vector, order
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING
-from service.files.shipped import cell_of as shipped
-from service.learning.learn import learn
-from service.learning.skill_file import decoded
-from service.settings.config import FOLLOWING, Settings, robot_description
-from sim.scene import Scene
-from sim.script import HandScript
-from sim.teach import demonstrations
 from support.arms import MODELS, cell_of
 from support.in_process import (
     ASSUMED,
@@ -49,6 +37,18 @@ from support.in_process import (
 from support.paths import RECORDINGS
 from support.skills import at_rest
 from support.starts import free_postures
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.controller import Controller, start_state
+from thirdhand.core.frame import Tick, Vector, order
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings.shipped import cell_of as shipped
+from thirdhand.settings.config import FOLLOWING, Settings, robot_description
+from thirdhand.skills.skill_file import decoded
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
+from thirdhand_sim.teach import demonstrations
 
 HAND_BRAKE_MPS2 = TUNING.setpoint.hand_brake_mps2
 

@@ -15,30 +15,48 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
-from service.contract.records import Flag, Mode
-from service.core.arm.stage import Arm
-from service.core.controller import Controller, start_state
-from service.core.frame import Record, Tick, Vector, blank, frame_layout
-from service.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
-from service.core.kinematics import Kinematics
-from service.core.limiter.stage import LimiterStage
-from service.core.separation import TABLE_DEPTH_M
-from service.core.separation.body import Body, body_of
-from service.core.separation.clearance import NEAR_ITSELF, NOBODY
-from service.core.separation.stage import Separation
-from service.core.separation.step import allowed_speed
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING
-from service.files.shipped import shipped_skill
-from service.settings.config import Box, Obstacles, Settings, TableTop, robot_description
-from sim.experiments.separation import nearest as measured
-from sim.scene import Scene
-from sim.script import HandScript
 from support import coal_shapes
 from support.arms import MODELS, cell_of
 from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, frames, seen
 from support.wam import STATE, URDF
+from thirdhand.contract.records import Flag, Mode
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.controller import Controller, start_state
+from thirdhand.core.frame import (
+    Record,
+    Tick,
+    Vector,
+    blank,
+    frame_layout,
+)
+from thirdhand.core.geometry import (
+    between_segments,
+    nearest_to_box,
+    place,
+    quaternion_of,
+    to_box,
+)
+from thirdhand.core.kinematics import Kinematics
+from thirdhand.core.limiter.stage import LimiterStage
+from thirdhand.core.separation import TABLE_DEPTH_M
+from thirdhand.core.separation.body import Body, body_of
+from thirdhand.core.separation.clearance import NEAR_ITSELF, NOBODY
+from thirdhand.core.separation.stage import Separation
+from thirdhand.core.separation.step import allowed_speed
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import (
+    Box,
+    Obstacles,
+    Settings,
+    TableTop,
+    robot_description,
+)
+from thirdhand_sim.lab.separation import nearest as measured
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 SLIP_SPEED_MPS = TUNING.separation.slip_speed_mps
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS

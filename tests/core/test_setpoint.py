@@ -11,19 +11,19 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.core.arm.stage import Arm
-from service.core.frame import Vector, blank, frame_layout
-from service.core.setpoint.bounds import speed_to_come, stop_distance
-from service.core.setpoint.stage import SetpointGenerator, SetpointStage
-from service.core.setpoint.step import slow_down
-from service.core.setpoint.tracker import waiting
-from service.core.skill.model import Target, Wanted
-from service.core.stops import fastest_stop
-from service.core.tuning import TUNING
-from service.settings.config import FOLLOWING, Settings, ToolSettings
 from support.explained import Explained, margin
 from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 from support.wam import STATE, URDF
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.frame import Vector, blank, frame_layout
+from thirdhand.core.setpoint.bounds import speed_to_come, stop_distance
+from thirdhand.core.setpoint.stage import SetpointGenerator, SetpointStage
+from thirdhand.core.setpoint.step import slow_down
+from thirdhand.core.setpoint.tracker import waiting
+from thirdhand.core.skill.model import Target, Wanted
+from thirdhand.core.stops import fastest_stop
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import FOLLOWING, Settings, ToolSettings
 
 HULL_MARGIN_M = TUNING.setpoint.hull_margin_m
 HULL_TIME_S = TUNING.setpoint.hull_time_s

@@ -10,17 +10,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.contract.records import Cause, Mode, Reason
-from service.core.arm.stage import Arm
-from service.core.geometry import place
-from service.core.separation.body import body_of
-from service.core.separation.stage import Separation
-from service.core.skill.skill import Skill
-from service.settings.config import Settings, robot_description
-from sim.scene import Scene
-from sim.script import HandScript
 from support.in_process import Loop, assert_limits_hold, assert_replays, script_hands
 from support.turning import ARMS, BEYOND, cell_in, sliding_cell
+from thirdhand.contract.records import Cause, Mode, Reason
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.geometry import place
+from thirdhand.core.separation.body import body_of
+from thirdhand.core.separation.stage import Separation
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 
 @pytest.fixture(scope="module")

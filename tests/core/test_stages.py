@@ -7,18 +7,23 @@ import itertools
 import numpy as np
 import pytest
 
-from service.core.controller import Controller, start_state
-from service.core.frame import Tick, order, structured
-from service.core.skill.memory import along, delayed
-from service.core.skill.skill import Skill
-from service.core.skill.stage import SkillStage
-from service.core.skill.stages import MOST_STAGES, STAGE, along_way, recognise
-from service.core.skill.tuning import FIRST_STAGE_ODDS
-from service.files.shipped import shipped_skill
-from service.learning.skill_file import decoded
-from service.settings.config import Settings
 from support.paths import RECORDINGS
 from support.wam import URDF
+from thirdhand.core.controller import Controller, start_state
+from thirdhand.core.frame import Tick, order, structured
+from thirdhand.core.skill.memory import along, delayed
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.stage import SkillStage
+from thirdhand.core.skill.stages import (
+    MOST_STAGES,
+    STAGE,
+    along_way,
+    recognise,
+)
+from thirdhand.core.skill.tuning import FIRST_STAGE_ODDS
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import decoded
 
 PERIOD_S = 0.01
 

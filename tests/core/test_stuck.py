@@ -15,19 +15,25 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from service.contract.records import Flag, Mode, Reason
-from service.core.arm.stage import Arm
-from service.core.controller import Controller, start_state
-from service.core.decision import WAY
-from service.core.frame import Event, Frame, Tick, Vector, order
-from service.core.separation.stage import Separation
-from service.core.skill.skill import Skill
-from service.core.way_out import WayOut
-from service.settings.config import Settings, robot_description
 from support.arms import cell_of
 from support.in_process import ASSUMED, Loop, assert_limits_hold, assert_replays, seen
 from support.starts import free_postures
 from support.wam import URDF
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.controller import Controller, start_state
+from thirdhand.core.decision import WAY
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Tick,
+    Vector,
+    order,
+)
+from thirdhand.core.separation.stage import Separation
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.way_out import WayOut
+from thirdhand.settings.config import Settings, robot_description
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "4"))
 SOUGHT_S, AGAIN_S = 0.3, 2.0  # that a search takes, and until the next one

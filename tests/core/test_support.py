@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from service.core.controller import start_state
-from service.core.frame import blank, frame_layout
-from service.core.numerics import UNPRIMED_DECIDED
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.model import LEVELS, NORMAL_RATIOS, Regions
-from service.core.skill.skill import Skill
-from service.core.skill.stage import SkillStage
-from service.core.skill.staged import StagedKMP, Unknown
-from service.core.skill.support import LocalErrors, error_probability
-from service.core.skill.tuning import LEAST_STD_M, UNSURE_M
-from service.files.shipped import shipped_skill
-from service.learning.skill_file import decoded, with_file
-from service.settings.config import Settings
-from sim.scene import Scene
 from support.paths import RECORDINGS
 from support.skills import at_rest
+from thirdhand.core.controller import start_state
+from thirdhand.core.frame import blank, frame_layout
+from thirdhand.core.numerics import UNPRIMED_DECIDED
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.model import LEVELS, NORMAL_RATIOS, Regions
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.stage import SkillStage
+from thirdhand.core.skill.staged import StagedKMP, Unknown
+from thirdhand.core.skill.support import LocalErrors, error_probability
+from thirdhand.core.skill.tuning import LEAST_STD_M, UNSURE_M
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import decoded, with_file
+from thirdhand_sim.scene import Scene
 
 FAR_STD_M = 0.3
 

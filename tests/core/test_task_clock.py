@@ -10,10 +10,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.skill import Prediction
-from service.core.skill.staged import StagedKMP
-from service.core.skill.task_clock import (
+from support.kinds import KINDS, learned, named, takes
+from support.skills import at_rest, figures_of
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.skill import Prediction
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.task_clock import (
     CLOCK_CHANGE,
     CLOCK_RATE,
     CLOCK_S,
@@ -23,13 +25,11 @@ from service.core.skill.task_clock import (
     count,
     counted,
 )
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.methods.clock import Tempo, clock_of
-from service.learning.skill_file import StoredSkill, decoded
-from sim.experiments.people.left_out import judged, left_out, predicted_rounds
-from support.kinds import KINDS, learned, named, takes
-from support.skills import at_rest, figures_of
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import StoredSkill, decoded
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.methods.clock import Tempo, clock_of
+from thirdhand_sim.lab.people.left_out import judged, left_out, predicted_rounds
 
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)

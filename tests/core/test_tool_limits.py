@@ -5,16 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.contract.records import Flag, Mode
-from service.contract.requests import ALONG_TASK, ANY_DIRECTION
-from service.core.arm.stage import Arm
-from service.core.frame import blank, frame_layout
-from service.core.skill.skill import Skill
-from service.core.tool_limits import binding, limits_of_task, path_of, tool_limits
-from service.core.tuning import TUNING
-from service.files.shipped import ARMS, cell_of
-from service.settings.config import Settings, robot_description
 from support.followed import changed
+from thirdhand.contract.records import Flag, Mode
+from thirdhand.contract.requests import ALONG_TASK, ANY_DIRECTION
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.frame import blank, frame_layout
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tool_limits import (
+    binding,
+    limits_of_task,
+    path_of,
+    tool_limits,
+)
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings.shipped import ARMS, cell_of
+from thirdhand.settings.config import Settings, robot_description
 
 PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 

@@ -15,17 +15,17 @@ import pkgutil
 import sys
 from pathlib import Path
 
-from service.process import one_blas_thread
+from thirdhand.process import one_blas_thread
 from numba.core.dispatcher import Dispatcher
 
 import kmp
-import service.core
-from service.settings.config import Settings, robot_description
-from service.core.warm_up import warm_up
+import thirdhand.core
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.core.warm_up import warm_up
 
 LOOPED = [
     importlib.import_module(found.name)
-    for package in (kmp, service.core)
+    for package in (kmp, thirdhand.core)
     for found in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
     if not found.name.endswith("__main__")
 ]
@@ -48,16 +48,16 @@ def compiled_by(skill):
     return compiled()
 """
 REPLAYED = """
-from service.cli.main import main
-from service.files.shipped import shipped_skill
+from thirdhand.command_line import main
+from thirdhand.recordings.shipped import shipped_skill
 
 before = compiled_by(shipped_skill())
 assert main(["replay", sys.argv[1]]) in (0, None)
 assert since(before) == {}, since(before)
 """
 OF_ANOTHER_KIND = """
-from service.contract.requests import ViaPoint
-from service.daemon.skill_worker import skill_of
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.daemon.skill_worker import skill_of
 
 place = ViaPoint(name="here", left=(0.6, -0.2, 0.3), right=(0.9, 0.3, 0.1), tool=(0.6, -0.2, 0.4))
 before = compiled_by(skill_of(Path(sys.argv[1])))

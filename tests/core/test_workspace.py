@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.core.frame import Vector
-from service.core.skill.skill import clamp, is_reachable
-from service.settings.config import Reach
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.skill import clamp, is_reachable
+from thirdhand.settings.config import Reach
 
 REACH = Reach()
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])

@@ -10,10 +10,10 @@ import pytest
 import zenoh
 from zenoh_ros2_sdk.session import ZenohSession
 
-from service.client import endpoints, open_session
-from service.core.skill.skill import Skill
-from service.daemon.skill_worker import SkillWorker
 from support.request_cell import PLACES, Cell
+from thirdhand.client import endpoints, open_session
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.skill_worker import SkillWorker
 
 
 @pytest.fixture(scope="session")

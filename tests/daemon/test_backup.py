@@ -7,14 +7,14 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from service.client import Client
-from service.daemon.saved_via_points import SavedViaPoints
-from service.learning.skill_file import skill_in
-from service.learning.via_points import adapted
-from service.settings.config import Files, Settings
-from sim.scene import Scene
 from support.cell import serving
 from support.paths import RECORDINGS, ROOT
+from thirdhand.client import Client
+from thirdhand.daemon.saved_via_points import SavedViaPoints
+from thirdhand.settings.config import Files, Settings
+from thirdhand.skills.skill_file import skill_in
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import Scene
 
 PAGE = (ROOT / "docs" / "operate.md").read_text(encoding="utf-8")
 

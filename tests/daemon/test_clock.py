@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from service.contract.requests import Percentiles
-from service.daemon import clock as clock_module
-from service.daemon.clock import (
+from thirdhand.contract.requests import Percentiles
+from thirdhand.daemon import clock as clock_module
+from thirdhand.daemon.clock import (
     BESIDE_NS,
     CREEP_NS,
     PREPARE_NS,

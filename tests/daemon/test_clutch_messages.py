@@ -9,17 +9,17 @@ from typing import Any
 
 import pytest
 
-from service.contract import cdr
-from service.contract.records import Mode, Reason
-from service.files.recording import Recording
-from service.files.replay import replay
 from support.cell import LISTENING, Daemon, Tracker, serving
 from support.paths import ROOT
+from thirdhand.contract import cdr
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay
 
 CLUTCHED = f'{LISTENING}\n[hands]\nclutch = "key"\n'
 SWITCH = """
 import sys, threading, time
-from service.client import connect
+from thirdhand.client import connect
 
 released = threading.Event()
 threading.Thread(target=lambda: (sys.stdin.readline(), released.set()), daemon=True).start()

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.client import RefusedError
-from service.contract.records import Mode
-from service.core.codes import HELD_SEEN, HELD_UNSEEN
-from service.core.skill.skill import Skill
-from service.learning.via_points import adapted
 from support.request_cell import PLACES, Cell
+from thirdhand.client import RefusedError
+from thirdhand.contract.records import Mode
+from thirdhand.core.codes import HELD_SEEN, HELD_UNSEEN
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.via_points import adapted
 
 ADD = {"op": "add"}
 

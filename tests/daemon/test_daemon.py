@@ -17,24 +17,24 @@ import numpy as np
 import pytest
 from zenoh.handlers import FifoChannel
 
-from service.cli.main import main
-from service.client import RefusedError
-from service.contract import cdr, messages, requests
-from service.core.arm.stage import Arm
-from service.core.controller import Controller
-from service.core.frame import Tick
-from service.core.skill.skill import Skill
-from service.daemon.status import MeasuredArm
-from service.files.recording import Recording
-from service.files.replay import replay
-from service.learning.learn import learn
-from service.settings.config import Settings, robot_description
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
 from support.cell_commands import assert_refused, python, succeeded
 from support.circling import circling
 from support.in_process import arm
 from support.paths import ROOT
 from support.wam import JOINT_NAMES
+from thirdhand.client import RefusedError
+from thirdhand.command_line import main
+from thirdhand.contract import cdr, messages, requests
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.status import MeasuredArm
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.workbench.learning.learn import learn
 
 HANDOVER = requests.ViaPoint(
     "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
@@ -199,7 +199,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
     shared_daemon.until(lambda s: not any(age < 300 for age in s["hand_age_ms"].values()))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
+        patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
     said = capsys.readouterr().err
     assert re.search(r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
@@ -208,7 +208,7 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
         assert main(add) == 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 0.0)
+            patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
             assert main(add) == 1
     assert "nothing was taught: hands or tool did not hold still" in capsys.readouterr().err
     (point,) = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
@@ -232,7 +232,7 @@ def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
         add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
         daemon.until(lambda s: s["tick"] > 0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.cli.here.HERE_TIMEOUT_S", 2.0)
+            patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 2.0)
             assert main([*add, "--here"]) == 1
         said = capsys.readouterr().err
         assert "waiting until right, tool are seen" in said

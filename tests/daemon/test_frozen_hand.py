@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract.messages import PoseStamped
-from service.core.frame import Vector
-from service.daemon.cell_streams import FROZEN_S, FrozenHand
 from support.cell import LEFT, Tracker, serving
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.core.frame import Vector
+from thirdhand.daemon.cell_streams import FROZEN_S, FrozenHand
 
 TURNED = (0.0, 0.0, 0.0, 1.0)
 

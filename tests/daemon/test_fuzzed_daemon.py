@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.contract import cdr
-from service.contract.records import Mode
-from service.settings.config import Settings
 from support.cell import serving
 from support.fuzzed import QUIET_S, Traffic, assert_recorded_session_keeps_the_bounds
+from thirdhand.contract import cdr
+from thirdhand.contract.records import Mode
+from thirdhand.settings.config import Settings
 
 SECONDS, INTERVAL_S = 5.0, 0.01
 INPUTS = ("hands/left", "hands/right", "joints/state")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.demo import too_busy
-from service.cli.status import rows
-from service.contract.evidence import Evidence, explained
-from service.contract.records import Mode, Reason
-from service.contract.requests import Source
-from service.daemon.machine import Machine
 from support.cell import Tracker, serving
+from thirdhand.cli.status import rows
+from thirdhand.contract.evidence import Evidence, explained
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import Source
+from thirdhand.daemon.machine import Machine
+from thirdhand.workbench.cli.demo import too_busy
 
 FOLLOWS, SILENT = (Mode.FOLLOW, Reason.NONE), (Mode.FAULT, Reason.ARM_SILENT)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.diagnosis import findings
-from service.contract import channels
-from service.contract.requests import Status
 from support.cell import LISTENING, serving, until
+from thirdhand.cli.diagnosis import findings
+from thirdhand.contract import channels
+from thirdhand.contract.requests import Status
 
 EVERY_INPUT = f'{LISTENING}\n[hands]\nclutch = "key"\ngripper = "key"\n[recording]\nalso = ["camera"]\n'
 HEARD = [channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded]

@@ -17,17 +17,30 @@ import zenoh
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
 from zenoh_ros2_sdk.session import ZenohSession
 
-from service.cli.cells import HEADS
-from service.cli.main import main
-from service.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
-from service.contract import cdr, channels, requests, ros2
-from service.contract.messages import PoseStamped
 from support.cell import LEFT, RIGHT, until
 from support.cell_commands import started
 from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
+from thirdhand.cli.cells import HEADS
+from thirdhand.client import (
+    Client,
+    Tracker,
+    UnreachableError,
+    cells,
+    endpoints,
+    open_session,
+    publisher,
+)
+from thirdhand.command_line import main
+from thirdhand.contract import (
+    cdr,
+    channels,
+    requests,
+    ros2,
+)
+from thirdhand.contract.messages import PoseStamped
 
 NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
 

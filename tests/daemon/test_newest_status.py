@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from service.client import Client
-from service.daemon.newest_status import NewestStatus
-from sim.scene import Scene
 from support.cell import Daemon, Tracker, serving
+from thirdhand.client import Client
+from thirdhand.daemon.newest_status import NewestStatus
+from thirdhand_sim.scene import Scene
 
 ROUNDS = 12
 

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.daemon.skill_worker import SkillWorker, way_out_of
-from service.files.demonstration_reader import write_demonstration
-from service.files.shipped import shipped_skill
-from service.settings.config import Settings
-from sim.scene import Scene
-from sim.teach import visits
 from support.cell import Daemon, Tracker, serving, thirdhand
 from support.paths import RECORDINGS
+from thirdhand.daemon.skill_worker import SkillWorker, way_out_of
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand.workbench.takes.demonstration_reader import write_demonstration
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import visits
 
 PLACES = Scene().via_points()
 TURNED = msgspec.structs.replace(PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03)
@@ -65,7 +65,7 @@ def commands_in(folder: Path) -> Iterator[str]:
     yield f"report {folder}/whole.mcap"
     yield f"tune {RECORDINGS}/golden.mcap --part 0 3"
     yield "bench --seconds 0.5"
-    yield f"arm service/arms/wam.urdf --output {folder}/arm.toml"
+    yield f"arm service/thirdhand/arms/wam.urdf --output {folder}/arm.toml"
     yield f"demo --output {folder}/demo"
 
 

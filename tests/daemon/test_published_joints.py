@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.contract import cdr
-from service.contract.messages import JointState
-from service.settings.config import Settings
 from support.cell import Daemon, serving, told
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import JointState
+from thirdhand.settings.config import Settings
 
 JOINTS = Settings().joints.names
 AT = dict(zip(JOINTS, Settings().arm.posture, strict=True))

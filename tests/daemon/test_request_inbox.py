@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.contract import cdr
-from service.contract.records import Mode
-from service.contract.requests import RequestError
-from service.core.frame import Event
-from service.core.skill.skill import Skill
-from service.daemon import request_inbox
-from service.daemon.request_inbox import MAX_HOLDERS, PendingRequest, RequestInbox
-from service.settings.config import Settings
 from support.in_process import Loop
+from thirdhand.contract import cdr
+from thirdhand.contract.records import Mode
+from thirdhand.contract.requests import RequestError
+from thirdhand.core.frame import Event
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon import request_inbox
+from thirdhand.daemon.request_inbox import MAX_HOLDERS, PendingRequest, RequestInbox
+from thirdhand.settings.config import Settings
 
 LED, NOT_LED = (Event("joints/guided", cdr.encode_bool(led), led) for led in (True, False))
 BY_HAND = "by hand"

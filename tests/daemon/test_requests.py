@@ -20,19 +20,24 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.cli.main import main
-from service.client import RefusedError, endpoints
-from service.contract import channels, requests
-from service.contract.records import Mode, Reason
-from service.core.skill.skill import Skill
-from service.daemon.daemon import load_skill
-from service.daemon.saved_via_points import SavedViaPoints
-from service.daemon.skill_worker import SkillWorker
-from service.learning.reach import beyond_m
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
-from service.learning.via_points import adapted
-from service.settings.config import Files, Reach, Settings
 from support.request_cell import PLACES, Cell
+from thirdhand.client import RefusedError, endpoints
+from thirdhand.command_line import main
+from thirdhand.contract import channels, requests
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.daemon import load_skill
+from thirdhand.daemon.saved_via_points import SavedViaPoints
+from thirdhand.daemon.skill_worker import SkillWorker
+from thirdhand.settings.config import Files, Reach, Settings
+from thirdhand.skills.reach import beyond_m
+from thirdhand.skills.skill_file import (
+    SkillError,
+    StoredSkill,
+    decoded,
+    with_file,
+)
+from thirdhand.skills.via_points import adapted
 
 HANDOVER = PLACES[0]
 ORDERS = ("hold", "resume", "reset")
@@ -235,7 +240,7 @@ def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to
 def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
     cell: Cell, monkeypatch: pytest.MonkeyPatch, state: str, message: str
 ) -> None:
-    monkeypatch.setattr("service.daemon.request_inbox.ADOPTION_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("thirdhand.daemon.request_inbox.ADOPTION_TIMEOUT_S", 0.05)
     setattr(cell, state, state == "fails")
     with pytest.raises(RefusedError, match=message):
         cell.client.add(PLACES)

@@ -17,16 +17,29 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from service.client import Client, cells, endpoints, living, open_session
-from service.client.session import CertificateError
-from service.contract import cdr, channels, ros2
-from service.contract.messages import PoseStamped
-from service.contract.roles import DAEMON, ROLES, ROUTER, TOPICS, access_control, names
-from service.daemon.launch import launched
-from service.daemon.single_instance import NETWORK_BOUNDS, occupy
 from support.cell import LEFT, Tracker, thirdhand, told, until
 from support.cell_commands import assert_refused, succeeded
 from support.certificates import make_certificates
+from thirdhand.client import (
+    Client,
+    cells,
+    endpoints,
+    living,
+    open_session,
+)
+from thirdhand.client.session import CertificateError
+from thirdhand.contract import cdr, channels, ros2
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.contract.roles import (
+    DAEMON,
+    ROLES,
+    ROUTER,
+    TOPICS,
+    access_control,
+    names,
+)
+from thirdhand.daemon.launch import launched
+from thirdhand.daemon.single_instance import NETWORK_BOUNDS, occupy
 
 CELL = "bench"
 NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")

@@ -13,12 +13,12 @@ import pytest
 import zenoh
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 
-from service.client import endpoints
-from service.settings.config import Settings
 from support.cell import Tracker, serving, until
 from support.ros2_nodes import header, port, typed
 from support.sabotage import SABOTAGE, fail
 from support.wam import JOINT_NAMES
+from thirdhand.client import endpoints
+from thirdhand.settings.config import Settings
 
 DOMAIN, RATE_HZ = 11, 250
 FORWARD, TRAJECTORY, STATES = "/arm/forward/commands", "/arm/jtc/joint_trajectory", "/arm/joint_states"

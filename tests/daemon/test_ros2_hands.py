@@ -17,14 +17,14 @@ import pytest
 import zenoh
 from zenoh_ros2_sdk import ROS2Publisher
 
-from service.client import endpoints, open_session
-from service.contract import cdr, channels, ros2
-from service.contract.messages import Quaternion, Transform, Vector3
-from service.files.replay import replay
-from service.settings.config import parse
-from service.trackers.capture import Capture
 from support.cell import LEFT, RIGHT, Daemon, serving, until
 from support.ros2_nodes import guarded, header, port, typed
+from thirdhand.client import endpoints, open_session
+from thirdhand.contract import cdr, channels, ros2
+from thirdhand.contract.messages import Quaternion, Transform, Vector3
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import parse
+from thirdhand.workbench.trackers.capture import Capture
 
 DOMAIN = 13
 KIND = "tf2_msgs/msg/TFMessage"

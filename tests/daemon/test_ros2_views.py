@@ -17,17 +17,17 @@ from zenoh import ext
 from zenoh_ros2_sdk import ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
-from service.client import endpoints, open_session
-from service.contract import cdr, ros2
-from service.contract.messages import JointState, Transform
-from service.core.frame import blank, frame_layout
-from service.core.transforms import Frames
-from service.daemon.ros2_domain import Ros2Domain
-from service.files.shipped import cell_of
-from service.settings.config import Settings, parse, robot_description
 from support.cell import Tracker, serving, until
 from support.ros2_nodes import TYPES, guarded, port, typed
 from support.wam import JOINT_NAMES
+from thirdhand.client import endpoints, open_session
+from thirdhand.contract import cdr, ros2
+from thirdhand.contract.messages import JointState, Transform
+from thirdhand.core.frame import blank, frame_layout
+from thirdhand.core.transforms import Frames
+from thirdhand.daemon.ros2_domain import Ros2Domain
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import Settings, parse, robot_description
 
 DOMAIN = 12
 VIEWED = """

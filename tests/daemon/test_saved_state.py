@@ -15,19 +15,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.cli.usage import added_in
-from service.contract.requests import RequestError
-from service.core.skill.skill import Skill
-from service.daemon.saved_stage import MAX_RESTART_S, SavedStage
-from service.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
-from service.daemon.saved_via_points import SavedViaPoints
-from service.daemon.single_instance import state_folder
-from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted
-from service.settings import mesh_cover
-from service.settings.config import WAM, Files, Settings, converted
-from sim.scene import Scene
 from support.cell import serving
+from thirdhand.cli.usage import added_in
+from thirdhand.contract.requests import RequestError
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.saved_stage import MAX_RESTART_S, SavedStage
+from thirdhand.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
+from thirdhand.daemon.saved_via_points import SavedViaPoints
+from thirdhand.daemon.single_instance import state_folder
+from thirdhand.settings import mesh_cover
+from thirdhand.settings.config import (
+    WAM,
+    Files,
+    Settings,
+    converted,
+)
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.scene import Scene
 
 POINTS = Scene().via_points()
 

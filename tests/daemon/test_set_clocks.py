@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from service.contract import cdr
 from support.cell import Daemon, Tracker, serving, told, until
 from support.cell_commands import succeeded
+from thirdhand.contract import cdr
 
 LIBRARY = next(iter(glob.glob("/usr/lib/*/faketime/libfaketimeMT.so.1")), "")
 OFFSETS_S = (0.3, 0.0, 3600.0, 0.0, 10 * 365 * 86_400.0)  # of the clock: set ahead and back in turn

@@ -7,11 +7,11 @@ import time
 
 import zenoh
 
-from service.contract.images import decode_image, image_in
-from service.daemon.cell_streams import Arrivals
-from service.daemon.side_streams import WAITING_IMAGES, SideStream
 from support.cell import until
 from support.pictures import grey
+from thirdhand.contract.images import decode_image, image_in
+from thirdhand.daemon.cell_streams import Arrivals
+from thirdhand.daemon.side_streams import WAITING_IMAGES, SideStream
 
 
 def test_images_are_passed_on_in_order_and_the_rest_is_counted(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:

@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.client import Client
-from service.client.connection import Connection
-from service.contract.requests import ANSWER_TIMEOUT_S, ViaPoint
-from service.core.skill.skill import Skill
-from service.daemon.request_inbox import ADOPTION_TIMEOUT_S
-from service.daemon.skill_worker import WORK_TIMEOUT_S, SkillWorker
-from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted, in_force
-from service.process import child
-from sim.scene import Scene
 from support.paths import RECORDINGS
+from thirdhand.client import Client
+from thirdhand.client.connection import Connection
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S, ViaPoint
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.request_inbox import ADOPTION_TIMEOUT_S
+from thirdhand.daemon.skill_worker import WORK_TIMEOUT_S, SkillWorker
+from thirdhand.process import child
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.skills.via_points import adapted, in_force
+from thirdhand_sim.scene import Scene
 
 PLACES = Scene().via_points()
 SOLDERING = RECORDINGS / "soldering.npz"
@@ -153,7 +153,7 @@ def test_a_slow_workshop_is_waited_for_and_what_it_has_imported_stays(
 
 
 def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.skill_worker.HUNG_S", 0.5)
+    monkeypatch.setattr("thirdhand.daemon.skill_worker.HUNG_S", 0.5)
     worker = SkillWorker()
     try:
         worker.load(SOLDERING)

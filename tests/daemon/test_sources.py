@@ -11,22 +11,33 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.contract.evidence import Evidence, explained
-from service.contract.incidents import what_to_do
-from service.contract.joint_states import JointStates
-from service.contract.messages import JointState, PoseStamped, WireError
-from service.contract.records import Cause, Reason
-from service.contract.requests import Percentiles, Source, Status
-from service.core.controller import Controller
-from service.core.frame import Event, Frame, Tick, blank, frame_layout
-from service.core.intake import KEPT
-from service.core.intake.stage import UNIT_M
-from service.core.skill.skill import Skill
-from service.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, apart_m, evidence
-from service.daemon.status import CellStatus
-from service.settings.config import HandSettings, Settings
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES, URDF
+from thirdhand.contract.evidence import Evidence, explained
+from thirdhand.contract.incidents import what_to_do
+from thirdhand.contract.joint_states import JointStates
+from thirdhand.contract.messages import JointState, PoseStamped, WireError
+from thirdhand.contract.records import Cause, Reason
+from thirdhand.contract.requests import Percentiles, Source, Status
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Tick,
+    blank,
+    frame_layout,
+)
+from thirdhand.core.intake import KEPT
+from thirdhand.core.intake.stage import UNIT_M
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.input_monitor import (
+    KEY_OF_SOURCE,
+    InputMonitor,
+    apart_m,
+    evidence,
+)
+from thirdhand.daemon.status import CellStatus
+from thirdhand.settings.config import HandSettings, Settings
 
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 S = 1_000_000_000

@@ -20,25 +20,32 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from service.cli.main import main
-from service.client import Client, StartingError, UnreachableError, cells, endpoints, open_session
-from service.contract.channels import CHANNELS
-from service.daemon import launch
-from service.daemon.launch import LaunchError, launched
-from service.daemon.start import LOG_EVERY_S, Startup, starting
-from service.process.priority import AHEAD_NICE
-from service.settings.config import Files, Settings
-from service.settings.network import Network
 from support.cell import LISTENING, serving
 from support.cell_commands import python
 from support.cell_commands import started as command_started
 from support.paths import ROOT
+from thirdhand.client import (
+    Client,
+    StartingError,
+    UnreachableError,
+    cells,
+    endpoints,
+    open_session,
+)
+from thirdhand.command_line import main
+from thirdhand.contract.channels import CHANNELS
+from thirdhand.daemon import launch
+from thirdhand.daemon.launch import LaunchError, launched
+from thirdhand.daemon.start import LOG_EVERY_S, Startup, starting
+from thirdhand.process.priority import AHEAD_NICE
+from thirdhand.settings.config import Files, Settings
+from thirdhand.settings.network import Network
 
 COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
 
 NEVER_CACHED = """
 import numba
-from service.daemon import daemon
+from thirdhand.daemon import daemon
 warm_up = daemon.warm_up
 daemon.warm_up = lambda *given, **more: (numba.njit(lambda x: x + 1)(1), warm_up(*given, **more))
 """
@@ -129,7 +136,7 @@ def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
     counts = [found for line in answers if (found := COUNTED.search(line))]
     there = [int(found[2]) for found in counts]
     assert there == sorted(there)
-    own = {path.stem for room in ("service/core", "kmp") for path in (ROOT / room).rglob("*.py")}
+    own = {path.stem for room in ("service/thirdhand/core", "kmp") for path in (ROOT / room).rglob("*.py")}
     assert {name.partition(".")[0] for name in compiled} <= own  # none of a library's own
     assert len({found[3] for found in counts}) == 1
     assert int(counts[0][3]) > 100  # of all that the loop may call
@@ -168,7 +175,7 @@ def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
     started[0].over()
     capsys.readouterr()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr("service.daemon.start.REPORT_EVERY_S", 0.01)
+    monkeypatch.setattr("thirdhand.daemon.start.REPORT_EVERY_S", 0.01)
     start = Startup(started[0].lock, started[0].session, "other")
     caplog.clear()
     functions = {str(number): SimpleNamespace(signatures=[]) for number in range(60)}
@@ -193,7 +200,7 @@ def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
 @pytest.mark.thorough
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "START_STALL_S", 16.0)
-    before = "import time\nfrom service.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
+    before = "import time\nfrom thirdhand.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
     said: list[str] = []
     stuck = r"no progress for 16 s.*last report: loading compiled functions, \d+ of \d+ functions"
     with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
@@ -220,7 +227,9 @@ def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: 
 )
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
     at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
-    code = f"import sys\nfrom service.cli.main import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"
+    code = (
+        f"import sys\nfrom thirdhand.command_line import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"
+    )
     done = python(f"{code}sys.exit(code)")
     assert done.returncode == 1
     assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
@@ -228,7 +237,8 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
 
 
 @pytest.mark.parametrize(
-    "command", ["service.cli.serve", "service.cli.demo", "service.daemon.start", "service.daemon.launch"]
+    "command",
+    ["thirdhand.cli.serve", "thirdhand.workbench.cli.demo", "thirdhand.daemon.start", "thirdhand.daemon.launch"],
 )
 def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
     code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"

@@ -17,14 +17,19 @@ from typing import Any
 
 import pytest
 
-from service.client import Client, RefusedError, UnreachableError, open_session
-from service.daemon.launch import free_port
-from service.daemon.single_instance import Lock
-from service.daemon.supervised_thread import supervised
-from service.files.replay import replay
 from support.cell import Daemon, Tracker, serving, thirdhand, until
 from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
+from thirdhand.client import (
+    Client,
+    RefusedError,
+    UnreachableError,
+    open_session,
+)
+from thirdhand.daemon.launch import free_port
+from thirdhand.daemon.single_instance import Lock
+from thirdhand.daemon.supervised_thread import supervised
+from thirdhand.recordings.replay import replay
 
 
 def children(pid: int) -> list[int]:
@@ -202,7 +207,8 @@ def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(t
     """Also beside a scribe that does not begin: the loop does not wait for it."""
     go, records = tmp_path / "go", tmp_path / "records"
     before = (
-        "import pathlib, time\nfrom service.process import child\nfrom service.daemon import daemon\nrun = daemon.run\n"
+        "import pathlib, time\nfrom thirdhand.process import child\nfrom thirdhand.daemon import daemon\n"
+        "run = daemon.run\n"
         f"def late(*arguments):\n    while not pathlib.Path({str(go)!r}).exists():\n        time.sleep(0.01)\n"
         "    run(*arguments)\ndaemon.run = late\n"
         "start = child.start\n"
@@ -259,11 +265,11 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
 def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     """A child that never looks at its socket, and a parent's thread that ends before it does."""
     (tmp_path / "busy.py").write_text(
-        "import time\nfrom service.process import child\n"
+        "import time\nfrom thirdhand.process import child\n"
         "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"
     )
     parent = (
-        "import socket, sys, threading, time\nfrom service.process import child\nstarted = []\n"
+        "import socket, sys, threading, time\nfrom thirdhand.process import child\nstarted = []\n"
         "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
         "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
         "print(started[0].pid, flush=True)\ntime.sleep(60)\n"
@@ -296,7 +302,7 @@ def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = (
-        f"exec {sys.executable} -m service serve --joints assumed --config {tmp_path}/cell.toml --listen {endpoint}"
+        f"exec {sys.executable} -m thirdhand serve --joints assumed --config {tmp_path}/cell.toml --listen {endpoint}"
     )
     running = subprocess.Popen(
         ["bash", "-c", f"{command} {streams}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

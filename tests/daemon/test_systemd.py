@@ -16,18 +16,18 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.main import parser
-from service.client import Client, RefusedError
-from service.daemon.systemd import Systemd
-from sim.scene import Scene
 from support.cell import LISTENING, Daemon, Tracker, serving, told
 from support.paths import ROOT
+from thirdhand.client import Client, RefusedError
+from thirdhand.command_line import parser
+from thirdhand.daemon.systemd import Systemd
+from thirdhand_sim.scene import Scene
 
 UNIT = ROOT / "examples" / "thirdhand@.service"
 PING_S = 0.2
 STANDS_STILL = """
 import pathlib, time
-from service.core import controller
+from thirdhand.core import controller
 
 def step(self, tick, *rest, honest=controller.Controller.step):
     while pathlib.Path({mark!r}).exists():
@@ -102,7 +102,7 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(manag
 
 DEAF = """
 import pathlib
-from service.daemon import own_answers, queryables
+from thirdhand.daemon import own_answers, queryables
 
 class Deaf(queryables.RequestQueue):
     def enqueue(self, request):
@@ -179,7 +179,10 @@ def commands() -> dict[str, list[str]]:
 
 def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
     options = {name: parser().parse_args(words[1:]) for name, words in commands().items()}
-    assert [options[name].run for name in ("ExecStartPre", "ExecStart")] == ["cli.serve_check.check", "cli.serve.serve"]
+    assert [options[name].run for name in ("ExecStartPre", "ExecStart")] == [
+        "thirdhand.cli.serve_check.check",
+        "thirdhand.cli.serve.serve",
+    ]
     assert options["ExecStart"].hold
     assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")  # it does not see the check's exit code
     assert {str(one.config) for one in options.values()} == {"/etc/thirdhand/%i.toml"}

@@ -19,13 +19,18 @@ from typing import Any
 
 import pytest
 
-from service.client import Client, RefusedError, UnreachableError, open_session
-from service.contract import channels
-from service.daemon.daemon import MAX_NOTES_PER_S
-from service.daemon.single_instance import MAX_SESSIONS
-from service.process.priority import AHEAD_NICE
 from support.cell import Daemon, serving
 from support.paths import ROOT
+from thirdhand.client import (
+    Client,
+    RefusedError,
+    UnreachableError,
+    open_session,
+)
+from thirdhand.contract import channels
+from thirdhand.daemon.daemon import MAX_NOTES_PER_S
+from thirdhand.daemon.single_instance import MAX_SESSIONS
+from thirdhand.process.priority import AHEAD_NICE
 
 pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
@@ -43,7 +48,7 @@ for _ in range(1500):
     held.append(one)
 """
 IDLE_SESSIONS = """
-from service.client import UnreachableError
+from thirdhand.client import UnreachableError
 held = []
 try:
     for _ in range(200):
@@ -75,7 +80,7 @@ for mib in (0, 400) * 4:
 print(*times)
 """
 FLOOD = """
-from service.contract.requests import Add, ViaPoint, encode_json
+from thirdhand.contract.requests import Add, ViaPoint, encode_json
 import threading
 kind = arguments[0]
 place = ViaPoint("a", (0.62, -0.28, 0.30), (0.98, 0.32, 0.06), (0.62, -0.28, 0.30))
@@ -133,7 +138,7 @@ with open_session(connect=[f"tcp/127.0.0.1:{near.getsockname()[1]}"]) as session
 @contextlib.contextmanager
 def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
     """Another process that attacks until the context ends; what it said when it was in place."""
-    code = f"import sys, time\nendpoint, *arguments = sys.argv[1:]\nfrom service.client import open_session\n{script}"
+    code = f"import sys, time\nendpoint, *arguments = sys.argv[1:]\nfrom thirdhand.client import open_session\n{script}"
     attacker = subprocess.Popen(
         [sys.executable, "-c", f"{code}\nprint('done', flush=True)\ntime.sleep(60)", daemon.endpoint, *arguments],
         stdout=subprocess.PIPE,
@@ -187,8 +192,8 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 HANDS = """
-from service.contract import cdr
-from service.contract.messages import PoseStamped
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import PoseStamped
 with open_session(connect=[endpoint]) as session:
     hands = [session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")]
     print("begun", flush=True)

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract import cdr
-from service.contract.channels import TRANSFORMS
-from service.contract.messages import Transform
-from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
-from service.files.mcap_file import McapFile, RecordingError
-from service.files.mcap_reader import Messages, full_name
-from service.files.pose_streams import ENDINGS, PoseTopic
-from service.files.recording import Recording
-from service.files.replay import replay
-from service.report.columns import read
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.recorded import write
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import TAKE_KEYS, TRANSFORMS
+from thirdhand.contract.messages import Transform
+from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.recordings.mcap_reader import Messages, full_name
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay
+from thirdhand.workbench.report.columns import read
+from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.pose_streams import PoseTopic
 
 TAKE = circling(0)._replace(gripper=np.full(600, 0.5))
 BAD: dict[str, Callable[[bytes], bytes]] = {
@@ -50,7 +50,7 @@ def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = rang
 
 
 @pytest.mark.parametrize("kind", BAD)
-@pytest.mark.parametrize("key", [*ENDINGS.values(), "gripper/state"])
+@pytest.mark.parametrize("key", [*TAKE_KEYS.values(), "gripper/state"])
 def test_a_bad_message_is_lost_and_counted(kind: str, key: str, tmp_path: Path) -> None:
     topic, remarks = f"/thirdhand/{key}", list[str]()
     write_demonstration(tmp_path / "take.mcap", TAKE)
@@ -70,12 +70,12 @@ def test_frames_that_nobody_asked_for_fail_no_take(tmp_path: Path) -> None:
     path, remarks, turn = tmp_path / "take.mcap", list[str](), (0.0, 0.0, 0.0, 1.0)
     with McapFile(path, joints=0, attached=False) as file:
         for i, stamp_ns in enumerate((TAKE.stamps_ns + 10**9).tolist()):
-            rows = zip(ENDINGS, (TAKE.left[i], TAKE.right[i], TAKE.tool[i]), strict=True)
+            rows = zip(TAKE_KEYS, (TAKE.left[i], TAKE.right[i], TAKE.tool[i]), strict=True)
             poses = [Transform("base", name, tuple(row[:3]), turn) for name, row in rows]
             elbow = Transform("world" if i else "base", "elbow", (0.0,) * 3, turn)  # two parents
             data = cdr.encode_transforms(stamp_ns, [*poses, elbow, elbow._replace(child="\x7f")])
             file.put("/tf", TRANSFORMS.type, data.replace(b"\x7f\0", b"\xff\0"), stamp_ns, i)
-    take = read_demonstration(path, topics={name: PoseTopic("/tf", name) for name in ENDINGS}, say=remarks.append)
+    take = read_demonstration(path, topics={name: PoseTopic("/tf", name) for name in TAKE_KEYS}, say=remarks.append)
     np.testing.assert_allclose(take.tool, TAKE.tool)
     assert f"{path}: /tf: 600 transforms are not readable: a string that is not UTF-8" in remarks
 

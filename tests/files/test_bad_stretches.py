@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract import cdr
-from service.contract.channels import JOINTS, POSE, STRING
-from service.contract.messages import JointState, PoseStamped
-from service.files.demonstration_files import summary
-from service.files.demonstration_reader import MIN_USABLE_SHARE, read_demonstration, write_demonstration
-from service.files.mcap_file import McapFile, RecordingError
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
 from support import spoiled
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.spoiled import SPOILS, START_NS, Streams, streams_of, write_streams
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import JOINTS, POSE, STRING
+from thirdhand.contract.messages import JointState, PoseStamped
+from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.takes.demonstration_files import summary
+from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration, write_demonstration
 
 SEEDS = 3
 BRIDGED_S, OFF_M = 0.5, 0.02  # a shorter stretch is bridged: positions may be off by this much then

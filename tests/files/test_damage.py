@@ -13,20 +13,20 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from service.cli.view import convert
-from service.contract.cdr import encode_pose
-from service.contract.channels import POSE
-from service.contract.messages import PoseStamped
-from service.core.frame import encode
-from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
-from service.files.mcap_file import McapFile, RecordingError
-from service.files.recorded_hands import recorded_hands
-from service.files.recording import Recorder, Recording
-from service.files.replay import replay
-from service.files.steps import Step
-from service.learning.demonstration import Demonstration
-from service.report.report import reported
 from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
+from thirdhand.contract.cdr import encode_pose
+from thirdhand.contract.channels import POSE
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.core.frame import encode
+from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.replay import replay
+from thirdhand.recordings.steps import Step
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.cli.view import convert
+from thirdhand.workbench.report.report import reported
+from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.recorded_hands import recorded_hands
 
 COUNT = 600
 

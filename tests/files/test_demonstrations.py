@@ -11,13 +11,13 @@ import pytest
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from service.contract import cdr, channels, messages
-from service.contract.ros2msg import schema
-from service.files.demonstration_reader import hand_samples, read_demonstration, write_demonstration
-from service.files.mcap_file import RecordingError
-from service.learning.demonstration import Demonstration
-from service.settings.config import Settings, TrackerSettings
 from support.recorded import START_NS, at_ns, write
+from thirdhand.contract import cdr, channels, messages
+from thirdhand.contract.ros2msg import schema
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import Settings, TrackerSettings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
 
 
 def _swaying(count: int) -> np.ndarray:

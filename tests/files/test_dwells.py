@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
-from service.files.demonstration_files import Summary, summary, table
-from service.files.demonstration_reader import write_demonstration
-from service.files.dwells import dwells, remarks_on_places
-from service.learning.demonstration import Demonstration
-from sim.scene import Scene
-from sim.teach import demonstrations
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes.demonstration_files import Summary, summary, table
+from thirdhand.workbench.takes.demonstration_reader import write_demonstration
+from thirdhand.workbench.takes.dwells import dwells, remarks_on_places
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import demonstrations
 
 SCENE = Scene()
 START = ViaPoint("start", SCENE.left_start, SCENE.right_start, SCENE.robot_start)

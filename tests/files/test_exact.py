@@ -13,20 +13,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
-from service.core.controller import Controller, start_state
-from service.core.frame import Tick, order
-from service.core.skill.skill import Skill
-from service.files.recording import Recorder
-from service.learning.demonstration import Demonstration
-from service.learning.skill_file import skill_in
-from service.learning.via_points import adapted
-from service.settings.config import robot_description
-from sim.experiments.people.left_out import RATE_HZ, hand_events
-from sim.scene import Scene
 from support.in_process import ASSUMED
 from support.kinds import KINDS, learned
 from support.paths import RECORDINGS, ROOT
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.controller import Controller, start_state
+from thirdhand.core.frame import Tick, order
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recorder
+from thirdhand.settings.config import robot_description
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import skill_in
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.lab.people.left_out import RATE_HZ, hand_events
+from thirdhand_sim.scene import Scene
 
 PROCESSORS = {
     "Prescott": {"OPENBLAS_CORETYPE": "Prescott"},
@@ -41,8 +41,8 @@ PROCESSORS = {
 REPLAYED = """
 import sys
 from pathlib import Path
-from service.process import one_blas_thread
-from service.files.replay import replay
+from thirdhand.process import one_blas_thread
+from thirdhand.recordings.replay import replay
 for name in sys.argv[1:]:
     result = replay(Path(name))
     if not result.exact:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.contract.messages import BASE
-from service.files.track import Track
-from service.files.track_check import checked
-from service.settings.config import Settings
+from thirdhand.contract.messages import BASE
+from thirdhand.settings.config import Settings
+from thirdhand.workbench.takes.track import Track
+from thirdhand.workbench.takes.track_check import checked
 
 RATE_HZ, LASTS_S = 25, 12.0
 

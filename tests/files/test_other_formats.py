@@ -18,20 +18,20 @@ import zstandard
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from service.contract import cdr
-from service.contract.channels import POSE
-from service.contract.explain import ExplainedError
-from service.contract.messages import PoseStamped
-from service.contract.ros2msg import schema
-from service.files.demonstration_reader import read_demonstration
-from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseTopic
-from service.learning.demonstration import Demonstration
-from service.learning.skill_file import skill_in
-from service.settings.arm_description import description
-from service.settings.config import HandSettings, Settings
 from support.circling import circling
 from support.paths import ROOT
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import POSE
+from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.contract.ros2msg import schema
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.arm_description import description
+from thirdhand.settings.config import HandSettings, Settings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import skill_in
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration
+from thirdhand.workbench.takes.pose_streams import PoseTopic
 
 NAMES = {"left": "LeftHand", "right": "RightHand", "tool": "Tool"}
 ROS_1 = get_typestore(Stores.ROS1_NOETIC)

@@ -17,20 +17,26 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from service.contract import cdr, channels
-from service.contract.channels import EVENT_NUMBERS
-from service.contract.ros2msg import schema
-from service.core.frame import Event, Tick, blank, definitions, encode
-from service.files.demonstration_reader import write_demonstration
-from service.files.mcap_file import McapFile, RecordingError
-from service.files.recording import Recorder, Recording
-from service.files.shipped import cell_of
-from service.files.urdf_markers import with_markers
-from service.learning.demonstration import Demonstration
-from service.settings.config import robot_description
-from service.settings.urdf import Urdf
 from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
 from support.wam import FRAME
+from thirdhand.contract import cdr, channels
+from thirdhand.contract.channels import EVENT_NUMBERS
+from thirdhand.contract.ros2msg import schema
+from thirdhand.core.frame import (
+    Event,
+    Tick,
+    blank,
+    definitions,
+    encode,
+)
+from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.recordings.urdf_markers import with_markers
+from thirdhand.settings.config import robot_description
+from thirdhand.settings.urdf import Urdf
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 
 
 def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:

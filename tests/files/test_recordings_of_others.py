@@ -19,11 +19,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from service.files.demonstration_reader import read_demonstration
-from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseTopic
-from service.settings.config import HandSettings, Settings
 from support.paths import RECORDINGS
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import HandSettings, Settings
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration
+from thirdhand.workbench.takes.pose_streams import PoseTopic
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STAMPS = np.arange(40) * 10_000_000 + 1_000_000_000

@@ -13,26 +13,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract.records import Mode, Reason
-from service.core.controller import Controller, run
-from service.core.frame import STAGES, Event, Frame, Tick
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING
-from service.files import replay as replay_module
-from service.files.mcap_file import RecordingError
-from service.files.recording import DECISIONS, Recorder, Recording
-from service.files.replay import replay, ticks
-from service.learning.via_points import adapted
-from sim.closed_loop import joints_event
-from sim.golden import ENCODED, ENCODED_SPEED, refresh
-from sim.scene import Scene
-from sim.script import HandScript
 from support.cell import thirdhand, told
 from support.cell_commands import assert_refused, succeeded
 from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS
 from support.recorded import thin
 from support.wam import URDF
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import (
+    STAGES,
+    Event,
+    Frame,
+    Tick,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings import replay as replay_module
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.recordings.recording import DECISIONS, Recorder, Recording
+from thirdhand.recordings.replay import replay, ticks
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.closed_loop import joints_event
+from thirdhand_sim.golden import ENCODED, ENCODED_SPEED, refresh
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 GOLDEN = RECORDINGS / "golden.mcap"
 

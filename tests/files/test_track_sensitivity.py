@@ -13,17 +13,17 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from service.files import track_check, track_offsets
-from service.files.demonstration_reader import read_demonstration
-from service.files.track import Track
-from service.learning.demonstration import Demonstration
-from service.settings.config import Settings
-from sim.scene import Scene
-from sim.teach import demonstrate
 from support import spoiled
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.spoiled import Spoil, Streams, streams_of
+from thirdhand.settings.config import Settings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes import track_check, track_offsets
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration
+from thirdhand.workbench.takes.track import Track
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import demonstrate
 
 NAMES = ("left", "right", "tool")
 OFF_M = 0.005  # what is farther than this from the truth is bad

@@ -9,8 +9,8 @@ from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, PeriodicKernel,
 from kmp.criteria.likelihood import negative_log_likelihood, with_ell
 from kmp.functionals import Functionals
 from kmp.problem.database import Database
-from sim.experiments.reproduction.writing import write
 from support.shown_skills import driven_by_hands, off, over_time, two_hands
+from thirdhand_sim.lab.reproduction.writing import write
 
 
 def chosen(demonstrations=None, **options):

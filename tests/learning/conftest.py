@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.skill_file import decoded
-from service.learning.via_points import adapted
 from support.paths import RECORDINGS
 from support.taught_scene import PLACES, demonstrated, quickly
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.learn import learn
 
 
 @pytest.fixture(scope="session")

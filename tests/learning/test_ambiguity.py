@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.learning.ambiguity import ALIKE_M, NOISES, SAME_M, same_hands_m, tracker_noise_m
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.records import Figures
 from support.circling import circling
 from support.fine_motion import fine
 from support.skills import figures_of
 from support.taught_scene import demonstrated
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.ambiguity import (
+    ALIKE_M,
+    NOISES,
+    SAME_M,
+    same_hands_m,
+    tracker_noise_m,
+)
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.records import Figures
 
 
 def judged(demonstrations: list[Demonstration]) -> Figures:

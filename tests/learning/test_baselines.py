@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.learning.baselines import baselines, held_out_errors, linear, look_up, same_time
-from service.learning.demonstration import Demonstration
-from service.learning.records import Take
-from service.learning.takes import takes_of
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.baselines import (
+    baselines,
+    held_out_errors,
+    linear,
+    look_up,
+    same_time,
+)
+from thirdhand.workbench.learning.records import Take
+from thirdhand.workbench.learning.takes import takes_of
 
 RANDOM = np.random.default_rng(0)
 SLOPE, OFFSET = RANDOM.normal(size=(6, 3)), np.array([0.1, 0.2, 0.3])

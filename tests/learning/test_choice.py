@@ -10,13 +10,19 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.criteria.cross_validation import mahalanobis, rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
-from service.core.skill.model import CHI_SQUARE, LEVELS
-from service.learning.choice import MAX_GAIN, POSITION_SCALES, RIDGE_M, selection_of, thinned
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.skill_file import SkillError
-from sim.scene import Scene
-from sim.script import HandScript, Teacher
+from thirdhand.core.skill.model import CHI_SQUARE, LEVELS
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.workbench.learning.choice import (
+    MAX_GAIN,
+    POSITION_SCALES,
+    RIDGE_M,
+    selection_of,
+    thinned,
+)
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript, Teacher
 
 
 def shown(seed: int) -> tuple[np.ndarray, np.ndarray]:

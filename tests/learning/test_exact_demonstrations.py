@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.contract.requests import ViaPoint
-from service.learning.demonstration import Demonstration
-from service.learning.gate import FLOOR_M
-from service.learning.learn import learn
 from support.circling import circling
 from support.skills import at_rest, figures_of
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.gate import FLOOR_M
+from thirdhand.workbench.learning.learn import learn
 
 NOISE_M = 0.002  # of a usual tracker
 PLACES = tuple(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.gate import CEILING_M, HELD_OUT_TIMES, nonsense
-from service.learning.learn import learn
-from service.learning.skill_file import HIGHEST_GATE_M
-from service.learning.via_points import adapted
-from sim.experiments.scenes import draw
 from support.taught_scene import PLACES, demonstrated, deviations
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import HIGHEST_GATE_M
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.gate import CEILING_M, HELD_OUT_TIMES, nonsense
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.lab.scenes import draw
 
 
 @pytest.fixture(scope="module")

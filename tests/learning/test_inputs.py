@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.tuning import TURN_LAG_S
-from service.learning.demonstration import Demonstration, persons
-from service.learning.learn import learn
-from service.learning.methods.held_out import swapped
-from service.learning.methods.inputs import KINDS
-from service.learning.skill_file import StoredSkill, decoded
-from service.learning.table import table
-from sim.experiments.people.left_out import judged, left_out, predicted
 from support.skills import at_rest, figures_of, turns_of
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.tuning import TURN_LAG_S
+from thirdhand.skills.demonstration import Demonstration, persons
+from thirdhand.skills.skill_file import StoredSkill, decoded
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.methods.held_out import swapped
+from thirdhand.workbench.learning.methods.inputs import KINDS
+from thirdhand.workbench.learning.table import table
+from thirdhand_sim.lab.people.left_out import judged, left_out, predicted
 
 TIMES = np.arange(0.0, 6.0, 0.04)
 CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is fixed to

@@ -8,16 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.picture import draw, drawn
-from service.learning.records import Evidence, Figures
-from service.learning.skill_file import SkillError
-from service.learning.table import table
-from service.settings.config import Reach
 from support.paths import ROOT
 from support.skills import figures_of, made
 from support.taught_scene import demonstrated
+from thirdhand.settings.config import Reach
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.picture import draw, drawn
+from thirdhand.workbench.learning.records import Evidence, Figures
+from thirdhand.workbench.learning.table import table
 
 
 def judged(demonstrations: list[Demonstration], **options: object) -> Figures:

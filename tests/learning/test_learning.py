@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.pose import mean_orientation
-from service.learning.skill_file import SkillError
 from support.skills import figures_of
 from support.taught_scene import deviations, error_m, quickly
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.pose import mean_orientation
 
 
 def test_a_demonstration_that_was_held_out_is_predicted_to_some_centimetres(

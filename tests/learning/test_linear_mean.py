@@ -10,18 +10,23 @@ import pytest
 from kmp import KMP, AffineMean
 from kmp.criteria.cross_validation import rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
-from service.core.frame import Vector
-from service.core.skill.model import standard_deviations
-from service.learning.baselines import held_out_errors, linear
-from service.learning.choice import MAX_GAIN, RIDGE_M, selection_of
-from service.learning.gate import nonsense
-from service.learning.learn import learn
-from service.learning.records import Evidence
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
-from service.learning.via_points import adapted
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.taught_scene import HANDOVER
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.model import standard_deviations
+from thirdhand.skills.skill_file import (
+    SkillError,
+    StoredSkill,
+    decoded,
+    with_file,
+)
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.baselines import held_out_errors, linear
+from thirdhand.workbench.learning.choice import MAX_GAIN, RIDGE_M, selection_of
+from thirdhand.workbench.learning.gate import nonsense
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.records import Evidence
 
 APART_M = 0.15  # the takes, from each other: a constant mean holds the tool back there
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.skill.skill import Skill
-from service.core.skill.tuning import SEGMENT_END_M
-from service.learning.corrections import (
+from support.paths import RECORDINGS
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.tuning import SEGMENT_END_M
+from thirdhand.skills.corrections import (
     OFFERED_AFTER,
     corrected,
     correction_at,
@@ -17,10 +18,9 @@ from service.learning.corrections import (
     offer_of,
     stage_of,
 )
-from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.learning.via_points import adapted, in_force
-from sim.scene import Scene
-from support.paths import RECORDINGS
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
+from thirdhand.skills.via_points import adapted, in_force
+from thirdhand_sim.scene import Scene
 
 UP = np.array([0.0, 0.0, 0.08])
 

@@ -8,24 +8,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.records import Mode, Reason
-from service.contract.requests import Hands, ViaPoint
-from service.core.frame import Records, Tick
-from service.core.skill.staged import StagedKMP
-from service.files.demonstration_files import summary
-from service.files.demonstration_reader import read_demonstration, write_demonstration
-from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseTopic
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.learning.table import table
-from service.learning.via_points import adapted
 from support.circling import circling
 from support.followed import followed
 from support.in_process import ASSUMED, hand
 from support.skills import STILL, at_rest, figures_of, made
 from support.spoiled import Streams, streams_of, write_streams
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import Hands, ViaPoint
+from thirdhand.core.frame import Records, Tick
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.table import table
+from thirdhand.workbench.takes.demonstration_files import summary
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration, write_demonstration
+from thirdhand.workbench.takes.pose_streams import PoseTopic
 
 AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
 Point = tuple[float, float, float]

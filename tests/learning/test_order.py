@@ -8,12 +8,12 @@ from random import Random
 import numpy as np
 import pytest
 
-from service.learning.demonstration import Demonstration, persons
-from service.learning.learn import learn
-from service.learning.methods.staged import is_clear
-from service.learning.skill_file import SkillError
-from service.learning.takes import takes_of
 from support.skills import figures_of, made
+from thirdhand.skills.demonstration import Demonstration, persons
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.methods.staged import is_clear
+from thirdhand.workbench.learning.takes import takes_of
 
 
 @functools.cache

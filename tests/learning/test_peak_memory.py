@@ -14,11 +14,11 @@ WHOLE_MB = 400  # limit of the process's largest resident memory
 LEARNING_MB = 260  # limit of what learning adds to that of its imports
 TAKES, SAMPLES = 72, 150  # 150 samples last 3 s
 CODE = f"""
-from service.process import one_blas_thread
+from thirdhand.process import one_blas_thread
 import re
 from pathlib import Path
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.learn import learn
 from support.circling import circling
 
 def peak_mb():

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.contract.requests import RequestError, ViaPoint, decode_request
-from service.core.frame import Vector
-from service.core.skill.hands_kmp import HandsKMP
-from service.core.skill.skill import Skill
-from service.files.shipped import shipped_skill
-from service.learning.ambiguity import SAME_M
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from service.learning.pose import learned_pose
-from service.learning.records import HeldOut
-from service.learning.skill_file import SkillError, decoded
-from service.learning.takes import takes_of
-from service.learning.via_points import adapted, in_force
-from sim.scene import TOOL_ORIENTATION
-from sim.teach import demonstrations
 from support.skills import at_rest, figures_of
 from support.taught_scene import PLACES, SCENE, with_hands
+from thirdhand.contract.requests import RequestError, ViaPoint, decode_request
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError, decoded
+from thirdhand.skills.via_points import adapted, in_force
+from thirdhand.workbench.learning.ambiguity import SAME_M
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.pose import learned_pose
+from thirdhand.workbench.learning.records import HeldOut
+from thirdhand.workbench.learning.takes import takes_of
+from thirdhand_sim.scene import TOOL_ORIENTATION
+from thirdhand_sim.teach import demonstrations
 
 TURN = np.radians(120.0) * np.array([0.0, 0.6, 0.8])
 START = Rotation.from_quat(TOOL_ORIENTATION)

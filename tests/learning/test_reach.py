@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arm.stage import Arm
-from service.core.skill.skill import is_reachable
-from service.files.shipped import ARMS, cell_of, shipped_skill
-from service.learning.reach import beyond_m, out_of_reach
-from service.learning.skill_file import StoredSkill
-from service.settings.config import Reach, Settings, robot_description
 from support.followed import changed
 from support.turning import sliding_cell
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.skill.skill import is_reachable
+from thirdhand.recordings.shipped import ARMS, cell_of, shipped_skill
+from thirdhand.settings.config import Reach, Settings, robot_description
+from thirdhand.skills.reach import beyond_m, out_of_reach
+from thirdhand.skills.skill_file import StoredSkill
 
 WIDE = Reach(centre=(0.0, 0.0, 0.3), inner=0.01, outer=3.0, min_x=-1.0, min_z=-1.0)
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
-from service.core.skill.staged import StagedKMP
-from service.core.skill.stages import LEFT
-from service.learning.choice import shared_counts
-from service.learning.demonstration import Demonstration, NamedDemonstration
-from service.learning.learn import learn
-from service.learning.methods.weights import chosen
-from service.learning.skill_file import SkillError, StoredSkill, decoded
-from service.learning.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
-from service.learning.table import table
 from support.circling import circling
 from support.skills import figures_of, made
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.stages import LEFT
+from thirdhand.skills.demonstration import Demonstration, NamedDemonstration
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
+from thirdhand.skills.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
+from thirdhand.workbench.learning.choice import shared_counts
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.methods.weights import chosen
+from thirdhand.workbench.learning.table import table
 
 HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
 

@@ -7,19 +7,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.core.controller import start_state
-from service.core.frame import blank, frame_layout
-from service.core.skill.model import CHI_SQUARE, LEVELS, NORMAL, REGION_95, Regions
-from service.core.skill.stage import SkillStage
-from service.core.skill.step import calibrate, recent
-from service.core.skill.tuning import UNSURE_M
-from service.files.shipped import shipped_skill
-from service.learning.learn import learn
-from service.learning.records import TimedErrors
-from service.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
-from service.settings.config import Settings
 from support.skills import figures_of, made
+from thirdhand.core.controller import start_state
+from thirdhand.core.frame import blank, frame_layout
+from thirdhand.core.skill.model import (
+    CHI_SQUARE,
+    LEVELS,
+    NORMAL,
+    REGION_95,
+    Regions,
+)
+from thirdhand.core.skill.stage import SkillStage
+from thirdhand.core.skill.step import calibrate, recent
+from thirdhand.core.skill.tuning import UNSURE_M
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import (
+    SkillError,
+    StoredSkill,
+    decoded,
+    with_file,
+)
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.records import TimedErrors
+from thirdhand.workbench.learning.regions import (
+    BLOCKS,
+    blocks_of,
+    calibrated,
+    calibrated_without,
+)
 
 
 def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> TimedErrors:

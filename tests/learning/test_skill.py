@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.frame import Vector
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from sim.script import HandMotions, HandScript
 from support.skills import at_rest
 from support.taught_scene import HANDOVER, SCENE, with_hands
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand_sim.script import HandMotions, HandScript
 
 
 def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
-from service.core.frame import Vector
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.skill_file import SkillError, decoded, with_file
-from service.learning.via_points import adapted
 from support.skills import figures_of, file_with
 from support.taught_scene import PLACES
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError, decoded, with_file
+from thirdhand.skills.via_points import adapted
 
 
 def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:

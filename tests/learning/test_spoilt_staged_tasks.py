@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from service.core.skill.staged import StagedKMP
-from service.files.demonstration_reader import read_demonstration
-from service.learning.skill_file import decoded
-from service.learning.via_points import adapted
-from sim.experiments.people.left_out import judged, left_out, predicted
 from support import spoiled
 from support.cell import told
 from support.paths import RECORDINGS
 from support.skills import figures_of
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.skills.skill_file import decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration
+from thirdhand_sim.lab.people.left_out import judged, left_out, predicted
 
 pytestmark = pytest.mark.thorough
 

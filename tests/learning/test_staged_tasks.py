@@ -13,23 +13,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.contract.requests import ViaPoint
-from service.core.skill import TURNS
-from service.core.skill.memory import turn_lag_s
-from service.core.skill.skill import Skill
-from service.core.skill.staged import StagedKMP
-from service.core.skill.stages import LEFT, NONE
-from service.learning.demonstration import Demonstration
-from service.learning.division import task_of, via_points_never_reached
-from service.learning.learn import learn
-from service.learning.records import Figures
-from service.learning.skill_file import SkillError, StoredSkill, decoded, with_file
-from service.learning.table import table
-from service.learning.via_points import adapted, in_force, warnings_of
-from sim.experiments.people.left_out import judged, left_out, predicted
-from sim.made_tasks import CARRIED_M
-from sim.teach import by_people
 from support.skills import STILL, at_rest, figures_of, file_with, made, turns_of
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.skill import TURNS
+from thirdhand.core.skill.memory import turn_lag_s
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.stages import LEFT, NONE
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import (
+    SkillError,
+    StoredSkill,
+    decoded,
+    with_file,
+)
+from thirdhand.skills.via_points import adapted, in_force, warnings_of
+from thirdhand.workbench.learning.division import task_of, via_points_never_reached
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.records import Figures
+from thirdhand.workbench.learning.table import table
+from thirdhand_sim.lab.people.left_out import judged, left_out, predicted
+from thirdhand_sim.made_tasks import CARRIED_M
+from thirdhand_sim.teach import by_people
 
 AT_REST = np.zeros(6)
 

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.contract.requests import ViaPoint
-from service.core.skill.skill import Skill
-from service.learning.skill_file import SkillError
-from service.learning.via_points import adapted, in_force, warnings_of
 from support.taught_scene import HANDOVER, PLACES, with_hands
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.skills.via_points import adapted, in_force, warnings_of
 
 
 def test_places_are_met(aimed: Skill) -> None:

@@ -7,11 +7,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from service.learning.gate import Caught, Gate
-from service.learning.records import Figures, Row
-from service.learning.residual_risk import ResidualRisk
-from service.learning.table import table
-from service.learning.verdicts import Subject, verdicts
+from thirdhand.skills.residual_risk import ResidualRisk
+from thirdhand.workbench.learning.gate import Caught, Gate
+from thirdhand.workbench.learning.records import Figures, Row
+from thirdhand.workbench.learning.table import table
+from thirdhand.workbench.learning.verdicts import Subject, verdicts
 
 GOOD = Row(name="all", error_mm=20.0, worst_mm=60.0, predicted_mm=20.0, within_50=50.0, within_95=95.0, held=1.0)
 FIGURES = Figures(

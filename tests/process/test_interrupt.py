@@ -22,7 +22,7 @@ GOLDEN = str(RECORDINGS / "golden.mcap")
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in range(1, 6)]
 CLEAN_UP_SLOWLY = """
 import time
-from service.process import interrupt
+from thirdhand.process import interrupt
 interrupt.watch()
 with interrupt.clean_up_first():
     try:
@@ -36,7 +36,7 @@ with interrupt.clean_up_first():
 
 INTERRUPTED_JUST_BEFORE = """
 import os, signal, sys, time
-from service.process import interrupt
+from thirdhand.process import interrupt
 interrupt.watch()
 sys.setswitchinterval(60)  # the thread gets its turn only when this one waits
 os.kill(os.getpid(), signal.SIGINT)
@@ -64,7 +64,7 @@ def nobody() -> Iterator[str]:
 def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
     """A command that runs and looks after interrupts: by a thread of its own, its second."""
     with said.open("wb") as errors:
-        command = [sys.executable, "-m", "service", *arguments]
+        command = [sys.executable, "-m", "thirdhand", *arguments]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, cwd=ROOT)
     wait_for(lambda: process.poll() is not None or len(os.listdir(f"/proc/{process.pid}/task")) > 1)
     return process
@@ -79,13 +79,13 @@ class Interrupting:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupting())
-from service.__main__ import main
+from thirdhand.__main__ import main
 main()
 """
 
 
 @pytest.mark.parametrize(
-    "module", ["service.process.interrupt", "contextlib", "service.cli", "service.client", "service.cli.status"]
+    "module", ["thirdhand.process.interrupt", "contextlib", "thirdhand.cli", "thirdhand.client", "thirdhand.cli.status"]
 )
 def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: str) -> None:
     """At imports from the first line of the program on; Python's own come before that."""
@@ -205,7 +205,7 @@ def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -
 def test_an_interrupt_that_is_ignored_stays_so() -> None:
     """As a shell starts what runs in its background."""
     code = (
-        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom service.process import interrupt\n"
+        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom thirdhand.process import interrupt\n"
         "interrupt.watch()\nsignal.raise_signal(signal.SIGINT)\nprint('goes on')"
     )
     done = subprocess.run(

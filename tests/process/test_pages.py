@@ -11,7 +11,7 @@ PROGRAM = """
 import re
 import numpy as np
 from numba import njit
-from service.process.pages import release_start_memory, share_one_heap
+from thirdhand.process.pages import release_start_memory, share_one_heap
 
 def mapped_mb():
     return int(re.search(r"^RssFile:\\s+(\\d+) kB", open("/proc/self/status").read(), re.M)[1]) / 1e3

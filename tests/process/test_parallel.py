@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from service.contract.explain import ExplainedError
-from service.process.parallel import spread
+from thirdhand.contract.explain import ExplainedError
+from thirdhand.process.parallel import spread
 
 
 @pytest.mark.parametrize(

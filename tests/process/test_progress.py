@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from service.process.progress import progress, steps
+from thirdhand.process.progress import progress, steps
 
 
 def until_said(capsys: pytest.CaptureFixture[str], words: str) -> str:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.settings.user_folder import user_folder
 from support.paths import RECORDINGS, ROOT
+from thirdhand.settings.user_folder import user_folder
 
 ENCODINGS = (
     {"PYTHONIOENCODING": "ascii"},
@@ -31,7 +31,7 @@ pwd.getpwuid = {}.__getitem__
 
 def run(command: str, *, before: str = "", folder: Path = ROOT, **variables: str) -> subprocess.CompletedProcess[str]:
     """A command in a terminal with these variables."""
-    code = f"{before}\nimport sys\nfrom service.__main__ import main\nsys.exit(main())"
+    code = f"{before}\nimport sys\nfrom thirdhand.__main__ import main\nsys.exit(main())"
     path = os.pathsep.join(filter(None, (variables.pop("PYTHONPATH", ""), str(ROOT))))
     return subprocess.run(
         [sys.executable, "-P", "-c", code, *command.split()],
@@ -48,7 +48,7 @@ def test_no_encoding_of_the_output_ends_in_a_traceback(command: str, code: int, 
 
 
 @pytest.mark.parametrize("variable", ["PYTHONPATH", "LD_LIBRARY_PATH"])
-@pytest.mark.parametrize("command", ["serve", "serve --check", "arm service/arms/ur5.urdf"])
+@pytest.mark.parametrize("command", ["serve", "serve --check", "arm service/thirdhand/arms/ur5.urdf"])
 def test_a_module_of_another_python_is_one_sentence_with_file_and_variable(
     tmp_path: Path, command: str, variable: str
 ) -> None:

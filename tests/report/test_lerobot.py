@@ -14,19 +14,19 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
-from service.cli.main import main
-from service.contract import cdr
-from service.contract.images import CompressedImage, encode_image
-from service.core.controller import Controller, run
-from service.core.frame import Frame, Tick
-from service.files.recording import Recorder, Recording
-from service.files.replay import ticks
-from service.learning.skill_file import StoredSkill
-from sim.scene import Scene
-from sim.script import HandScript
 from support.in_process import ASSUMED, resting, ticks_of
 from support.pictures import grey
 from support.wam import JOINT_NAMES, URDF
+from thirdhand.command_line import main
+from thirdhand.contract import cdr
+from thirdhand.contract.images import CompressedImage, encode_image
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import Frame, Tick
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.replay import ticks
+from thirdhand.skills.skill_file import StoredSkill
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)

@@ -15,27 +15,53 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.cli.main import main
-from service.contract.records import Flag, Mode, Reason
-from service.contract.requests import Percentiles, Status, ViaPoint, encode_json
-from service.core.controller import Controller
-from service.core.frame import STAGES, Event, Tick, order, timed
-from service.core.skill.skill import Skill
-from service.daemon.input_monitor import InputMonitor
-from service.daemon.status import CellStatus
-from service.files.recording import Recorder, Recording
-from service.learning.skill_file import decoded, with_file
-from service.learning.via_points import adapted
-from service.report.columns import read, runs
-from service.report.report import Report, Span, differing_settings, reported, why_missed
-from service.report.stages import LEAST_S
-from service.report.tables import tables, verdict
-from service.settings.config import Settings
-from sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.recorded import thin
 from support.wam import URDF
 from support.wicked import wicked_skill
+from thirdhand.command_line import main
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.contract.requests import (
+    Percentiles,
+    Status,
+    ViaPoint,
+    encode_json,
+)
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import (
+    STAGES,
+    Event,
+    Tick,
+    order,
+    timed,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING
+from thirdhand.daemon.input_monitor import InputMonitor
+from thirdhand.daemon.status import CellStatus
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import decoded, with_file
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.report.columns import read, runs
+from thirdhand.workbench.report.report import (
+    Report,
+    Span,
+    differing_settings,
+    reported,
+    why_missed,
+)
+from thirdhand.workbench.report.stages import LEAST_S
+from thirdhand.workbench.report.tables import tables, verdict
+from thirdhand_sim.golden import (
+    AWAY_S,
+    BAD_S,
+    DROPOUT_S,
+    HOLD_S,
+    RETEACH_S,
+    SESSION_S,
+    TEACH_S,
+)
 
 SETTINGS = Settings()
 PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
@@ -159,10 +185,11 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
     assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SESSION_S, abs=0.05)
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
+    far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand comes back by a jump
     for reason, (begin_s, end_s) in {
         Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),  # until then the tool does not depend on that hand
         Reason.OPERATOR: HOLD_S,
-        Reason.FAR_FROM_DEMONSTRATIONS: AWAY_S,
+        Reason.FAR_FROM_DEMONSTRATIONS: (AWAY_S[0], far_end_s),
     }.items():
         assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)

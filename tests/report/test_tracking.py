@@ -7,7 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from service.report.tracking import derivative, lag_ms, overshoots, rms, tracking
+from thirdhand.workbench.report.tracking import (
+    derivative,
+    lag_ms,
+    overshoots,
+    rms,
+    tracking,
+)
 
 PERIOD_S = 0.002
 TIMES = np.arange(0.0, 8.0, PERIOD_S)

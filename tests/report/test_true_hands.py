@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from service.contract.messages import BASE
-from service.core.frame import Tick
-from service.files.mcap_file import RecordingError
-from service.report.true_hands import TrueHand, true_hands, with_true_hands
-from service.settings.config import Settings
-from sim.closed_loop import START_NS, hand_event
+from thirdhand.contract.messages import BASE
+from thirdhand.core.frame import Tick
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import Settings
+from thirdhand.workbench.report.true_hands import TrueHand, true_hands, with_true_hands
+from thirdhand_sim.closed_loop import START_NS, hand_event
 
 PERIOD_S = 0.002
 SETTINGS = Settings()

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract.records import Mode
-from service.files.mcap_file import RecordingError
-from service.files.recorded_hands import RecordedHands, recorded_hands
-from service.files.recording import Recording
-from service.report.tracking import TrackingFigures
-from service.report.variants import (
+from support.paths import RECORDINGS
+from thirdhand.contract.records import Mode
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.recordings.recording import Recording
+from thirdhand.settings.config import Settings, parse
+from thirdhand.workbench.report.tracking import TrackingFigures
+from thirdhand.workbench.report.variants import (
     CHANGES,
     Change,
     JudgedHands,
@@ -24,8 +25,7 @@ from service.report.variants import (
     tried,
     written_change,
 )
-from service.settings.config import Settings, parse
-from support.paths import RECORDINGS
+from thirdhand.workbench.takes.recorded_hands import RecordedHands, recorded_hands
 
 GOLDEN = RECORDINGS / "golden.mcap"
 CALM: Change = {"tool": {"max_jerk": 100.0}}

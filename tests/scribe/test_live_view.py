@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from service.contract.images import CompressedImage, encode_image
-from service.contract.records import Mode, Reason
-from service.core.frame import Event, Tick
-from service.core.skill.skill import Skill
-from service.scribe.process import MAX_WAITING_FRAMES, LiveView
-from service.scribe.protocol import ImageArrival, TickMessage
-from service.settings.config import WAM, RecordingSettings, Settings
-from service.viewer.stream import Viewer
 from support.pictures import grey
 from support.recorded import TEXT, at_ns, drawn, ticks, values
+from thirdhand.contract.images import CompressedImage, encode_image
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.frame import Event, Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.scribe.process import MAX_WAITING_FRAMES, LiveView
+from thirdhand.scribe.protocol import ImageArrival, TickMessage
+from thirdhand.settings.config import WAM, RecordingSettings, Settings
+from thirdhand.viewer.stream import Viewer
 
 HELD_AT = MAX_WAITING_FRAMES + 300  # for one tick, within the gap
 END = MAX_WAITING_FRAMES + 600

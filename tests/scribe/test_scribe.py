@@ -20,16 +20,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from service.contract.images import CompressedImage, encode_image
-from service.core.frame import Event, Tick, encode
-from service.files.recording import Recording
-from service.process import child
-from service.process.child import Child, Progress
-from service.scribe.protocol import pack, unpack
-from service.scribe.scribe import Scribe
-from service.settings.config import RecordingSettings, Settings
 from support.pictures import grey
 from support.recorded import SKILL, at_ns, state_after, tell, ticks
+from thirdhand.contract.images import CompressedImage, encode_image
+from thirdhand.core.frame import Event, Tick, encode
+from thirdhand.process import child
+from thirdhand.process.child import Child, Progress
+from thirdhand.recordings.recording import Recording
+from thirdhand.scribe.protocol import pack, unpack
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.settings.config import RecordingSettings, Settings
 
 WHOLE = RecordingSettings(frames_hz=0)
 SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
@@ -322,8 +322,8 @@ def test_a_child_whose_import_fails_is_reported_as_one_that_did_not_start(
 DAEMON = """
 import os, signal, sys, time
 from pathlib import Path
-from service.settings.config import RecordingSettings, Settings
-from service.scribe.scribe import Scribe
+from thirdhand.settings.config import RecordingSettings, Settings
+from thirdhand.scribe.scribe import Scribe
 from support.recorded import SKILL, state_after, tell
 one = Scribe(Settings(cell="hall/bench-1", rate_hz=50), folder=Path(sys.argv[1]))
 one.start(skill=SKILL, state=state_after(-1))

@@ -17,23 +17,28 @@ from typing import Any
 import msgspec
 import pytest
 
-from service.cli.main import main
-from service.core.controller import Controller, run
-from service.core.frame import TIMING, Frame, Tick, blank
-from service.core.skill.skill import Skill
-from service.files.recording import Recording
-from service.files.replay import replay
-from service.scribe import segments
-from service.scribe.paths import RecordingPaths
-from service.scribe.protocol import TickMessage
-from service.scribe.scribe import Scribe
-from service.scribe.segments import Segments
-from service.settings.config import Files, RecordingSettings, Settings
-from sim.scene import Scene
-from sim.script import HandScript
 from support.in_process import ASSUMED, ticks_of
 from support.recorded import SKILL, state_after, ticks, write
 from support.wam import URDF
+from thirdhand.command_line import main
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import (
+    TIMING,
+    Frame,
+    Tick,
+    blank,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay
+from thirdhand.scribe import segments
+from thirdhand.scribe.paths import RecordingPaths
+from thirdhand.scribe.protocol import TickMessage
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.scribe.segments import Segments
+from thirdhand.settings.config import Files, RecordingSettings, Settings
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 COUNT = 2100
 SMALL = Files(segment_mb=0.1)
@@ -143,7 +148,7 @@ def test_a_clock_that_was_set_makes_no_recording_much_older(
         path.write_bytes(b"")
         changed_s = now_s - 3600 * hours + set_s * (right_after <= hours < set_before)
         os.utime(path, (changed_s, changed_s))
-    monkeypatch.setattr("service.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1)
+    monkeypatch.setattr("thirdhand.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1)
     RecordingPaths(settings, str(tmp_path), None).prune(None)
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap" for hours in reversed(range(count))]

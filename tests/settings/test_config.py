@@ -15,12 +15,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from service.cli.usage import reaching
-from service.client.client_settings import client_settings
-from service.contract.requests import List, ViaPointsRequest, decode_request
-from service.daemon.launch import described
-from service.files.shipped import cell_of
-from service.settings.config import (
+from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
+from thirdhand.cli.usage import reaching
+from thirdhand.client.client_settings import client_settings
+from thirdhand.contract.requests import List, ViaPointsRequest, decode_request
+from thirdhand.daemon.launch import described
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import (
     FOLLOWING,
     WAM,
     Files,
@@ -30,10 +31,9 @@ from service.settings.config import (
     parse,
     robot_description,
 )
-from service.settings.file_content import SettingsError
-from service.settings.network import Network, is_local
-from sim.scene import Scene, SceneError
-from support.turning import NEAR_SEAM, cell_in, continuous_cell, continuous_urdf
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.network import Network, is_local
+from thirdhand_sim.scene import Scene, SceneError
 
 
 def refusal(text: str) -> str:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from service.contract.explain import in_words
-from service.daemon.skill_worker import skill_of
-from service.learning.skill_file import SkillError
-from service.settings.file_content import UnusableError, content
 from support.cell import told
+from thirdhand.contract.explain import in_words
+from thirdhand.daemon.skill_worker import skill_of
+from thirdhand.settings.file_content import UnusableError, content
+from thirdhand.skills.skill_file import SkillError
 
 LARGEST = 1000
 COMMANDS = {

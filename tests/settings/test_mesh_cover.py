@@ -19,17 +19,23 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from service.core.geometry import rotation
-from service.core.separation.body import body_of
-from service.settings.arm_description import description
-from service.settings.config import Settings, converted, parse, robot_description, urdf_path
-from service.settings.file_content import SettingsError
-from service.settings.mesh_cover import capsule_around, covered, unfound
-from service.settings.urdf import Shape, Urdf, UrdfError
 from support import arms
 from support.paths import ROOT
+from thirdhand.core.geometry import rotation
+from thirdhand.core.separation.body import body_of
+from thirdhand.settings.arm_description import description
+from thirdhand.settings.config import (
+    Settings,
+    converted,
+    parse,
+    robot_description,
+    urdf_path,
+)
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.mesh_cover import capsule_around, covered, unfound
+from thirdhand.settings.urdf import Shape, Urdf, UrdfError
 
-WAM = (ROOT / "service" / "arms" / "wam.urdf").read_text(encoding="utf-8")
+WAM = (ROOT / "service" / "thirdhand" / "arms" / "wam.urdf").read_text(encoding="utf-8")
 Points = NDArray[np.float64]
 
 

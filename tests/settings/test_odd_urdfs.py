@@ -15,14 +15,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.core.arm.stage import Arm
-from service.core.separation.body import body_of
-from service.settings.arm_description import description
-from service.settings.config import Settings, robot_description
-from service.settings.file_content import SettingsError
-from service.settings.urdf import Urdf
-from service.viewer.static import ArmModels
 from support.ur5_cell import UR5, cell_in
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.separation.body import body_of
+from thirdhand.settings.arm_description import description
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.urdf import Urdf
+from thirdhand.viewer.static import ArmModels
 
 SPHERE = '<collision><geometry><sphere radius="0.01"/></geometry></collision>'
 BOUND_S = 10.0

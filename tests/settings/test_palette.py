@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from service.contract.records import Mode
-from service.report.page import MODE_COLOURS, TINT
-from service.settings import palette
-from service.settings.palette import BACKGROUND, BY_MODE, LEAST_CONTRAST, PAPER, contrast, written
+from thirdhand.contract.records import Mode
+from thirdhand.settings import palette
+from thirdhand.settings.palette import (
+    BACKGROUND,
+    BY_MODE,
+    LEAST_CONTRAST,
+    PAPER,
+    contrast,
+    written,
+)
+from thirdhand.workbench.report.page import MODE_COLOURS, TINT
 
 LINES = {name: getattr(palette, name) for name in ("LEFT", "RIGHT", "TOOL", "TARGET", "MEASURED", "NEAREST", "PLACE")}
 LINES |= {name: getattr(palette, name) for name in ("OFF", "GATE", "LATENCY", "WORK", "LATENESS", "ARM_BODY")}

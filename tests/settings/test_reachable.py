@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.core.arm.stage import Arm
-from service.files.shipped import ARMS, cell_of
-from service.settings.config import Settings, parse, robot_description
-from service.settings.file_content import SettingsError
-from service.settings.reachable import Shell, workspace_of
-from service.settings.urdf import Urdf
 from support.turning import sliding_cell
 from support.ur5_cell import CELL, UR5, cell_in
+from thirdhand.core.arm.stage import Arm
+from thirdhand.recordings.shipped import ARMS, cell_of
+from thirdhand.settings.config import Settings, parse, robot_description
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.reachable import Shell, workspace_of
+from thirdhand.settings.urdf import Urdf
 
 MOUNTS = {
     "as it is": None,

@@ -11,17 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.arms.rates import rates
-from service.core.arm.stage import Arm
-from service.settings.arm_description import completed
-from service.settings.config import load, parse, robot_description
-from service.settings.file_content import SettingsError
-from service.settings.robot_xml import readable
-from service.settings.urdf import Urdf, UrdfError, multiply
-from sim.scene import Scene
 from support.arms import MODELS, cell_of, toml_of, urdf_of
 from support.turning import BEYOND, continuous_urdf, sliding_urdf
 from support.wam import JOINT_NAMES, URDF
+from thirdhand.core.arm.stage import Arm
+from thirdhand.settings.arm_description import completed
+from thirdhand.settings.config import load, parse, robot_description
+from thirdhand.settings.file_content import SettingsError
+from thirdhand.settings.robot_xml import readable
+from thirdhand.settings.urdf import Urdf, UrdfError, multiply
+from thirdhand.workbench.first_cell.rates import rates
+from thirdhand_sim.scene import Scene
 
 
 def test_the_chain_to_the_tool_has_the_joints_in_order_with_their_limits() -> None:

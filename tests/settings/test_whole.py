@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.settings.whole_file import whole
+from thirdhand.settings.whole_file import whole
 
 
 def test_a_file_and_a_folder_appear_once_they_are_complete(tmp_path: Path) -> None:

@@ -16,23 +16,30 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
-from service.contract import cdr, messages
-from service.contract.records import Mode
-from service.core.geometry import rotation
-from service.core.separation.body import body_of
-from service.daemon.launch import ENGINES, described
-from service.files.shipped import ARMS, cell_of, shipped_skill
-from service.learning.via_points import adapted
-from service.settings.config import Box, Obstacles, Reach, Settings, parse, robot_description
-from service.settings.file_content import UnreadableError
-from service.settings.urdf import Urdf
-from sim.bench import Bench
-from sim.engines import world_of
-from sim.experiments.rehearsal import rehearse
-from sim.observed_world import ObservedWorld
-from sim.scene import Scene, SceneError
-from sim.script import HandScript
 from support import arms
+from thirdhand.contract import cdr, messages
+from thirdhand.contract.records import Mode
+from thirdhand.core.geometry import rotation
+from thirdhand.core.separation.body import body_of
+from thirdhand.daemon.launch import ENGINES, described
+from thirdhand.recordings.shipped import ARMS, cell_of, shipped_skill
+from thirdhand.settings.config import (
+    Box,
+    Obstacles,
+    Reach,
+    Settings,
+    parse,
+    robot_description,
+)
+from thirdhand.settings.file_content import UnreadableError
+from thirdhand.settings.urdf import Urdf
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.engines import world_of
+from thirdhand_sim.lab.rehearsal import rehearse
+from thirdhand_sim.observed_world import ObservedWorld
+from thirdhand_sim.scene import Scene, SceneError
+from thirdhand_sim.script import HandScript
 
 SCENE = Scene()
 # The maker's limits of an FR3's joint velocity at a position q [rad/s]: the least of `flat` and

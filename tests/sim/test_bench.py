@@ -20,20 +20,27 @@ import pinocchio as pin
 import pytest
 import zenoh
 
-from service.client import endpoints, open_session
-from service.contract import cdr, channels, messages
-from service.core.skill.pose import CLOSED, OPEN
-from service.learning.learn import learn
-from service.learning.via_points import adapted
-from service.settings.config import WAM, Settings
-from sim.bench import Bench, Observation
-from sim.experiments.rehearsal import rehearse
-from sim.network import BenchError, Commands, Dropout, Live, RunReport, run
-from sim.observed_world import ObservedWorld
-from sim.scene import Scene
-from sim.script import GRIP_S, HandScript, Teacher
-from sim.teach import demonstrations
 from support.wam import JOINT_NAMES
+from thirdhand.client import endpoints, open_session
+from thirdhand.contract import cdr, channels, messages
+from thirdhand.core.skill.pose import CLOSED, OPEN
+from thirdhand.settings.config import WAM, Settings
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.bench import Bench, Observation
+from thirdhand_sim.lab.rehearsal import rehearse
+from thirdhand_sim.network import (
+    BenchError,
+    Commands,
+    Dropout,
+    Live,
+    RunReport,
+    run,
+)
+from thirdhand_sim.observed_world import ObservedWorld
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import GRIP_S, HandScript, Teacher
+from thirdhand_sim.teach import demonstrations
 
 SCENE = Scene()
 STILL = (0.0,) * 7
@@ -320,7 +327,7 @@ def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
     command = [
         sys.executable,
         "-m",
-        "sim",
+        "thirdhand_sim",
         "--connect",
         network[1],
         "--output",
@@ -362,7 +369,7 @@ def test_bad_usage_and_bad_scenes_have_their_exit_codes(tmp_path: Path) -> None:
 
 def sim(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-W", "error", "-m", "sim", *arguments],
+        [sys.executable, "-W", "error", "-m", "thirdhand_sim", *arguments],
         capture_output=True,
         text=True,
         timeout=30,

@@ -12,13 +12,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.client import RefusedError
-from service.contract.records import Flag, Mode, Reason
-from service.files.recording import Recording
-from service.files.replay import replay
-from service.settings.config import Settings
 from support.cell import LEFT, Daemon, Tracker, serving, told
 from support.guided_bench import GuidedBench
+from thirdhand.client import RefusedError
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import Settings
 
 RATE_HZ = 100  # a tick of 10 ms leaves a busy machine room for a simulated arm beside the daemon
 HALFWAY = (0.80, -0.31, 0.19)  # of the left hand, on its way to the handover

@@ -8,15 +8,21 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from service.daemon.launch import ENGINES, LaunchError, engine_of
-from service.files.shipped import shipped_skill
-from service.learning.via_points import adapted
-from sim.bench import Bench
-from sim.engines import world_of
-from sim.experiments.rehearsal import Rehearsed, rehearse
-from sim.scene import Scene
-from sim.script import HandScript
-from sim.world import LEVEL, Pose, carried_by, pixels, seen_from
+from thirdhand.daemon.launch import ENGINES, LaunchError, engine_of
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.engines import world_of
+from thirdhand_sim.lab.rehearsal import Rehearsed, rehearse
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
+from thirdhand_sim.world import (
+    LEVEL,
+    Pose,
+    carried_by,
+    pixels,
+    seen_from,
+)
 
 SCENE = Scene()
 EYE, TARGET, SIZE = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31), (160, 120)
@@ -128,7 +134,7 @@ def test_what_is_carried_keeps_its_place_in_the_hand() -> None:
 
 
 def test_an_engine_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
+    monkeypatch.setattr("thirdhand.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
     assert engine_of() == "msgspec"
     with pytest.raises(LaunchError, match="needs NoneSuch, which is not installed"):
         engine_of("none_such")

@@ -19,20 +19,27 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib")
 
-from service.files.recording import Recording
-from service.files.replay import ticks
-from service.files.shipped import recordings, shipped_skill
-from service.settings.config import Settings
-from sim.experiments import evidence
-from sim.experiments.__main__ import jobs, main
-from sim.experiments.catalogue import EXPERIMENTS, Stream
-from sim.experiments.evidence import core_digest, kmp_digest, options_of, origin, staleness, tree
-from sim.experiments.results import ExperimentError, Options
-from sim.golden import record
 from support.cell import thirdhand
 from support.paths import ROOT
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import ticks
+from thirdhand.recordings.shipped import recordings, shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand_sim.golden import record
+from thirdhand_sim.lab import evidence
+from thirdhand_sim.lab.__main__ import jobs, main
+from thirdhand_sim.lab.catalogue import EXPERIMENTS, Stream
+from thirdhand_sim.lab.evidence import (
+    core_digest,
+    kmp_digest,
+    options_of,
+    origin,
+    staleness,
+    tree,
+)
+from thirdhand_sim.lab.results import ExperimentError, Options
 
-MODULES = sorted((ROOT / "sim" / "experiments").rglob("*.py"))
+MODULES = sorted((ROOT / "sim" / "thirdhand_sim" / "lab").rglob("*.py"))
 NAMED = {"commit", "date", "machine", "seeds", "options", "depends_on"}
 
 
@@ -194,9 +201,9 @@ class TestAll:
 
         few = {name: EXPERIMENTS[name] for name in ("letters", "promp", "table")}
         for name in few:
-            monkeypatch.setitem(sys.modules, f"sim.experiments.{EXPERIMENTS[name].module}", module(name))
+            monkeypatch.setitem(sys.modules, f"thirdhand_sim.lab.{EXPERIMENTS[name].module}", module(name))
         monkeypatch.setattr(
-            "sim.experiments.__main__.EXPERIMENTS", {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]}
+            "thirdhand_sim.lab.__main__.EXPERIMENTS", {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]}
         )
         return seen
 

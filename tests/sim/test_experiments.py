@@ -22,18 +22,18 @@ pytest.importorskip(
     "movement_primitives", reason="ProMPs need movement_primitives: pip install 'thirdhand[experiments]'"
 )
 
-from sim.experiments.__main__ import main
-from sim.experiments.catalogue import EXPERIMENTS
-from sim.experiments.load.live import is_evidence
-from sim.experiments.reproduction.table import METHODS
-from sim.experiments.reproduction.writing import recorded, write
-from sim.experiments.results import Array, ExperimentError
-from sim.experiments.scenes import draw
-from sim.experiments.separation import ThrustScript
-from sim.experiments.statistics import SCENES, wilson
-from sim.scene import MOST_MOVED, Scene
-from sim.script import Clock, Teacher
 from support.paths import ROOT
+from thirdhand_sim.lab.__main__ import main
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.load.live import is_evidence
+from thirdhand_sim.lab.reproduction.table import METHODS
+from thirdhand_sim.lab.reproduction.writing import recorded, write
+from thirdhand_sim.lab.results import Array, ExperimentError
+from thirdhand_sim.lab.scenes import draw
+from thirdhand_sim.lab.separation import ThrustScript
+from thirdhand_sim.lab.statistics import SCENES, wilson
+from thirdhand_sim.scene import MOST_MOVED, Scene
+from thirdhand_sim.script import Clock, Teacher
 
 pytestmark = pytest.mark.timeout(300)
 SHIPPED = ROOT / "recordings" / "experiments"
@@ -175,8 +175,8 @@ class TestExperiments:
     def test_statistics_compare_eight_methods_in_the_same_scenes(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("sim.experiments.statistics.SCENES", SCENES._replace(numbers=range(10)))
-        monkeypatch.setattr("sim.experiments.statistics.OURS_HZ", 250)
+        monkeypatch.setattr("thirdhand_sim.lab.statistics.SCENES", SCENES._replace(numbers=range(10)))
+        monkeypatch.setattr("thirdhand_sim.lab.statistics.OURS_HZ", 250)
         found = numbers("statistics", tmp_path)
         reaching = ["ours", "none", "look_up", "gaussian_process_5"]
         assert list(found["methods"]) == [*reaching, "gaussian_process", "paper", "promp", "gmr"]
@@ -223,7 +223,7 @@ def test_an_experiment_without_a_test_of_its_own_makes_its_files_too(tmp_path: P
 DRAWN = [
     name
     for name in EXPERIMENTS
-    if hasattr(importlib.import_module(f"sim.experiments.{EXPERIMENTS[name].module}"), "draw_numbers")
+    if hasattr(importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}"), "draw_numbers")
 ]
 
 

@@ -13,35 +13,41 @@ import pytest
 
 pytest.importorskip("movement_primitives", reason="ProMPs need movement_primitives")
 
-from service.contract import cdr
-from service.contract.messages import BASE, PoseStamped
-from service.contract.records import SIDES, Mode
-from service.contract.requests import TOLERANCE_M
-from service.core.controller import Controller
-from service.core.frame import Event, Tick
-from service.core.skill.model import NORMAL
-from service.core.skill.skill import Skill
-from service.core.skill.staged import StagedKMP
-from service.core.skill.stages import MOST_STAGES
-from service.files.shipped import recordings, shipped_skill
-from service.learning.learn import learn
-from service.learning.methods import staged
-from service.learning.skill_file import decoded
-from service.learning.via_points import adapted
-from service.settings.config import Settings, robot_description
-from sim.experiments import rehearsal
-from sim.experiments.open_loop import targets
-from sim.experiments.people.moving_hands import stops
-from sim.experiments.people.trials import RATE_HZ, Seen, judge, seen, served
-from sim.experiments.reached import ours
-from sim.experiments.rivals import followers
-from sim.experiments.rivals.method import DependsOn, Observed, Predicted
-from sim.experiments.rivals.service import LearnedByService
-from sim.people import person
-from sim.scene import Scene
-from sim.script import HandScript
-from sim.sessions import session
-from sim.teach import by_people, places_of
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import BASE, PoseStamped
+from thirdhand.contract.records import SIDES, Mode
+from thirdhand.contract.requests import TOLERANCE_M
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Event, Tick
+from thirdhand.core.skill.model import NORMAL
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.stages import MOST_STAGES
+from thirdhand.recordings.shipped import recordings, shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.skills.skill_file import decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.methods import staged
+from thirdhand_sim.lab import rehearsal
+from thirdhand_sim.lab.open_loop import targets
+from thirdhand_sim.lab.people.moving_hands import stops
+from thirdhand_sim.lab.people.trials import (
+    RATE_HZ,
+    Seen,
+    judge,
+    seen,
+    served,
+)
+from thirdhand_sim.lab.reached import ours
+from thirdhand_sim.lab.rivals import followers
+from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
+from thirdhand_sim.lab.rivals.service import LearnedByService
+from thirdhand_sim.people import person
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
+from thirdhand_sim.sessions import session
+from thirdhand_sim.teach import by_people, places_of
 
 pytestmark = pytest.mark.thorough
 

@@ -16,9 +16,9 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
 
-from sim.experiments.__main__ import main
-from sim.experiments.load.faults import SHORT
-from sim.parts import CellPart
+from thirdhand_sim.lab.__main__ import main
+from thirdhand_sim.lab.load.faults import SHORT
+from thirdhand_sim.parts import CellPart
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.timed]
 BRAKE_MM = 40.0  # of a tool at up to 0.8 m/s that brakes 20 ms after the last command

@@ -7,15 +7,20 @@ import itertools
 import numpy as np
 from PIL import Image
 
-from service.core.controller import Controller
-from service.files.shipped import shipped_skill
-from service.settings.config import Settings, robot_description
-from sim.bench import Bench
-from sim.closed_loop import ClosedLoop
-from sim.film import FRAME_HZ, PICTURE_PX, PLAYBACK_SPEED, Film
-from sim.scene import Scene
-from sim.script import HandScript
 from support.paths import ROOT
+from thirdhand.core.controller import Controller
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.closed_loop import ClosedLoop
+from thirdhand_sim.film import (
+    FRAME_HZ,
+    PICTURE_PX,
+    PLAYBACK_SPEED,
+    Film,
+)
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 
 def test_the_picture_in_the_readme_is_small_lasts_some_seconds_and_moves() -> None:

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract.records import Mode
-from service.daemon.launch import ENGINES
-from service.files.shipped import shipped_skill
-from service.learning.via_points import adapted
-from service.settings.config import Settings
-from sim.bench import Bench
-from sim.engines import world_of
-from sim.experiments.rehearsal import rehearse
-from sim.scene import Scene
-from sim.script import HandScript
 from support.turning import BEYOND, cell_in, continuous_cell, continuous_urdf, sliding_cell
+from thirdhand.contract.records import Mode
+from thirdhand.daemon.launch import ENGINES
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.engines import world_of
+from thirdhand_sim.lab.rehearsal import rehearse
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 SCENE = Scene()
 

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.learning.division import FOLLOW, off_via_point
-from service.settings.config import Reach
-from sim.made_tasks import CARRIED_M, LEAD_S, REACTION_S, TAKE_HZ, TASK_KINDS, run, takes
-from sim.sessions import along
+from thirdhand.settings.config import Reach
+from thirdhand.workbench.learning.division import FOLLOW, off_via_point
+from thirdhand_sim.made_tasks import (
+    CARRIED_M,
+    LEAD_S,
+    REACTION_S,
+    TAKE_HZ,
+    TASK_KINDS,
+    run,
+    takes,
+)
+from thirdhand_sim.sessions import along
 
 pytestmark = pytest.mark.thorough
 

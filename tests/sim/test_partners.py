@@ -10,20 +10,34 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from service.cli.main import main as command
-from service.contract.records import SIDES
-from service.core.skill.model import LEVELS
-from service.core.skill.skill import is_reachable
-from service.files.demonstration_reader import write_demonstration
-from service.learning.learn import learn
-from service.learning.skill_file import decoded
-from service.settings.config import Settings
-from sim.experiments.partners import Fold, Found, as_command, numbers_of, served, summary
-from sim.experiments.people.into_reach import RigidMap, depth_m
-from sim.experiments.people.left_out import JUDGED_HZ, LeftOut, judged, left_out, predicted, read
-from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.rivals.method import Predicted
-from sim.experiments.rivals.partners import (
+from thirdhand.command_line import main as command
+from thirdhand.contract.records import SIDES
+from thirdhand.core.skill.model import LEVELS
+from thirdhand.core.skill.skill import is_reachable
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import decoded
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.takes.demonstration_reader import write_demonstration
+from thirdhand_sim.lab.partners import (
+    Fold,
+    Found,
+    as_command,
+    numbers_of,
+    served,
+    summary,
+)
+from thirdhand_sim.lab.people.into_reach import RigidMap, depth_m
+from thirdhand_sim.lab.people.left_out import (
+    JUDGED_HZ,
+    LeftOut,
+    judged,
+    left_out,
+    predicted,
+    read,
+)
+from thirdhand_sim.lab.results import ExperimentError, Options, Results
+from thirdhand_sim.lab.rivals.method import Predicted
+from thirdhand_sim.lab.rivals.partners import (
     MEMORY_S,
     MOVES_MPS,
     RIVALS,
@@ -34,7 +48,7 @@ from sim.experiments.rivals.partners import (
     past,
     scene_of,
 )
-from sim.made_tasks import takes
+from thirdhand_sim.made_tasks import takes
 
 pytestmark = pytest.mark.thorough
 
@@ -202,9 +216,9 @@ def test_a_reduced_run_has_all_methods_and_says_what_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    from sim.experiments.partners import run
+    from thirdhand_sim.lab.partners import run
 
-    monkeypatch.setattr("sim.experiments.partners.TASK_KINDS", ("three", "cyclic"))
+    monkeypatch.setattr("thirdhand_sim.lab.partners.TASK_KINDS", ("three", "cyclic"))
     results = Results(tmp_path, "partners", said=False)
     found = json.loads(results.numbers(run(results, Options(share=0.5))).read_text())
     assert (tmp_path / "partners.png").read_bytes()[:4] == b"\x89PNG"

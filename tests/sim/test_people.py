@@ -11,19 +11,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.skill.skill import Skill
-from sim.experiments.people.comparison import METHODS, Task, chosen, outcomes, run
-from sim.experiments.people.recorded_people import recorded_people
-from sim.experiments.people.trials import RATE_HZ, Seen, judge, seen
-from sim.experiments.results import ExperimentError, Options, Results
-from sim.experiments.rivals.gaussian_process import GaussianProcess
-from sim.experiments.rivals.method import DependsOn, Observed, Predicted
-from sim.experiments.rivals.mixtures import frames
-from sim.experiments.rivals.places import LookUp, NoDemonstrations
-from sim.experiments.rivals.service import Service
-from sim.people import Group, Person, person
-from sim.scene import TOOL_FROM_HAND
-from sim.sessions import BREAKING, MISTAKES, Session, breaking, demonstrations, played, session
+from thirdhand.core.skill.skill import Skill
+from thirdhand_sim.lab.people.comparison import (
+    METHODS,
+    Task,
+    chosen,
+    outcomes,
+    run,
+)
+from thirdhand_sim.lab.people.recorded_people import recorded_people
+from thirdhand_sim.lab.people.trials import (
+    RATE_HZ,
+    Seen,
+    judge,
+    seen,
+)
+from thirdhand_sim.lab.results import ExperimentError, Options, Results
+from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
+from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
+from thirdhand_sim.lab.rivals.mixtures import frames
+from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
+from thirdhand_sim.lab.rivals.service import Service
+from thirdhand_sim.people import Group, Person, person
+from thirdhand_sim.scene import TOOL_FROM_HAND
+from thirdhand_sim.sessions import (
+    BREAKING,
+    MISTAKES,
+    Session,
+    breaking,
+    demonstrations,
+    played,
+    session,
+)
 
 pytestmark = pytest.mark.thorough
 
@@ -233,10 +252,10 @@ def test_recorded_hands_make_people_for_tuning(tmp_path: Path) -> None:
 def test_a_reduced_comparison_keeps_the_order_that_is_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
-        monkeypatch.setattr(f"sim.experiments.people.comparison.{table}", {"tuning": value, "test": value})
-    monkeypatch.setattr("sim.experiments.people.comparison.BREAKING", BREAKING[:1])
+        monkeypatch.setattr(f"thirdhand_sim.lab.people.comparison.{table}", {"tuning": value, "test": value})
+    monkeypatch.setattr("thirdhand_sim.lab.people.comparison.BREAKING", BREAKING[:1])
     few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
-    monkeypatch.setattr("sim.experiments.people.comparison.METHODS", few)
+    monkeypatch.setattr("thirdhand_sim.lab.people.comparison.METHODS", few)
     results = Results(tmp_path, "people", said=False)
     found = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
     mean = {name: {m: one[m]["mean"] for m in ("success", "path_rms_mm")} for name, one in found["methods"].items()}

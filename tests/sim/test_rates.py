@@ -8,12 +8,12 @@ import importlib.util
 
 import pytest
 
-from service.daemon.launch import ENGINES
-from service.files.shipped import ARMS, cell_of
-from sim.experiments.rehearsal import rehearse
-from sim.network import BenchError
-from sim.script import HandScript
 from support.demo import SCENE, Played, played, taught
+from thirdhand.daemon.launch import ENGINES
+from thirdhand.recordings.shipped import ARMS, cell_of
+from thirdhand_sim.lab.rehearsal import rehearse
+from thirdhand_sim.network import BenchError
+from thirdhand_sim.script import HandScript
 
 RATES_HZ = (100, 250, 500, 700, 1000)
 LAG_TICKS = 2.0  # of the arm behind its command

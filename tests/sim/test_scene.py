@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.scene import Scene, SceneError
+from thirdhand_sim.scene import Scene, SceneError
 
 
 def load(folder: Path, text: str) -> Scene:

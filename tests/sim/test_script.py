@@ -7,9 +7,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.scene import Scene
-from sim.script import HandScript, PointMotion, ScriptPause, Teacher
-from sim.teach import demonstrations
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import (
+    HandScript,
+    PointMotion,
+    ScriptPause,
+    Teacher,
+)
+from thirdhand_sim.teach import demonstrations
 
 SCENE = Scene()
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.core.controller import Controller
-from service.core.tuning import TUNING, Tuning
-from service.files.shipped import shipped_skill
-from service.settings.config import Settings, robot_description
-from sim.experiments import sensitivity
-from sim.experiments.catalogue import EXPERIMENTS
 from support.paths import ROOT
+from thirdhand.core.controller import Controller
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.lab import sensitivity
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
 
 # Values that another limit of the shipped cell keeps from having an effect.
 BOUND_BY_SETTINGS = {"arm.position_gain_rate_share 2", "separation.planned_brake_limits 2"}
@@ -40,9 +40,9 @@ def test_each_tuned_number_reaches_the_constants_of_a_stage() -> None:
 
 def test_each_tuned_number_is_read_by_the_core() -> None:
     """The records of intake, decision and setpoint hold all their numbers, read or not."""
-    sources = [path for path in (ROOT / "service" / "core").rglob("*.py") if path.name != "tuning.py"]
+    sources = [path for path in (ROOT / "service" / "thirdhand" / "core").rglob("*.py") if path.name != "tuning.py"]
     read = set(re.findall(r"\.(\w+)", "".join(path.read_text(encoding="utf-8") for path in sources)))
-    derived = (ROOT / "service" / "core" / "intake" / "tuning.py").read_text(encoding="utf-8")
+    derived = (ROOT / "service" / "thirdhand" / "core" / "intake" / "tuning.py").read_text(encoding="utf-8")
     read |= set(re.findall(r"self\.(\w+)", derived))
     assert {number.name for number in sensitivity.numbers().values()} - read == set()
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from service.cli.usage import places_in
-from service.contract import cdr, messages
-from service.core.skill.stages import NONE
-from service.learning.division import off_via_point
-from sim import teach
-from sim.scene import Scene
+from thirdhand.cli.usage import places_in
+from thirdhand.contract import cdr, messages
+from thirdhand.core.skill.stages import NONE
+from thirdhand.workbench.learning.division import off_via_point
+from thirdhand_sim import teach
+from thirdhand_sim.scene import Scene
 
 
 def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:

@@ -9,14 +9,14 @@ import math
 import msgspec
 import pytest
 
-from service.contract.messages import BASE, PoseStamped
-from service.core.controller import Controller
-from service.settings.config import Settings, parse, robot_description
-from sim.bench import Bench, TaskEvents
-from sim.closed_loop import ClosedLoop, begin_when_settled
-from sim.scene import HAND_ORIENTATION, Point
-from sim.tracked_hands import TrackedHands, hand_places
 from support.demo import SCENE, taught
+from thirdhand.contract.messages import BASE, PoseStamped
+from thirdhand.core.controller import Controller
+from thirdhand.settings.config import Settings, parse, robot_description
+from thirdhand_sim.bench import Bench, TaskEvents
+from thirdhand_sim.closed_loop import ClosedLoop, begin_when_settled
+from thirdhand_sim.scene import HAND_ORIENTATION, Point
+from thirdhand_sim.tracked_hands import TrackedHands, hand_places
 
 SPEED_M_S = 0.5
 TIMEOUT_S = 40.0

@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.experiments.gains import gain
-from sim.experiments.people.moving_hands import SMALL_KINDS, recorded, small_motion, tracker_kind
-from sim.experiments.people.tracker_jumps import exchanged_samples, noise_std_m, repair
-from sim.experiments.results import Array
+from thirdhand_sim.lab.gains import gain
+from thirdhand_sim.lab.people.moving_hands import (
+    SMALL_KINDS,
+    recorded,
+    small_motion,
+    tracker_kind,
+)
+from thirdhand_sim.lab.people.tracker_jumps import exchanged_samples, noise_std_m, repair
+from thirdhand_sim.lab.results import Array
 
 WAY = np.array([0.6, 0.64, 0.48])
 TRACKERS = {"24 Hz": (24.0, 0.0002), "30 Hz": (30.0, 0.002), "120 Hz": (120.0, 0.0003)}  # rate, noise [m]

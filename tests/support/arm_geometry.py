@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.core.frame import Vector
-from service.core.separation import TABLE_DEPTH_M
-from service.core.separation.body import body_of
-from service.settings.config import Settings
-from service.settings.urdf import Urdf
+from thirdhand.core.frame import Vector
+from thirdhand.core.separation import TABLE_DEPTH_M
+from thirdhand.core.separation.body import body_of
+from thirdhand.settings.config import Settings
+from thirdhand.settings.urdf import Urdf
 
 STEP_S = 1e-5  # of difference quotients
 SEARCH_STEPS = 30  # of a golden-section search, each 0.62 times as wide as the one before

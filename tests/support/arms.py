@@ -9,8 +9,8 @@ from importlib.metadata import files
 from pathlib import Path
 from typing import NamedTuple
 
-from service.settings.config import Settings, parse
 from support.in_process import ASSUMED
+from thirdhand.settings.config import Settings, parse
 
 
 class Model(NamedTuple):

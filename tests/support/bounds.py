@@ -13,10 +13,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from service.contract.records import Flag, Mode, Reason
-from service.core.frame import Vector
-from service.settings.config import Settings
 from support.arm_geometry import STEP_S, ArmGeometry, at_least, between_segments, segments_to_box
+from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core.frame import Vector
+from thirdhand.settings.config import Settings
 
 ROUNDING = 1e-9  # of numbers in SI units, and relative
 POSITION_ROUNDING_M = 1e-6

@@ -16,11 +16,11 @@ from typing import Any
 
 import zenoh
 
-from service.cli.main import main
-from service.client import Client, open_session
-from service.contract import cdr, messages
-from service.daemon.launch import Launched, launched
 from support.paths import ROOT
+from thirdhand.client import Client, open_session
+from thirdhand.command_line import main
+from thirdhand.contract import cdr, messages
+from thirdhand.daemon.launch import Launched, launched
 
 LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
@@ -28,7 +28,7 @@ LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m
 
 def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.CompletedProcess[str]:
     """A `thirdhand` command, run to its end."""
-    command = [sys.executable, "-m", "service", *arguments]
+    command = [sys.executable, "-m", "thirdhand", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more)
 
 
@@ -84,9 +84,9 @@ def serving(
     process runs that Python.
     """
     program = (
-        ("-c", f"{before}\nfrom service.__main__ import main\nimport sys\nsys.exit(main())")
+        ("-c", f"{before}\nfrom thirdhand.__main__ import main\nimport sys\nsys.exit(main())")
         if before
-        else ("-m", "service")
+        else ("-m", "thirdhand")
     )
     with (
         launched(folder, *arguments, program=program, network=network, say=say) as service,

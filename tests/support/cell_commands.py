@@ -30,7 +30,7 @@ def succeeded(*arguments: str) -> subprocess.CompletedProcess[str]:
 @contextlib.contextmanager
 def started(*arguments: str, within_s: float = 300, **more: Any) -> Iterator[subprocess.Popen[str]]:
     """A `thirdhand` command as a process with pipes; it is killed at the end or after a time."""
-    command = [sys.executable, "-m", "service", *arguments]
+    command = [sys.executable, "-m", "thirdhand", *arguments]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     with subprocess.Popen(command, **({"text": True, "cwd": ROOT} | pipes | more)) as process:
         timer = threading.Timer(within_s, process.kill)

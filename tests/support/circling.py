@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.learning.demonstration import Demonstration
+from thirdhand.skills.demonstration import Demonstration
 
 RATE_HZ, LASTS_S, RADIUS_M = 50, 12.0, 0.12
 GOES = np.array([[0.6, 0.2, 0.0, 0.4, -0.2, 0.0], [-0.2, 0.6, 0.0, 0.2, 0.4, 0.0], [0.0, 0.0, 0.5, 0.0, 0.0, 0.5]])

@@ -8,7 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from service.core.frame import Vector
+from thirdhand.core.frame import Vector
 
 RADIUS_M = 0.01
 

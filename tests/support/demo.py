@@ -10,21 +10,27 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from service.contract.cdr import encode_attachment
-from service.contract.messages import Attachment
-from service.contract.records import SIDES, Mode
-from service.core.controller import Controller, outgoing
-from service.core.frame import Event, Tick
-from service.core.skill.skill import Skill
-from service.files.shipped import shipped_skill
-from service.learning.via_points import adapted
-from service.settings.config import Settings, robot_description
-from sim.bench import Bench, TaskEvents
-from sim.closed_loop import HANDS_HZ, START_NS, begin_when_settled, hand_event, joints_event
-from sim.engines import world_of
-from sim.network import Commands, Gripper, Led
-from sim.scene import Scene
-from sim.script import HandScript
+from thirdhand.contract.cdr import encode_attachment
+from thirdhand.contract.messages import Attachment
+from thirdhand.contract.records import SIDES, Mode
+from thirdhand.core.controller import Controller, outgoing
+from thirdhand.core.frame import Event, Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.skills.via_points import adapted
+from thirdhand_sim.bench import Bench, TaskEvents
+from thirdhand_sim.closed_loop import (
+    HANDS_HZ,
+    START_NS,
+    begin_when_settled,
+    hand_event,
+    joints_event,
+)
+from thirdhand_sim.engines import world_of
+from thirdhand_sim.network import Commands, Gripper, Led
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 SCENE = Scene()
 

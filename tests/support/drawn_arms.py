@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.contract.messages import JointState
-from service.core.frame import Event, Frame, Vector
-from service.settings.config import Settings
+from thirdhand.contract.messages import JointState
+from thirdhand.core.frame import Event, Frame, Vector
+from thirdhand.settings.config import Settings
 
 # An arm that follows well is drawn as often as all others together.
 KINDS = ("lag", "noise", "jumps", "drift", "odd numbers", "gaps", "joint missing", "delay", "stall")

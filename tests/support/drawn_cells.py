@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from service.files.shipped import cell_of as shipped
-from service.settings.config import Box, Settings, parse
 from support.arms import MODELS, Model, toml_of
+from thirdhand.recordings.shipped import cell_of as shipped
+from thirdhand.settings.config import Box, Settings, parse
 
 XARM7 = Model("xarm7.urdf", "link7", (0.0, -0.3, 0.0, 1.2, 0.0, 1.5, 0.0))
 ENGAGE_SPEEDS_MPS = (0.01, 0.05, 0.15, 0.15, 0.4)

@@ -11,11 +11,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from service.contract.records import SIDES
-from service.core.frame import Vector
-from sim.scene import Scene
-from sim.script import HandScript
 from support.drawn_arms import ODD_NUMBERS
+from thirdhand.contract.records import SIDES
+from thirdhand.core.frame import Vector
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 Motion: TypeAlias = Iterator[Vector]
 Sample: TypeAlias = tuple[str, Vector]  # side, position [m]

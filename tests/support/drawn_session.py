@@ -13,21 +13,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from service.contract.messages import PoseStamped
-from service.contract.records import SIDES, Flag, Reason
-from service.contract.requests import ViaPoint
-from service.core.controller import Controller
-from service.core.frame import Event, Frame, Record, Tick, Vector, order
-from service.core.skill.skill import Skill
-from service.core.way_out import WayOut
-from service.files.shipped import shipped_skill
-from service.learning.learn import learn
-from service.learning.skill_file import SkillError, decoded
-from service.learning.via_points import adapted
-from service.settings.config import Settings, robot_description
-from sim.made_tasks import takes
-from sim.scene import Scene
-from sim.script import HandScript
 from support.arm_geometry import ArmGeometry
 from support.bounds import Session
 from support.drawn_arms import KINDS, ODD_STAMPS_NS, WELL, DrawnArm
@@ -37,6 +22,28 @@ from support.explained import explained_controller
 from support.in_process import clutch
 from support.paths import RECORDINGS
 from support.starts import free_postures
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.contract.records import SIDES, Flag, Reason
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Record,
+    Tick,
+    Vector,
+    order,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.way_out import WayOut
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.skills.skill_file import SkillError, decoded
+from thirdhand.skills.via_points import adapted
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.made_tasks import takes
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 SEGMENTS = 7  # of a session, each with its motion and its report
 TRACKERS_HZ = (10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 240.0, 500.0)

@@ -7,15 +7,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.core.controller import Controller
-from service.core.frame import Record, Vector
-from service.core.setpoint import HULL_SPANS
-from service.core.setpoint.bounds import farthest, speed_to_come
-from service.core.setpoint.stage import SetpointGenerator
-from service.core.skill.model import Target
-from service.core.skill.skill import Skill
-from service.core.tuning import TUNING, Tuning
-from service.settings.config import Settings, ToolSettings
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Record, Vector
+from thirdhand.core.setpoint import HULL_SPANS
+from thirdhand.core.setpoint.bounds import farthest, speed_to_come
+from thirdhand.core.setpoint.stage import SetpointGenerator
+from thirdhand.core.skill.model import Target
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.settings.config import Settings, ToolSettings
 
 HULL_MARGIN_M = TUNING.setpoint.hull_margin_m
 HULL_TIME_S = TUNING.setpoint.hull_time_s
@@ -75,5 +75,5 @@ class Explained(SetpointGenerator):
 def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:
     """A controller whose setpoint generator asserts its bound."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.core.setpoint.stage.SetpointGenerator", Explained)
+        patch.setattr("thirdhand.core.setpoint.stage.SetpointGenerator", Explained)
         return Controller(settings, skill, urdf=urdf)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from service.learning.demonstration import Demonstration
+from thirdhand.skills.demonstration import Demonstration
 
 FINE_M, TIMES = 0.015, 8.0  # the left hand goes to and fro so far, and the tool so many times as far
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from service.core.controller import Controller
-from service.core.frame import Tick
-from service.core.skill.skill import Skill
-from service.settings.config import Settings, robot_description
 from support.in_process import ASSUMED, assert_limits_hold, frames
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import Settings, robot_description
 
 
 def changed(cell: Settings, **parts: Any) -> Settings:

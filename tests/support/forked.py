@@ -1,9 +1,10 @@
 """Commands that tests start, forked from a process that has imported and loaded what they need.
 
-`python -m service ...` and `python -m sim ...` cost two seconds of imports and rehearsal. `Popen`
-takes the place of `subprocess.Popen`, also in the service's own code. The process is a child of the
-one that starts it, with pipes, environment, folder and signals of its own. All else is started as
-ever: other programs, an environment that imports would read, and tests that are about starts.
+`python -m thirdhand ...` and `python -m thirdhand_sim ...` cost two seconds of imports and
+rehearsal. `Popen` takes the place of `subprocess.Popen`, also in the service's own code. The
+process is a child of the one that starts it, with pipes, environment, folder and signals of its
+own. All else is started as ever: other programs, an environment that imports would read, and tests
+that are about starts.
 
 The standard library's fork server gives a child neither pipes nor an environment, and its children
 are not children of this process, so they could neither be waited for nor told apart from others.
@@ -18,10 +19,10 @@ import subprocess
 import sys
 from typing import Any
 
-from service.process.child import ForkServer
+from thirdhand.process.child import ForkServer
 
 MODULE = "tests.support.forked_command"
-STARTED = ("-m service", "-m sim")
+STARTED = ("-m thirdhand", "-m thirdhand_sim")
 READ_AT_IMPORT = ("NUMBA_", "PYTHON", "OPENBLAS_", "LD_", "MUJOCO_", "HOME", "XDG_CACHE_HOME")
 ANY_TIME = {"PYTHONPATH"}  # the server has found its modules already
 BEGIN_POLL_S = 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.process import one_blas_thread  # noqa: F401
+from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import atexit
@@ -18,16 +18,16 @@ import sys
 import threading
 import traceback
 
-import service.cli
-from service.core.warm_up import warm_up
-from service.files.shipped import shipped_skill
-from service.settings.config import Settings, robot_description
+import thirdhand.cli
+from thirdhand.core.warm_up import warm_up
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings, robot_description
 
 MAX_REQUEST_BYTES = 1 << 18
 
-for _found in pkgutil.iter_modules(service.cli.__path__):
-    importlib.import_module(f"service.cli.{_found.name}")
-for _module in ("service.daemon.daemon", "service.scribe.scribe", "sim.network"):
+for _found in pkgutil.iter_modules(thirdhand.cli.__path__):
+    importlib.import_module(f"thirdhand.cli.{_found.name}")
+for _module in ("thirdhand.daemon.daemon", "thirdhand.scribe.scribe", "thirdhand_sim.network"):
     importlib.import_module(_module)
 warm_up(Settings(), shipped_skill().for_loop(), urdf=robot_description(Settings()))
 

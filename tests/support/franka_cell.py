@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from service.settings.config import JointSettings, Settings, parse
 from support.paths import ROOT
+from thirdhand.settings.config import JointSettings, Settings, parse
 
 PERIOD = 0.001  # [s]
 STANDS = np.array((0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785))  # where franky-sim begins

@@ -11,20 +11,20 @@ from random import Random
 
 import numpy as np
 
-from service.contract import cdr
-from service.contract.messages import BASE, JointState, PoseStamped
-from service.contract.records import SIDES
-from service.core.frame import Frame, Vector
-from service.files.recording import Recording
-from service.files.replay import replay, ticks
-from service.learning.skill_file import decoded
-from service.settings.config import robot_description
 from support.arm_geometry import ArmGeometry
 from support.bounds import Session, broken
 from support.explained import explained_controller
 from support.hostile_bytes import mutated
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import BASE, JointState, PoseStamped
+from thirdhand.contract.records import SIDES
+from thirdhand.core.frame import Frame, Vector
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.replay import replay, ticks
+from thirdhand.settings.config import robot_description
+from thirdhand.skills.skill_file import decoded
 
 QUIET_S = 1.0  # of every two, in which nothing is spoilt
 ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")

@@ -9,15 +9,15 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from service.client import publisher
-from service.contract import cdr
-from service.core.frame import Vector
-from service.daemon.clock import Deadlines
-from service.settings.config import Settings
-from sim.bench import Bench
-from sim.network import Bridge, Led, Live
-from sim.scene import Scene
-from sim.script import HandScript
+from thirdhand.client import publisher
+from thirdhand.contract import cdr
+from thirdhand.core.frame import Vector
+from thirdhand.daemon.clock import Deadlines
+from thirdhand.settings.config import Settings
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.network import Bridge, Led, Live
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.script import HandScript
 
 LED_RADPS = 0.5
 SETTLED_RAD = 0.003

@@ -143,7 +143,7 @@ class Served:
 @contextlib.contextmanager
 def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> Iterator[Served]:
     """The command, connected to a Zenoh endpoint, with its token under a home folder."""
-    command = [sys.executable, "-m", "service", "hands", "--web", "--connect", endpoint, *arguments]
+    command = [sys.executable, "-m", "thirdhand", "hands", "--web", "--connect", endpoint, *arguments]
     if "--listen" not in arguments:
         command += ["--listen", f"127.0.0.1:{port}"]
     environment = os.environ | {"HOME": str(home)}

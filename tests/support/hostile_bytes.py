@@ -22,12 +22,12 @@ if __name__ == "__main__":
     import atheris
 
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    with atheris.instrument_imports(include=["service.contract"]):
-        import service.contract.cdr
-        import service.contract.requests  # noqa: F401
+    with atheris.instrument_imports(include=["thirdhand.contract"]):
+        import thirdhand.contract.cdr
+        import thirdhand.contract.requests  # noqa: F401
 
-from service.contract import cdr, requests
-from service.contract.messages import (
+from thirdhand.contract import cdr, requests
+from thirdhand.contract.messages import (
     GRIPPER,
     JointState,
     PoseStamped,

@@ -10,18 +10,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from service.contract import cdr
-from service.contract.messages import GRIPPER, JointState
-from service.contract.records import SIDES
-from service.core.controller import Controller, run, start_state
-from service.core.frame import Event, Frame, Record, Tick, Vector
-from service.core.skill.skill import Skill
-from service.files.recording import Recorder
-from service.files.replay import replay
-from service.settings.config import Settings, robot_description
-from sim.closed_loop import hand_event, joints_event
-from sim.script import HandScript
 from support.wam import JOINT_NAMES
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import GRIPPER, JointState
+from thirdhand.contract.records import SIDES
+from thirdhand.core.controller import Controller, run, start_state
+from thirdhand.core.frame import (
+    Event,
+    Frame,
+    Record,
+    Tick,
+    Vector,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recorder
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.closed_loop import hand_event, joints_event
+from thirdhand_sim.script import HandScript
 
 ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
 LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]

@@ -11,10 +11,6 @@ from typing import Any
 
 from hatchling.builders.wheel import WheelBuilder
 
-from support.paths import ROOT
-
-CLIENT = ROOT / "service" / "client"  # the folder of the distribution thirdhand-client
-
 
 def wheel_of(project: Path, folder: Path, *, editable: bool = False) -> Path:
     """The wheel of a project, built into a folder."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from service.contract.requests import ViaPoint
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from sim.experiments.reached import taught
-from sim.made_tasks import TASK_KINDS
-from sim.made_tasks import takes as made
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.lab.reached import taught
+from thirdhand_sim.made_tasks import TASK_KINDS
+from thirdhand_sim.made_tasks import takes as made
 
 KINDS = (
     "clock",

@@ -4,7 +4,7 @@ many_cells.py FOLDER ENDPOINT CELL ...` serves until its standard input ends.
 
 from __future__ import annotations
 
-from service.process import one_blas_thread  # noqa: F401
+from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
 import contextlib
@@ -16,14 +16,19 @@ from typing import Any
 
 import msgspec
 
-from service.core.warm_up import warm_up
-from service.daemon.daemon import Daemon
-from service.daemon.skill_worker import SkillWorker
-from service.daemon.start import starting
-from service.files.shipped import recordings, shipped_skill
-from service.scribe.scribe import Scribe
-from service.settings.config import ArmSettings, Files, Settings, robot_description
-from service.settings.network import Network
+from thirdhand.core.warm_up import warm_up
+from thirdhand.daemon.daemon import Daemon
+from thirdhand.daemon.skill_worker import SkillWorker
+from thirdhand.daemon.start import starting
+from thirdhand.recordings.shipped import recordings, shipped_skill
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.settings.config import (
+    ArmSettings,
+    Files,
+    Settings,
+    robot_description,
+)
+from thirdhand.settings.network import Network
 
 RATE_HZ, ROS2_DOMAIN = 50, 7
 

@@ -9,14 +9,20 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from service.contract import cdr, messages
-from service.core.controller import outgoing
-from service.core.frame import TIMING, Event, Record, Tick, blank
-from service.files.recording import Recorder, Recording
-from service.files.replay import ticks as ticks_in
-from service.scribe.scribe import Scribe
-from service.settings.config import Settings
 from support.wam import FRAME, JOINT_NAMES, STATE
+from thirdhand.contract import cdr, messages
+from thirdhand.core.controller import outgoing
+from thirdhand.core.frame import (
+    TIMING,
+    Event,
+    Record,
+    Tick,
+    blank,
+)
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.replay import ticks as ticks_in
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.settings.config import Settings
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 2_000_000

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from service.client import Client
-from service.contract import channels, requests
-from service.contract.records import Mode, Reason
-from service.core.controller import start_state
-from service.core.frame import Event
-from service.core.skill.skill import Skill
-from service.daemon.queryables import Queryables
-from service.daemon.single_instance import state_folder
-from service.daemon.skill_worker import SkillWorker
-from service.settings.config import Files, Reach, Settings
-from sim.scene import Scene
+from thirdhand.client import Client
+from thirdhand.contract import channels, requests
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.core.controller import start_state
+from thirdhand.core.frame import Event
+from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.queryables import Queryables
+from thirdhand.daemon.single_instance import state_folder
+from thirdhand.daemon.skill_worker import SkillWorker
+from thirdhand.settings.config import Files, Reach, Settings
+from thirdhand_sim.scene import Scene
 
 PLACES = Scene().via_points()
 CELLS = (f"tests/cell{n}" for n in itertools.count())

@@ -11,11 +11,11 @@ from typing import Any
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from service.client import endpoints, open_session
-from service.contract import ros2
-from service.contract.roles import access_control
-from service.daemon.single_instance import NETWORK_BOUNDS
 from support.certificates import make_certificates
+from thirdhand.client import endpoints, open_session
+from thirdhand.contract import ros2
+from thirdhand.contract.roles import access_control
+from thirdhand.daemon.single_instance import NETWORK_BOUNDS
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 

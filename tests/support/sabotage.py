@@ -7,9 +7,9 @@ from pathlib import Path
 # A part fails while a file of its name is in the folder, or "once" if that is what the file says.
 SABOTAGE = """
 import pathlib
-from service.core import controller
-from service.daemon import daemon
-from service.daemon import queryables
+from thirdhand.core import controller
+from thirdhand.daemon import daemon
+from thirdhand.daemon import queryables
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
     honest = getattr(owner, name)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.core.frame import Vector, blank
-from service.core.skill.model import Target
-from service.settings.config import Settings, ToolSettings
 from support.explained import Explained
 from support.wam import STATE
+from thirdhand.core.frame import Vector, blank
+from thirdhand.core.skill.model import Target
+from thirdhand.settings.config import Settings, ToolSettings
 
 PERIOD_S = 0.002
 TOOL = ToolSettings(engage_speed=0.0)  # at full speed from the start: engaging has tests of its own

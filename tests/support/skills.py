@@ -12,13 +12,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from kmp.storage import checksum
-from service.core.frame import Vector
-from service.core.skill import TURNS
-from service.core.skill.skill import Prediction, Skill
-from service.learning.demonstration import Demonstration
-from service.learning.records import Figures
-from service.learning.skill_file import StoredSkill
-from sim.made_tasks import takes
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill import TURNS
+from thirdhand.core.skill.skill import Prediction, Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import StoredSkill
+from thirdhand.workbench.learning.records import Figures
+from thirdhand_sim.made_tasks import takes
 
 STILL = np.zeros((2, 3))
 

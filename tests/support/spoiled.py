@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.contract import cdr
-from service.contract.channels import POSE, STRING
-from service.contract.messages import BASE, PoseStamped
-from service.contract.requests import ViaPoint, encode_json
-from service.files.mcap_file import McapFile
-from service.files.pose_streams import PLACES_TOPIC
-from service.learning.demonstration import Demonstration
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import POSE, STRING
+from thirdhand.contract.messages import BASE, PoseStamped
+from thirdhand.contract.requests import ViaPoint, encode_json
+from thirdhand.recordings.mcap_file import McapFile
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes.pose_streams import PLACES_TOPIC
 
 KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 START_NS = 10**18

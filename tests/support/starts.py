@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.core.frame import Vector
-from service.core.separation.clearance import NOBODY
-from service.core.separation.stage import Separation
-from service.settings.config import Settings, robot_description
+from thirdhand.core.frame import Vector
+from thirdhand.core.separation.clearance import NOBODY
+from thirdhand.core.separation.stage import Separation
+from thirdhand.settings.config import Settings, robot_description
 
 
 def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.contract.requests import ViaPoint
-from service.core.frame import Vector
-from service.core.skill.skill import Skill
-from service.learning.demonstration import Demonstration
-from service.learning.learn import learn
-from sim.scene import Scene
-from sim.teach import demonstrations
 from support.skills import at_rest
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.skill import Skill
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.learn import learn
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import demonstrations
 
 SCENE = Scene()
 PLACES = SCENE.via_points()

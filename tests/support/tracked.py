@@ -6,15 +6,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from service.contract.messages import JointState, PoseStamped
-from service.contract.records import Cause
-from service.core.codes import ARM_HEARD
-from service.core.frame import Record, Vector, as_array, blank, copied
-from service.core.intake.hand_estimator import is_fresh
-from service.core.intake.stage import Intake
-from service.core.intake.step import is_contested
-from service.settings.config import HandSettings, Settings, TrackerSettings
 from support.wam import FRAME, JOINT_NAMES, STATE
+from thirdhand.contract.messages import JointState, PoseStamped
+from thirdhand.contract.records import Cause
+from thirdhand.core.codes import ARM_HEARD
+from thirdhand.core.frame import (
+    Record,
+    Vector,
+    as_array,
+    blank,
+    copied,
+)
+from thirdhand.core.intake.hand_estimator import is_fresh
+from thirdhand.core.intake.stage import Intake
+from thirdhand.core.intake.step import is_contested
+from thirdhand.settings.config import HandSettings, Settings, TrackerSettings
 
 PERIOD_S = 0.002
 LEFT, RIGHT = 0, 1

@@ -6,10 +6,10 @@ import math
 import re
 from pathlib import Path
 
-from service.settings.config import Settings, load
 from support.paths import ROOT
+from thirdhand.settings.config import Settings, load
 
-ARMS = ROOT / "service" / "arms"
+ARMS = ROOT / "service" / "thirdhand" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
 NEAR_SEAM = math.pi - 0.02  # [rad] of the base's joint at the posture: the task takes it to both sides of pi
 BASE = '<origin xyz="0 0 0.089159"/>'

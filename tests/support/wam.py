@@ -4,8 +4,8 @@ recorded of it.
 
 from __future__ import annotations
 
-from service.core.frame import frame_layout, state_layout
-from service.settings.config import WAM, Settings
+from thirdhand.core.frame import frame_layout, state_layout
+from thirdhand.settings.config import WAM, Settings
 
 JOINT_NAMES = Settings().joints.names
 URDF = WAM.read_text(encoding="utf-8")

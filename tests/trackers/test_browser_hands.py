@@ -21,14 +21,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.contract.explain import ExplainedError
-from service.contract.messages import WireError
-from service.trackers import browser_hands
-from service.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
-from service.trackers.hand_message import HANDS_LAYOUT, PING, PING_MAGIC, decode_hands
-from service.trackers.hands_page import WORKER, HeadsetPage
-from service.trackers.web_server import FOREIGN, server_certificate
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
+from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.messages import WireError
+from thirdhand.workbench.trackers import browser_hands
+from thirdhand.workbench.trackers.browser_hands import (
+    FULL,
+    MAX_PAGES,
+    NO_TOKEN,
+    TAKEN,
+)
+from thirdhand.workbench.trackers.hand_message import (
+    HANDS_LAYOUT,
+    PING,
+    PING_MAGIC,
+    decode_hands,
+)
+from thirdhand.workbench.trackers.hands_page import WORKER, HeadsetPage
+from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 
 NAN_PALM, NO_ROTATION = (math.nan, *PALM[1:]), (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
 DAY_MS = 86_400_000.0

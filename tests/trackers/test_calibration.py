@@ -21,16 +21,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.client import endpoints, open_session
-from service.contract import cdr
-from service.contract.messages import JointState, PoseStamped
-from service.daemon.launch import free_port
-from service.files.mcap_file import whole_file
-from service.files.shipped import cell_of
-from service.files.track import Track
-from service.settings.config import HandSettings, Settings, TrackerSettings, load
-from service.trackers.calibration import cell_file
-from service.trackers.calibration.cell_file import (
+from support.cell import serving, told
+from support.cell_commands import assert_refused, started, succeeded
+from support.paths import ROOT
+from thirdhand.client import endpoints, open_session
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import JointState, PoseStamped
+from thirdhand.daemon.launch import free_port
+from thirdhand.recordings.mcap_file import whole_file
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import (
+    HandSettings,
+    Settings,
+    TrackerSettings,
+    load,
+)
+from thirdhand.workbench.takes.track import Track
+from thirdhand.workbench.trackers.calibration import cell_file
+from thirdhand.workbench.trackers.calibration.cell_file import (
     CalibrationRecord,
     hand_settings,
     lines,
@@ -38,8 +46,14 @@ from service.trackers.calibration.cell_file import (
     recorded,
     write,
 )
-from service.trackers.calibration.collecting import LedTracks, distances_m, held_tool, progress, solved
-from service.trackers.calibration.solver import (
+from thirdhand.workbench.trackers.calibration.collecting import (
+    LedTracks,
+    distances_m,
+    held_tool,
+    progress,
+    solved,
+)
+from thirdhand.workbench.trackers.calibration.solver import (
     Calibration,
     CalibrationError,
     HeldTool,
@@ -47,10 +61,17 @@ from service.trackers.calibration.solver import (
     solve_held,
     solve_points,
 )
-from sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
-from support.cell import serving, told
-from support.cell_commands import assert_refused, started, succeeded
-from support.paths import ROOT
+from thirdhand_sim.calibration import (
+    GRIP,
+    KINDS,
+    ORIGIN,
+    TURN,
+    LedArm,
+    error_m,
+    held,
+    led,
+    touched,
+)
 
 SECONDS, SEEDS = 40.0, range(8)
 CORNERS = bench_corners(Settings())
@@ -590,8 +611,8 @@ def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings
 def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     settings, arm = cell_of("ur5"), path_of("ur5", 0)
     recording(tmp_path / "led.mcap", held_by("mocap", arm="ur5"), arm.joints, settings)
-    urdf = ROOT / "service" / "arms" / "ur5.urdf"
-    text = (ROOT / "service" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
+    urdf = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
+    text = (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
     (tmp_path / "cell.toml").write_text(text)
     file = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
     assert_refused(1, "both hands arrive: give the one that is at the tool", *file)
@@ -744,7 +765,7 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
     np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.02)
     assert "# my cell" in cell.read_text()
 
-    monkeypatch.setattr("service.cli.calibrate.CHECK_S", 2.0)
+    monkeypatch.setattr("thirdhand.workbench.cli.calibrate.CHECK_S", 2.0)
     check = ["calibrate", "--check", "--config", str(cell)]
     with open_session(listen=["tcp/127.0.0.1:0"]) as hub, LedCell(endpoints(hub)[0], Settings(), arm):
         done = told(*check, "--connect", endpoints(hub)[0])

@@ -11,10 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.trackers import hand_model
-from service.trackers.camera import CameraError, HandCamera, pictures
-from service.trackers.hand_model import HandModelError
-from service.trackers.palm import AVERAGE_PALM, PALM, PALM_CORNERS, Array, Lens, palm_pose
+from thirdhand.workbench.trackers import hand_model
+from thirdhand.workbench.trackers.camera import CameraError, HandCamera, pictures
+from thirdhand.workbench.trackers.hand_model import HandModelError
+from thirdhand.workbench.trackers.palm import (
+    AVERAGE_PALM,
+    PALM,
+    PALM_CORNERS,
+    Array,
+    Lens,
+    palm_pose,
+)
 
 LENS, LENGTH_M = Lens(600.0, 640, 480), 0.18
 HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None

@@ -19,13 +19,13 @@ import zenoh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.client import Client, endpoints, open_session
-from service.contract.messages import PoseStamped
-from service.daemon.launch import free_port
 from support import headset
 from support.cell import LISTENING, serving, until
 from support.chromium import Tab
 from support.page_hands import Heard
+from thirdhand.client import Client, endpoints, open_session
+from thirdhand.contract.messages import PoseStamped
+from thirdhand.daemon.launch import free_port
 
 pytestmark = pytest.mark.skipif(bool(lacks := headset.lacking()), reason=lacks)
 TIMEOUT_S = 60.0

@@ -18,17 +18,17 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from service.cli.demo import EVENT_TITLES
-from service.client import RefusedError, UnreachableError
-from service.contract.messages import BASE
-from service.trackers.browser_hands import NO_TOKEN
-from sim.scene import HAND_ORIENTATION
 from support import chromium
 from support.cell import Daemon, serving, until
 from support.cell_commands import started
 from support.chromium import Tab
 from support.dragging import Person
 from support.page_hands import Heard
+from thirdhand.client import RefusedError, UnreachableError
+from thirdhand.contract.messages import BASE
+from thirdhand.workbench.cli.demo import EVENT_TITLES
+from thirdhand.workbench.trackers.browser_hands import NO_TOKEN
+from thirdhand_sim.scene import HAND_ORIENTATION
 
 TIMEOUT_S = 90
 MAX_SPEED_M_S = 0.6

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from service.client import Watch, endpoints, open_session
-from service.trackers.pinch import Pinches
+from thirdhand.client import Watch, endpoints, open_session
+from thirdhand.workbench.trackers.pinch import Pinches
 
 LEFT_M = {  # distance of thumb and index tip of the left hand, None where it is not seen: whether the clutch is pressed
     "parted": ([0.09], [False]),

@@ -16,21 +16,34 @@ import numpy as np
 import pytest
 import zenoh
 
-from service.cli.main import main
-from service.cli.record_options import add_options
-from service.client import endpoints, open_session
-from service.contract import cdr, channels
-from service.contract.messages import JointState, PoseStamped
-from service.contract.requests import Add, encode_json
-from service.core.arm.stage import Arm
-from service.daemon.launch import free_port
-from service.files.demonstration_files import demonstration_paths, summary, table, trim, uncut
-from service.files.demonstration_reader import hand_samples, read_demonstration
-from service.files.dwells import REST_M
-from service.files.mcap_file import RecordingError
-from service.files.pose_streams import PoseRecording, PoseTopic
-from service.settings.config import HandSettings, Settings, ToolSettings, robot_description
-from service.trackers.capture import (
+from support.cell import until
+from support.paths import ROOT
+from thirdhand.client import endpoints, open_session
+from thirdhand.command_line import main
+from thirdhand.contract import cdr, channels
+from thirdhand.contract.messages import JointState, PoseStamped
+from thirdhand.contract.requests import Add, encode_json
+from thirdhand.core.arm.stage import Arm
+from thirdhand.daemon.launch import free_port
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import (
+    HandSettings,
+    Settings,
+    ToolSettings,
+    robot_description,
+)
+from thirdhand.workbench.cli.record_options import add_options
+from thirdhand.workbench.takes.demonstration_files import (
+    demonstration_paths,
+    summary,
+    table,
+    trim,
+    uncut,
+)
+from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
+from thirdhand.workbench.takes.dwells import REST_M
+from thirdhand.workbench.takes.pose_streams import PoseRecording, PoseTopic
+from thirdhand.workbench.trackers.capture import (
     JOINT_STATES,
     MOVED_RATIO,
     REST_RAD,
@@ -40,10 +53,8 @@ from service.trackers.capture import (
     Sample,
     capture,
 )
-from sim.scene import Scene
-from sim.teach import perform
-from support.cell import until
-from support.paths import ROOT
+from thirdhand_sim.scene import Scene
+from thirdhand_sim.teach import perform
 
 SETTINGS = Settings(
     hands=HandSettings(unit="mm", frame="tracker", base_from_tracker=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))

@@ -18,15 +18,15 @@ import aiohttp
 import pytest
 import zenoh
 
-from service.client import Client, endpoints, open_session
-from service.contract import cdr
-from service.contract.explain import ExplainedError
-from service.contract.incidents import ORDERS
-from service.trackers import browser_hands, cell_view, web_server
-from service.trackers.cell_view import Latest, carried_out
-from service.trackers.pinch import Pinches
-from service.trackers.web_server import FOREIGN, server_certificate
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
+from thirdhand.client import Client, endpoints, open_session
+from thirdhand.contract import cdr
+from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.incidents import ORDERS
+from thirdhand.workbench.trackers import browser_hands, cell_view, web_server
+from thirdhand.workbench.trackers.cell_view import Latest, carried_out
+from thirdhand.workbench.trackers.pinch import Pinches
+from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 from trackers.test_browser_hands import opened, reason
 
 REFUSED: dict[str, tuple[bytes, str]] = {  # a request, with HOST for the header, and the answer to it

@@ -17,17 +17,24 @@ import pytest
 import zenoh
 from scipy.spatial.transform import Rotation
 
-from service.client import Watch
-from service.contract import cdr
-from service.contract.messages import JointState
-from service.files.replay import replay
-from service.settings.config import Settings, load
-from sim.calibration import BENCH, GRIP, ORIGIN, TURN, LedArm, led
-from sim.scene import Scene
 from support import headset
 from support.cell import serving, told
 from support.chromium import Tab
 from support.paths import ROOT
+from thirdhand.client import Watch
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import JointState
+from thirdhand.recordings.replay import replay
+from thirdhand.settings.config import Settings, load
+from thirdhand_sim.calibration import (
+    BENCH,
+    GRIP,
+    ORIGIN,
+    TURN,
+    LedArm,
+    led,
+)
+from thirdhand_sim.scene import Scene
 
 pytestmark = [
     pytest.mark.timed,
@@ -145,7 +152,9 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
         daemon.client.add(scene.via_points())
         begin(tab, scene)
         command = ["--connect", daemon.endpoint, "--arm", str(cell), "--tracked-hands", str(TIMEOUT_S), "--once"]
-        bench = subprocess.Popen([sys.executable, "-m", "sim", *command], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        bench = subprocess.Popen(
+            [sys.executable, "-m", "thirdhand_sim", *command], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        )
         with bench:
             daemon.until(lambda now: now["reason"] == "clutch", TIMEOUT_S)
             pinch(tab, 1.0)

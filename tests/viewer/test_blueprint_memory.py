@@ -7,8 +7,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from service.settings.config import Settings
-from service.viewer.blueprint import blueprint
+from thirdhand.settings.config import Settings
+from thirdhand.viewer.blueprint import blueprint
 
 
 def test_a_sent_blueprint_leaves_no_thread_behind(tmp_path: Path) -> None:

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.cli.main import main
-from service.cli.view import RRD_MAGIC, last_followed, screenshot
-from service.contract.messages import SceneObject
-from service.contract.printable import as_markdown, printable
-from service.contract.records import Mode, Reason
-from service.contract.requests import encode_json
-from service.core.separation.body import body_of
-from service.core.skill.skill import Skill
-from service.settings.config import WAM, Settings
-from service.viewer.blueprint import blueprint
-from service.viewer.stream import Viewer
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views
 from support.wicked import WICKED, wicked_skill
+from thirdhand.command_line import main
+from thirdhand.contract.messages import SceneObject
+from thirdhand.contract.printable import as_markdown, printable
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import encode_json
+from thirdhand.core.separation.body import body_of
+from thirdhand.core.skill.skill import Skill
+from thirdhand.settings.config import WAM, Settings
+from thirdhand.viewer.blueprint import blueprint
+from thirdhand.viewer.stream import Viewer
+from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 
 
 def viewer(**where: Any) -> Viewer:

@@ -15,11 +15,11 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from service.scribe.process import LiveView
-from service.scribe.protocol import TickMessage
-from service.settings.config import WAM, Settings
-from service.viewer.stream import Viewer, rerun_program
 from support.recorded import drawn, ticks, values
+from thirdhand.scribe.process import LiveView
+from thirdhand.scribe.protocol import TickMessage
+from thirdhand.settings.config import WAM, Settings
+from thirdhand.viewer.stream import Viewer, rerun_program
 
 pytestmark = pytest.mark.thorough
 

@@ -15,28 +15,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.cli.main import main
-from service.cli.usage import UsageError
-from service.cli.view import convert, moment, screenshot
-from service.contract import cdr
-from service.contract.messages import JointState, SceneObject
-from service.contract.records import Mode, Reason
-from service.contract.requests import ViaPoint, encode_json
-from service.core.skill.model import REGION_95
-from service.core.skill.pose import CLOSED
-from service.core.skill.skill import Skill
-from service.files.mcap_file import RecordingError
-from service.learning.skill_file import with_file
-from service.settings.config import WAM, Settings, parse
-from service.viewer.banner import banner, headline
-from service.viewer.blueprint import blueprint
-from service.viewer.dynamic import REPEAT_S, DrawnFrame, DynamicScene
-from service.viewer.sentences import sentence
-from service.viewer.static import ArmModels
-from service.viewer.stream import Viewer, ViewerError
 from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
 from support.turning import sliding_cell
 from support.wam import JOINT_NAMES
+from thirdhand.cli.usage import UsageError
+from thirdhand.command_line import main
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import JointState, SceneObject
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import ViaPoint, encode_json
+from thirdhand.core.skill.model import REGION_95
+from thirdhand.core.skill.pose import CLOSED
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import WAM, Settings, parse
+from thirdhand.skills.skill_file import with_file
+from thirdhand.viewer.banner import banner, headline
+from thirdhand.viewer.blueprint import blueprint
+from thirdhand.viewer.dynamic import REPEAT_S, DrawnFrame, DynamicScene
+from thirdhand.viewer.sentences import sentence
+from thirdhand.viewer.static import ArmModels
+from thirdhand.viewer.stream import Viewer, ViewerError
+from thirdhand.workbench.cli.view import convert, moment, screenshot
 
 
 def viewer(**where: Any) -> Viewer:

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.cli.main import main
-from service.cli.view import convert
-from service.contract import cdr
-from service.contract.messages import JointState
-from service.contract.records import Mode, Reason
-from service.contract.requests import ViaPoint
-from service.core.frame import Event, Tick
-from service.core.skill.skill import Skill
-from service.files.recording import Recorder, Recording
-from service.learning.skill_file import with_file
-from service.settings.config import Settings
 from support.recorded import SKILL, TEXT, at_ns, drawn, ticks, values
 from support.wam import JOINT_NAMES
+from thirdhand.command_line import main
+from thirdhand.contract import cdr
+from thirdhand.contract.messages import JointState
+from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.frame import Event, Tick
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import with_file
+from thirdhand.workbench.cli.view import convert
 
 VISE = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
 MEASURED_AT, TAUGHT_AT, LATE_AT, HELD_AT = 55, 155, 205, 255  # between whole frames

@@ -1,8 +1,0 @@
-"""Stage 6, arm: the pose of the tool, and the joint velocities that move it to the setpoint."""
-
-from __future__ import annotations
-
-from service.contract.records import Layout
-
-STATE: Layout = ()
-FRAME: Layout = ()

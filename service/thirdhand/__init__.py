@@ -1,0 +1,17 @@
+"""A robot arm as a third hand. The names here are the client's: connect to a cell, publish hands,
+watch, teach, request. See `thirdhand.client`.
+"""
+
+TYPE_CHECKING = False  # for type checkers; this module imports nothing, as each command begins with it
+if TYPE_CHECKING:
+    from thirdhand.client import *  # noqa: F403
+
+
+def __getattr__(name: str) -> object:
+    """A name of the client, which is imported when it is first needed."""
+    import importlib
+
+    client = importlib.import_module("thirdhand.client")
+    if name not in client.__all__:
+        raise AttributeError(f"module 'thirdhand' has no name {name!r}")
+    return getattr(client, name)

@@ -1,0 +1,118 @@
+"""`thirdhand via-points`, `stage`, `correct`, `hold`, `resume`, `reset`: requests to a daemon."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import Any
+
+import msgspec
+
+from thirdhand.cli.here import still
+from thirdhand.cli.usage import UsageError, added_in, reached
+from thirdhand.client import Client
+from thirdhand.contract.incidents import in_brief, what_to_do
+from thirdhand.contract.records import SIDES
+from thirdhand.contract.requests import Correction
+from thirdhand.process.progress import progress
+
+WAITING = "waiting for the daemon's answer"
+
+
+def via_points(args: argparse.Namespace) -> int:
+    """Send the request and print the via-points in force; exit code 0."""
+    request: dict[str, Any] = {"op": args.action}
+    if args.action == "remove":
+        request["names"] = args.names
+    elif args.action == "add":
+        request = _add(args)
+    with reached(args) as session, progress(WAITING):
+        client = Client(session, args.cell)
+        before = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
+        reply = client.ask("via_points", request)
+    for point in reply["points"]:
+        tool = " ".join(f"{v:.3f}" for v in point["tool"])
+        missed = f"missed by {1000 * point['missed_by_m']:.1f} mm"
+        if point["missed_by_rad"] is not None:
+            missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
+        if point["gripper"]:
+            missed += f", gripper {point['gripper']}"
+        if point["stage"]:
+            missed += f", in the stage from {point['stage']} on"
+        if point["corrections"]:
+            missed += f", corrected {point['corrections']} time{'s' * (point['corrections'] != 1)}"
+        print(f"{point['name']:<16} tool {tool}   {missed}")
+    count = len(reply["points"])
+    print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
+    added = [point["name"] for point in request.get("points", ())]
+    if replaced := [point["name"] for point in before if point["name"] in added]:
+        print(f"replaced, because a via-point had the same name: {', '.join(replaced)}")
+    for warning in reply.get("warnings", ()):
+        print(f"warning: {warning}", file=sys.stderr)
+    return 0
+
+
+def _add(args: argparse.Namespace) -> Any:
+    if args.file:
+        return msgspec.to_builtins(added_in(args.file))
+    if args.here and args.name:
+        for name, position in still(args).items():
+            setattr(args, name, getattr(args, name) or position)
+    given = [side for side in SIDES if getattr(args, side)]
+    if args.name and args.tool and len(given) == 1 and ask(args, "status").get("hands") == given[0]:
+        args.left = args.right = args.left or args.right  # the skill ignores the other hand
+    if not (args.name and args.left and args.right and args.tool):
+        raise UsageError(
+            "NAME with --here, or NAME with --left, --right and --tool, or --file needed; for a skill of one hand, "
+            "its option suffices"
+        )
+    fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
+    point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
+    return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
+
+
+def stage(args: argparse.Namespace) -> int:
+    """Report the reached via-point and print the resulting mode; exit code 0."""
+    reply = ask(args, "stage", {"name": args.name})
+    mode, reason = (reply.get(name, "") for name in ("mode", "reason"))
+    print(f"at {args.name} since tick {reply['tick']}: {in_brief(mode, reason)}")
+    return 0
+
+
+def correct(args: argparse.Namespace) -> int:
+    """Correct the tool, or undo the last correction, and print its effect; exit code 0."""
+    request: dict[str, Any] = {"op": "undo"}
+    if not args.undo:
+        request = {"op": "add", "hands": "now" if args.now else "held", "turned": args.turned}
+        request |= {"tool": args.tool} if args.tool else {}
+    elif args.tool or args.now or args.turned:
+        raise UsageError("--undo accepts no other option")
+    reply = ask(args, "correct", request)
+    found = msgspec.convert(reply["correction"], Correction)
+    print(f"{found.name} {'undone' if found.undone else 'in force'} since tick {reply['tick']}: {found.text}")
+    print("Then `thirdhand resume`: the tool approaches its target at [tool] engage_speed.")
+    if note := reply.get("note"):
+        print(note[0].upper() + note[1:])
+    for warning in reply.get("warnings", ()):
+        print(f"warning: {warning}", file=sys.stderr)
+    return 0
+
+
+def hold(args: argparse.Namespace) -> int:
+    """Send hold, resume or reset and print the resulting mode; exit code 0."""
+    reply = ask(args, args.command)
+    mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
+    print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
+    if (mode == "fault" or (args.command == "resume" and mode == "hold")) and what_to_do(reason):
+        print(f"What to do: {what_to_do(reason)}")
+    return 0
+
+
+resume = reset = hold
+
+
+def ask(args: argparse.Namespace, suffix: str, request: Any = None) -> dict[str, Any]:
+    """The reply to a request as received. Raises UnreachableError, RefusedError."""
+    with reached(args) as session, progress(WAITING):
+        return Client(session, args.cell).ask(suffix, request)

@@ -1,0 +1,171 @@
+"""`thirdhand doctor`: examines a running cell; prints what was found and what to do about it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import math
+import socket
+import time
+from collections import deque
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import TypeAlias
+
+import msgspec
+import zenoh
+
+from thirdhand.cli.diagnosis import Finding, findings, wrong
+from thirdhand.cli.status import statuses
+from thirdhand.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
+from thirdhand.client import (
+    Overheard,
+    RefusedError,
+    StartingError,
+    UnreachableError,
+)
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import ENDPOINT, key, tcp_address
+from thirdhand.contract.explain import in_words
+from thirdhand.contract.incidents import Condition, what_to_do
+from thirdhand.contract.messages import WireError
+from thirdhand.contract.printable import printable_lines
+from thirdhand.contract.ros2 import NO_TYPE_HASH
+from thirdhand.process import bytecode
+
+PROBE_S = 1.0
+MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
+PUBLISHED = ("**/hands/*", "**/joints/state", f"**/{NO_TYPE_HASH}")  # in any cell, because a name may be wrong
+
+Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad] of a joint
+
+
+def doctor(args: argparse.Namespace) -> int:
+    """Exit code 1 if something is wrong."""
+    found = []
+    for finding in _examined(args):
+        found.append(finding)
+        if not args.json:
+            print(printable_lines(finding.text()), flush=True)
+    count = sum(finding.level == "wrong" for finding in found)
+    if args.json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+    else:
+        many = f"{count} things are wrong; the first may cause the others"
+        print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
+    return 1 if count else 0
+
+
+def _examined(args: argparse.Namespace) -> Iterator[Finding]:
+    try:
+        session = reached(args)
+    except UnreachableError as error:
+        yield from (unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT])
+        return
+    with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
+        try:
+            with contextlib.closing(statuses(session, args.cell)) as arriving:
+                seen = [next(arriving)]
+                travel = Travel()
+                if seen[0].command_heard:  # otherwise the daemon would take this subscriber for a driver
+                    closing.enter_context(travel.watching(session, args.cell))
+                end = time.monotonic() + args.seconds
+                while time.monotonic() < end:
+                    seen.append(next(arriving))
+        except StartingError as error:
+            yield wrong("daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING))
+            return
+        except UnreachableError as error:
+            cells = {
+                str(reply.ok.key_expr).split("/daemon/")[0]
+                for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
+                if reply.ok is not None
+            }
+            remedy = what_to_do(
+                Condition.NO_ANSWER if args.cell in cells else Condition.OTHER_CELL if cells else Condition.NO_DAEMON
+            )
+            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
+            return
+        except RefusedError as error:
+            yield wrong("daemon", str(error), f"version {version('thirdhand')}", what_to_do(Condition.VERSIONS_DIFFER))
+            return
+    yield from findings(
+        *seen,
+        own_ns=time.time_ns(),
+        own_version=version("thirdhand"),
+        published=published.keys,
+        travels=travel.of_joints(),
+        lag_ms=travel.lag_ms(),
+    )
+    if uncompiled := bytecode.missing():
+        yield Finding("note", "bytecode", uncompiled)
+
+
+class Travel:
+    """Commanded and measured positions of an arm's joints while they are watched."""
+
+    def __init__(self) -> None:
+        self._commanded: dict[str, Series] = {}  # of each joint
+        self._measured: dict[str, Series] = {}
+
+    @contextlib.contextmanager
+    def watching(self, session: zenoh.Session, cell: str) -> Iterator[None]:
+        """Watch a cell's arm while the context lasts."""
+        commands = functools.partial(self._take, self._commanded)
+        states = functools.partial(self._take, self._measured)
+        with (
+            session.declare_subscriber(key(cell, "joints/command"), commands),
+            session.declare_subscriber(key(cell, "joints/state"), states),
+        ):
+            yield
+
+    def of_joints(self) -> dict[str, tuple[float, float]]:
+        """Commanded and measured travel of each joint [rad]."""
+        return {
+            name: (_span(commanded), _span(measured))
+            for name, commanded in self._commanded.copy().items()
+            if (measured := self._measured.get(name)) is not None
+        }
+
+    def lag_ms(self) -> float | None:
+        """The measured lag of the arm behind its commands; None if it followed no motion."""
+        from thirdhand.cli.arm_lag import lag  # numpy is slow to import, and most findings need none
+
+        commanded, measured = (
+            {name: list(series) for name, series in joints.copy().items()}
+            for joints in (self._commanded, self._measured)
+        )
+        found = lag(commanded, measured)
+        return None if found is None else 1000 * found.lag_s
+
+    @staticmethod
+    def _take(joints: dict[str, Series], sample: zenoh.Sample) -> None:
+        at_s = time.monotonic()
+        with contextlib.suppress(WireError):
+            message = cdr.decode_joints(sample.payload.to_bytes())
+            for name, position in zip(message.names, message.position, strict=False):
+                if math.isfinite(position):
+                    joints.setdefault(name, deque(maxlen=MAX_SERIES)).append((at_s, position))
+
+
+def _span(series: Series) -> float:
+    positions = [position for _, position in series.copy()]
+    return max(positions) - min(positions)
+
+
+def unreachable(endpoint: str, error_text: str) -> Finding:
+    """The reason why no session with an endpoint can be opened."""
+    wanted = f"a daemon that listens on {endpoint}"
+    if (address := tcp_address(endpoint)) is None:
+        return wrong("port", error_text, wanted, what_to_do(Condition.PORT_CLOSED))
+    host, port = address
+    try:
+        socket.create_connection(address, timeout=PROBE_S).close()
+    except ConnectionRefusedError:
+        return wrong("port", f"nothing listens on {host} port {port}", wanted, what_to_do(Condition.PORT_CLOSED))
+    except (OSError, OverflowError) as error:
+        found = f"{host} port {port} cannot be reached: {in_words(error)}"
+        return wrong("port", found, wanted, what_to_do(Condition.NO_WAY))
+    found = f"something listens on {host} port {port}, but opens no Zenoh session"
+    return wrong("port", found, wanted, what_to_do(Condition.PORT_FOREIGN))

@@ -1,0 +1,53 @@
+"""`thirdhand follow`: drive an arm by a cell's commands."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+
+from thirdhand.cli.usage import reaching
+from thirdhand.client import Client
+from thirdhand.client.session import tried
+from thirdhand.process.progress import say
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import Settings
+from thirdhand.settings.file_content import UnreadableError
+
+DRIVES = ("franka", "simulated")
+
+
+def follow(args: argparse.Namespace) -> int:
+    """Drive the arm until Ctrl-C; exit code 0 with the arm at rest. Raises DriveError,
+    UnreachableError.
+    """
+    if args.arm not in DRIVES:
+        raise UnreadableError(
+            f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with examples/own_arm.py"
+        )
+    settings = cell_of(str(args.config)) if args.config else Settings()
+    reach = reaching(args, settings)
+    cell = settings.cell if args.config and not args.cell else reach.cell
+    with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
+        from thirdhand.arms.drive import Drive, DriveError  # slow imports: a missing daemon is reported before
+        from thirdhand.arms.drive import follow as driven
+        from thirdhand.arms.franka import FrankaArm
+        from thirdhand.arms.simulated import SimulatedArm
+        from thirdhand.daemon.clock import ask_for_real_time
+
+        status = Client(session, cell).wait_until_ready(timeout_s=args.wait, silent=False)
+        if status.joints != settings.joints.names:
+            raise DriveError(
+                f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; the "
+                f"settings here have {len(settings.joints.names)}, {', '.join(settings.joints.names)}: "
+                "give the daemon's settings by --config"
+            )
+        drive: Drive = FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        ask_for_real_time()
+        say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
+        playback = driven(drive, session, cell, stop=stop, wait_s=args.wait)
+    say(f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were refused")
+    return 0

@@ -1,0 +1,266 @@
+"""A connection to a cell: its requests as calls, and its streams, for programs of a few lines."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import reprlib
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from thirdhand.client.calls import Client
+from thirdhand.client.client_settings import client_settings
+from thirdhand.client.session import check_open, put
+from thirdhand.client.streams import (
+    UNTURNED,
+    Watch,
+    checked_frame,
+    checked_stamp,
+    encoded_joints,
+    publisher,
+    wait_until_heard,
+)
+from thirdhand.contract import cdr, markers
+from thirdhand.contract.messages import (
+    BASE,
+    GRIPPER,
+    JointState,
+    PoseStamped,
+    Quaternion,
+    SceneObject,
+    Vector3,
+    finite,
+)
+from thirdhand.contract.requests import (
+    ANSWER_TIMEOUT_S,
+    NORM_TOLERANCE,
+    Reply,
+    ViaPoint,
+)
+
+LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
+FORMS = {  # by the largest count of numbers
+    1: "0 (open) to 1 (closed)",
+    3: "x y z [m]",
+    7: "x y z [m], or x y z and a quaternion x y z w,",
+}
+
+
+def connect(
+    endpoint: str | Sequence[str] | None = None,
+    *,
+    cell: str | None = None,
+    certificate: str | Path | None = None,
+    zenoh_config: str | Path | None = None,
+    timeout_s: float | None = 10.0,
+) -> Connection:
+    """A connection to a cell; a context manager. The caller closes it.
+
+    Arguments that are None are taken from the environment, the client's file or the defaults, see
+    `client_settings`. Connecting is tried for `timeout_s` [s]; None: until Ctrl-C. Raises
+    UnreachableError, and SettingsError for settings that cannot be used.
+    """
+    endpoints = [endpoint] if isinstance(endpoint, str) else endpoint
+    settings = client_settings(connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config)
+    return Connection(settings.session(timeout_s=timeout_s), settings.cell)
+
+
+class Connection(Client, AbstractContextManager["Connection"]):
+    """A cell's streams, and all requests of a `Client`, over one Zenoh session; a context manager.
+
+    A pose is three numbers, the position x y z [m], or seven, followed by the quaternion x y z w.
+    `stamp_ns` is the time of measurement [ns since 1970]; None: now. Stamps of one channel must
+    increase. The first message on a channel waits up to 5 s until somebody listens to it. `close`
+    closes the session.
+
+    Each publishing call raises ValueError, before anything is sent, for values that the service
+    would reject, and UnreachableError if nobody listens.
+    """
+
+    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
+        super().__init__(session, cell, timeout_s=timeout_s)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The Zenoh session, for a `Follower` or for keys of your own."""
+        return self._session
+
+    def hands(
+        self,
+        *,
+        left: Sequence[float] | None = None,
+        right: Sequence[float] | None = None,
+        stamp_ns: int | None = None,
+        frame_id: str = BASE,
+    ) -> None:
+        """Publish the poses of the hands that the tracker sees now, in its frame."""
+        given = {"left": left, "right": right}
+        poses = {f"hands/{side}": _pose(side, pose) for side, pose in given.items() if pose is not None}
+        if not poses:
+            raise ValueError("no hand given; left, right or both needed")
+        self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
+
+    def tool(self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE) -> None:
+        """Publish the measured pose of the tool, for demonstrations."""
+        self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
+
+    def gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
+        """Publish the measured closure of the gripper, 0 (open) to 1 (closed), for
+        demonstrations.
+        """
+        self._publish_closure("gripper/state", closure, stamp_ns)
+
+    def clutch(self, pressed: bool) -> None:
+        """Publish that the clutch is pressed, or released. While it is pressed, call this at 10 Hz
+        or more.
+        """
+        self._publish_bool("clutch", pressed)
+
+    def joints(
+        self,
+        names: Sequence[str],
+        position: Sequence[float],
+        velocity: Sequence[float] = (),
+        *,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Publish the measured joints [rad, rad/s; m, m/s if prismatic] of an arm that is led or
+        that a program of its own moves. An arm that follows this cell uses a `Follower`.
+        """
+        encoded_joints(0, names, position, velocity)  # raises before anything is sent
+        if not finite((*position, *velocity)):
+            raise ValueError(f"joints: {list(position)} and {list(velocity)} given; finite numbers needed")
+        self._publish({"joints/state": lambda ns: encoded_joints(ns, names, position, velocity)}, stamp_ns)
+
+    def guided(self, led: bool) -> None:
+        """Publish that somebody leads the arm by hand, or no longer does. While it is led, call
+        this with each joint state.
+        """
+        self._publish_bool("joints/guided", led)
+
+    def wish_gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
+        """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
+        self._publish_closure("gripper/wish", closure, stamp_ns)
+
+    def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
+        """Publish all objects on the bench, for viewers and recordings."""
+        try:
+            scene = tuple(objects)
+        except TypeError:
+            raise ValueError(f"objects: {reprlib.repr(objects)} given; SceneObjects needed") from None
+        for one in scene:
+            if not isinstance(one, SceneObject):
+                raise ValueError(f"object {one!r} given; a SceneObject needed")
+            if one.shape not in markers.NUMBERS:
+                accepted = ", ".join(markers.NUMBERS)
+                raise ValueError(f"object {one.name!r}: shape {one.shape!r} given; one of {accepted} accepted")
+        markers.decode_objects(markers.encode_objects(0, scene))  # raises the error that the daemon would report
+        self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
+
+    def watch(self, suffix: str, *, timeout_s: float | None = None) -> Watch:
+        """An iterator over the messages of a channel: `tool/target`, `joints/command`, `status`.
+
+        It yields None after `timeout_s` [s] without a message; if `timeout_s` is None, it waits. To
+        the daemon, a program that watches `joints/command` is the arm's driver.
+        """
+        return Watch(self._session, self._cell, suffix, timeout_s=timeout_s)
+
+    def teach(
+        self, name: str, *, left: Sequence[float], right: Sequence[float], tool: Sequence[float], **more: Any
+    ) -> Reply:
+        """Teach one via-point: the tool's position [m] that belongs to these positions of the
+        hands. `more` are further fields of `ViaPoint`. Returns once it is in force.
+        """
+        point = ViaPoint(name, _position("left", left), _position("right", right), _position("tool", tool), **more)
+        return self.add([point])
+
+    def close(self) -> None:
+        """Close the session, with all that was opened on it."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _publish_bool(self, suffix: str, value: bool) -> None:
+        if not isinstance(value, bool):
+            raise ValueError(f"{suffix.removeprefix('joints/')}: {value!r} given; True or False needed")
+        self._publish({suffix: lambda _: cdr.encode_bool(value)}, None)
+
+    def _publish_closure(self, suffix: str, closure: float, stamp_ns: int | None) -> None:
+        (value,) = _numbers("closure", [closure], 1)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"closure: {closure} given; {FORMS[1]} needed")
+        self._publish({suffix: lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))}, stamp_ns)
+
+    def _publish(self, messages: dict[str, Callable[[int], bytes]], stamp_ns: int | None) -> None:
+        """Publish messages that are encoded for a stamp [ns]; None: the time when all of them are
+        heard. With a time before that wait, later samples would seem to arrive too early.
+        """
+        if stamp_ns is not None:
+            stamp_ns = checked_stamp(stamp_ns)
+        check_open(self._session)
+        publishers = [self._heard(suffix) for suffix in messages]
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        for one, encode in zip(publishers, messages.values(), strict=True):
+            put(self._session, one, encode(stamp_ns))
+
+    def _heard(self, suffix: str) -> zenoh.Publisher:
+        """The publisher on a channel, once somebody listens. Raises UnreachableError."""
+        if (known := self._publishers.get(suffix)) is not None:
+            return known
+        one = publisher(self._session, self._cell, suffix, express=True)
+        try:
+            wait_until_heard(one, timeout_s=LISTENER_TIMEOUT_S)
+        except BaseException:
+            one.undeclare()  # type: ignore[no-untyped-call]
+            raise
+        return self._publishers.setdefault(suffix, one)
+
+
+def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:
+    """The encoding of a pose for a stamp [ns]. Raises ValueError for what is no name of a frame."""
+    checked_frame(frame_id)
+    return lambda stamp_ns: cdr.encode_pose(PoseStamped(stamp_ns, frame_id, position, orientation))
+
+
+def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
+    """Position [m] and orientation of a pose of three or seven numbers. Raises ValueError."""
+    numbers = _numbers(what, pose, 3, 7)
+    position, turned = (numbers[0], numbers[1], numbers[2]), numbers[3:]
+    if not turned:
+        return position, UNTURNED
+    if abs((norm := math.hypot(*turned)) - 1.0) > NORM_TOLERANCE:
+        raise ValueError(f"{what}: quaternion {list(turned)} has norm {norm:.4g}; 1 needed (x y z w)")
+    return position, (turned[0], turned[1], turned[2], turned[3])
+
+
+def _position(what: str, given: Sequence[float]) -> Vector3:
+    """The three numbers of a position [m]. Raises ValueError."""
+    x, y, z = _numbers(what, given, 3)
+    return x, y, z
+
+
+def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
+    """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
+    try:
+        if isinstance(given, str | bytes | bytearray | Mapping | Set):  # their members are in no order, or no numbers
+            raise TypeError
+        values = tuple(itertools.islice(given, counts[-1] + 1))
+        if any(isinstance(value, str | bytes) for value in values):
+            raise TypeError
+        numbers = tuple(map(float, values))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; {FORMS[counts[-1]]} needed") from None
+    if len(numbers) not in counts:
+        most = f"more than {counts[-1]}" if len(numbers) > counts[-1] else len(numbers)
+        count = len(given) if hasattr(given, "__len__") else most
+        raise ValueError(f"{what}: {count} numbers given; {FORMS[counts[-1]]} needed")
+    if not finite(numbers):
+        raise ValueError(f"{what}: {list(numbers)} given; finite numbers needed")
+    return numbers

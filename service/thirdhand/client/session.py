@@ -1,0 +1,326 @@
+"""Zenoh sessions between named endpoints, without multicast discovery."""
+
+from __future__ import annotations
+
+import codecs
+import json
+import os
+import re
+import socket
+import ssl
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import zenoh
+
+from thirdhand.contract.channels import lacking, tcp_address
+from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
+
+CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # files in the folder of a role
+FOLDER_NEEDED = f"a folder with {CERTIFICATE}, {KEY} and {AUTHORITY} needed"
+ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
+ATTEMPT_S = 1.0  # timeout of one attempt
+RETRY_S = 0.05  # pause before the next attempt
+SERVER_PROBLEMS = {  # by OpenSSL's code of a failed verification; others: another authority
+    9: "is not valid yet by the clock of this machine",
+    10: "has expired",
+    26: "is that of another role",
+    62: "is not for this name",
+    64: "is not for this address",
+}
+CLIENT_PROBLEMS = {  # by the alert of TLS that the server sends
+    **dict.fromkeys(("UNKNOWN_CA", "DECRYPT_ERROR"), "is not from the authority there"),
+    **dict.fromkeys(("BAD_CERTIFICATE", "CERTIFICATE_UNKNOWN", "CERTIFICATE_REQUIRED"), "is not valid there"),
+    "CERTIFICATE_EXPIRED": "has expired by the clock there",
+}
+Attempted = TypeVar("Attempted")
+
+
+class UnreachableError(ExplainedError, OSError):
+    """No Zenoh session can be opened, or no daemon answers."""
+
+
+class CertificateError(UnreachableError):
+    """A certificate is missing, wrong or not valid now; waiting does not help."""
+
+
+class StartingError(UnreachableError):
+    """The daemon is not ready yet; the message has the progress of its start."""
+
+
+class UncertainError(UnreachableError):
+    """No answer to a request arrived, and it may have been carried out."""
+
+
+class RefusedError(ExplainedError, ValueError):
+    """The daemon refused a request; the message is its answer."""
+
+
+def open_session(
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    otherwise: Sequence[str] = (),
+    timeout_s: float | None = 10.0,
+    certificate: str | Path | None = None,
+    zenoh_config: str | Path | None = None,
+    more: Mapping[str, Any] | None = None,
+    at_once: bool = False,
+) -> zenoh.Session:
+    """An open Zenoh session between named endpoints; `more` has further settings of Zenoh.
+
+    A session that only connects is a client of the first endpoint that answers, because peers do
+    not meet through a router. A session that listens is a peer, or a router if it also connects. A
+    `mode` in the file `zenoh_config` overrides that; all other settings here override the file. A
+    client without `connect` takes the file's endpoints, or else those in `otherwise`.
+
+    Opening is tried for `timeout_s` [s]. None, for a session that only connects: until Ctrl-C, with
+    one message on standard error, so that programs may be started in any order. With `at_once`, the
+    call fails immediately if the system reports that nothing listens, or that there is no way.
+
+    `certificate` is the folder of a role, for endpoints that begin with `tls/`; None:
+    $THIRDHAND_CERTIFICATE, empty: none. Without `zenoh_config`, $THIRDHAND_ZENOH_CONFIG is used.
+    The caller closes the session. Raises UnreachableError, and CertificateError at once if TLS
+    fails for a certificate.
+    """
+    for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
+        if lacks := lacking(endpoint):
+            raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
+    config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
+    if otherwise and not connect and not listen:
+        connect = _endpoints_in(config) or otherwise
+    folder = os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate
+    role = ("router" if connect else "peer") if listen or not connect else "client"
+    settings: dict[str, Any] = {
+        "mode": json.loads(config.get_json("mode")) or role,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
+        "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
+        "listen/exit_on_failure": True,
+        "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
+        "plugins_loading/enabled": False,
+        "namespace": None,  # the contract's keys are absolute
+        # [batches] A tick publishes up to four messages, each a batch of its own. With Zenoh's 2,
+        # `put` waits for the thread that sends, for 1 ms, and drops the message.
+        "transport/link/tx/queue/size/real_time": 16,
+        "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
+        **_tls(folder),
+        **(more or {}),
+    }
+
+    if at_once and (failed := _failures(connect)):
+        raise UnreachableError(
+            _unreached(failed) or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
+        )
+
+    def opened() -> zenoh.Session:
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            ours = connect if folder or not zenoh_config else ()  # else the file may have certificates of its own
+            if problem := next(filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""):
+                raise CertificateError(problem) from None
+            raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
+
+    return tried(opened, None if timeout_s is None and not listen else 0.0)
+
+
+def check_open(session: zenoh.Session) -> None:
+    """Raise UnreachableError for a session that was closed, or that another thread closes."""
+    try:
+        closed = session.is_closed()
+    except RuntimeError:  # Zenoh has lent the session to the thread that closes it
+        closed = True
+    if closed:
+        raise UnreachableError("the connection was closed in this program: open a new one")
+
+
+def put(session: zenoh.Session, publisher: zenoh.Publisher, message: bytes) -> None:
+    """Publish a message. Raises UnreachableError if another thread closes the session meanwhile."""
+    try:
+        publisher.put(message)
+    except (zenoh.ZError, RuntimeError):
+        check_open(session)
+        raise
+
+
+def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
+    """By endpoint, why the system connects to none of them; empty where one accepts or hangs."""
+    failed: dict[str, OSError] = {}
+    for endpoint in endpoints:
+        if (address := tcp_address(endpoint)) is None:
+            return {}
+        try:
+            socket.create_connection(address, timeout=ATTEMPT_S).close()
+        except TimeoutError:
+            return {}
+        except OSError as error:
+            failed[endpoint] = error
+        else:
+            return {}
+    return failed
+
+
+def _unreached(failed: Mapping[str, OSError]) -> str:
+    """The failures in words that are no refusals; empty if all are refusals."""
+    return "; ".join(
+        f"{endpoint} cannot be reached: {in_words(error)}"
+        for endpoint, error in failed.items()
+        if not isinstance(error, ConnectionRefusedError)
+    )
+
+
+def tls_problem(endpoint: str, folder: str | Path | None) -> str:
+    """The reason why a TLS handshake with an endpoint fails, in words; empty if it succeeds or
+    fails for another cause. Zenoh itself gives no reason.
+
+    In TLS 1.3 the server reports after the handshake that it refuses the client's certificate. At
+    an endpoint of `tcp`, a handshake that succeeds is the problem.
+    """
+    if (address := tcp_address(endpoint)) is None:
+        return ""
+    tls, is_plain = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), not endpoint.startswith("tls/")
+    try:
+        if folder and not is_plain:
+            own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+            tls.load_verify_locations(authority)
+            tls.load_cert_chain(own, key)
+        else:
+            tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
+        with (
+            socket.create_connection(address, timeout=ATTEMPT_S) as plain,
+            tls.wrap_socket(plain, server_hostname=address[0]) as secured,
+        ):
+            if is_plain:
+                return f"{endpoint} accepts TLS only: tls/{endpoint.partition('/')[2]}, and a certificate, needed"
+            secured.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        words = SERVER_PROBLEMS.get(error.verify_code, f"is not from the authority in {folder}")
+        return f"the certificate of the daemon or router at {endpoint} {words}"
+    except ssl.SSLError as error:
+        if is_plain:
+            return ""
+        problem = CLIENT_PROBLEMS.get(str(error.reason).partition("ALERT_")[2], "")
+        if folder or not problem:
+            return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
+        return (
+            f"{endpoint} requires a certificate, and none was given: the folder of your role needed, in "
+            "$THIRDHAND_CERTIFICATE or in the file of client settings"
+        )
+    except OSError:
+        pass
+    return ""
+
+
+def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: bool | None = None) -> Attempted:
+    """The result of `attempt`, which is repeated while it raises UnreachableError.
+
+    The error is raised after `timeout_s` [s] with the same message; None: never. A CertificateError
+    is raised at once. One message on standard error reports the waiting unless `silent`, which by
+    default holds if there is a timeout.
+    """
+    begun_s, reported = time.monotonic(), ""
+    silent = timeout_s is not None if silent is None else silent
+    while True:
+        try:
+            return attempt()
+        except CertificateError:
+            raise
+        except UnreachableError as error:
+            if reported and str(error) != reported:
+                begun_s = time.monotonic()
+            reported = str(error)
+            waited_s = time.monotonic() - begun_s
+            if timeout_s is not None and waited_s >= timeout_s:
+                raise
+            if not silent and waited_s > ATTEMPT_S / 2:
+                until = "until Ctrl-C" if timeout_s is None else f"up to {timeout_s:g} s"
+                print(f"waiting, {until}: {error}", file=sys.stderr, flush=True)
+                silent = True
+            time.sleep(RETRY_S)
+
+
+def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
+    """A message with the reason why there is no session between these endpoints."""
+    if connect and "connect" in reason:
+        return _unreached(_failures(connect)) or (
+            f"nobody answers at {', '.join(connect)}: "
+            "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
+        )
+    found = re.search(r"\(os error (\d+)\)", reason)
+    words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
+    return f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
+
+
+def _zenoh_config(path: str | Path | None) -> zenoh.Config:
+    """The configuration in a Zenoh file, or Zenoh's defaults. Raises UnreachableError."""
+    if not path:
+        return zenoh.Config()
+    try:
+        file = Path(path).expanduser()
+        if content(file, LARGEST_CONFIGURATION).startswith(codecs.BOM_UTF8):
+            raise UnusableError("Zenoh reads no byte order mark: save it as UTF-8 without one")
+        return zenoh.Config.from_file(file)
+    except (OSError, RuntimeError, UnusableError, zenoh.ZError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise UnreachableError(f"cannot read the Zenoh configuration {path}: {reason}") from None
+
+
+def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
+    """The endpoints to connect to in a configuration, for every mode or for clients."""
+    found = json.loads(config.get_json("connect/endpoints"))
+    return tuple(found.get("client") or () if isinstance(found, dict) else found or ())
+
+
+def _tls(folder: str | Path | None) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS with the certificate in a folder; empty without a folder.
+
+    Raises UnreachableError for an incomplete folder.
+    """
+    if not folder:
+        return {}
+    try:
+        own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+    except RuntimeError:
+        raise UnreachableError(f"certificate {folder}: no user of this name has a folder here") from None
+    for path in (own, key, authority):
+        if not os.access(path, os.R_OK):
+            raise UnreachableError(f"cannot read {path}: {FOLDER_NEEDED}")
+    try:
+        tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        tls.load_verify_locations(authority)
+        tls.load_cert_chain(own, key, password="none")
+    except ssl.SSLError:
+        raise UnreachableError(
+            f"cannot use {own}, {key} and {authority}: certificates in PEM, and the key of the first without a "
+            "password, needed"
+        ) from None
+    settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
+    for side in ("listen", "connect"):
+        settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
+    settings |= {"verify_name_on_connect": True, "close_link_on_expiration": True}
+    return {"transport/link/tls": settings}  # replaces any other TLS settings
+
+
+def check_files(certificate: str | Path, zenoh_config: str | Path) -> None:
+    """Raise UnreachableError if `open_session` would refuse this folder or file; empty: none."""
+    _zenoh_config(zenoh_config)
+    _tls(certificate)
+
+
+def endpoints(session: zenoh.Session) -> tuple[str, ...]:
+    """The endpoints at which a session listens, with the ports that the system assigned."""
+    for reply in session.get(f"@/{session.zid()}/*", timeout=ENDPOINTS_TIMEOUT_S):
+        if reply.ok is not None:
+            return tuple(json.loads(reply.ok.payload.to_bytes())["locators"])
+    return ()

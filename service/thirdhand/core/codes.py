@@ -1,0 +1,116 @@
+"""Codes that the stages exchange."""
+
+from __future__ import annotations
+
+import enum
+
+from thirdhand.contract.records import Mode, Reason
+
+
+class Condition(enum.IntFlag):
+    """Conditions of hands, arm and task that hold at a tick."""
+
+    HANDS = 1  # both hands are seen
+    ARM_HEARD = 2  # the arm has reported its joints recently
+    ARM_STILL = 4  # the arm has reported the same posture for a while
+    CONTESTED = 8  # two sources report a hand or the arm
+    LEFT_UNSEEN = 16  # the left hand is out of sight for a moment; the right hand is seen
+    RIGHT_UNSEEN = 32  # the right hand is out of sight for a moment; the left hand is seen
+    ARM_INSIDE = 64  # a part of the arm is inside of a thing, or of another part
+    ONE_HAND = 128  # the leading hand is seen; the second hand was never seen, or has disappeared
+    STAGE_AMBIGUOUS = 256  # the stage of the task is not known
+    UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
+    CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
+    ARM_GUIDED = 2048  # the arm's driver reports that the arm is led by hand
+
+
+class Alternation(enum.IntEnum):
+    """Orders in which two sources may report one hand, over four samples. Bit i is the source of
+    sample i, counted from the newest.
+    """
+
+    SECOND_NEWEST = 0b0010  # the second-newest sample is of the other source
+    THIRD_NEWEST = 0b0100  # the third-newest sample is of the other source
+    INNER_PAIR = 0b0110  # two of the other source, between two of the first one
+    EVERY_OTHER = 0b0101  # the sources take turns
+
+
+class Start(enum.IntEnum):
+    """Posture at which the arm's motion starts."""
+
+    ASSUMED = 1  # the configured posture
+    MEASURED = 2  # the posture that the arm has just reported
+
+
+class ArmReady(enum.IntEnum):
+    """Readiness of the arm to follow."""
+
+    READY = 1  # the arm is within its limits, and inside of nothing
+    RETURNING = 2  # the arm moves back into its limits, or out of a thing
+
+
+class Stuck(enum.IntEnum):
+    """State of a tool that does not approach its target."""
+
+    NOTICED = 1  # the arm still follows
+    HELD = 2  # the arm holds, or moves along a way out
+
+
+class Held(enum.IntEnum):
+    """Knowledge of the hands at the begin of an operator's hold."""
+
+    HANDS_UNSEEN = 1  # a hand that the skill needs was not seen
+    HANDS_SEEN = 2
+
+
+class SetpointStep(enum.IntEnum):
+    """Limitation of a step of the setpoint."""
+
+    PLANNED = 1  # the tracker's jerk was reduced to keep a bound
+    STOPPED = 2  # the setpoint began its stop
+    BROKEN = 3  # a bound was broken; the setpoint did not move
+
+
+class SetpointBound(enum.IntEnum):
+    """Bound that a step of the setpoint has broken."""
+
+    NONE = 0
+    NOT_FINITE = 1
+    SPEED = 2
+    ACCELERATION = 3
+    JERK = 4
+    POSITION = 5
+
+
+class ClockTrust(enum.IntEnum):
+    """Trust in a tracker's clock."""
+
+    LEARNING = 0  # its first window is not over
+    DOUBTED = 1  # the minimum delays of the last two windows differ
+    TRUSTED = 2  # they agree
+
+
+# The same codes as plain integers: compiled functions need them, and in Python each access to a
+# member of an enumeration takes a microsecond.
+HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Condition.HANDS), int(Condition.ARM_HEARD), int(Condition.ARM_STILL)
+CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
+ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
+STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.STAGE_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
+CLUTCH_RELEASED, ARM_GUIDED = int(Condition.CLUTCH_RELEASED), int(Condition.ARM_GUIDED)
+SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
+ALTERNATIONS = tuple(int(order) for order in Alternation)
+STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
+READY, RETURNING = int(ArmReady.READY), int(ArmReady.RETURNING)
+HELD_UNSEEN, HELD_SEEN = int(Held.HANDS_UNSEEN), int(Held.HANDS_SEEN)
+NOTICED, HELD = int(Stuck.NOTICED), int(Stuck.HELD)
+PLANNED, STOPPED, BROKEN = int(SetpointStep.PLANNED), int(SetpointStep.STOPPED), int(SetpointStep.BROKEN)
+NO_BOUND, FINITE_BOUND = int(SetpointBound.NONE), int(SetpointBound.NOT_FINITE)
+SPEED_BOUND, ACCELERATION_BOUND = int(SetpointBound.SPEED), int(SetpointBound.ACCELERATION)
+JERK_BOUND, POSITION_BOUND = int(SetpointBound.JERK), int(SetpointBound.POSITION)
+LEARNING, DOUBTED, TRUSTED = int(ClockTrust.LEARNING), int(ClockTrust.DOUBTED), int(ClockTrust.TRUSTED)
+HOLD, FOLLOW, FAULT = int(Mode.HOLD), int(Mode.FOLLOW), int(Mode.FAULT)
+NONE, NO_HANDS, STALE_HAND = int(Reason.NONE), int(Reason.NO_HANDS), int(Reason.STALE_HAND)
+FAR, TWO_SOURCES = int(Reason.FAR_FROM_DEMONSTRATIONS), int(Reason.TWO_SOURCES)
+OPERATOR, NOT_READY, BLOCKED = int(Reason.OPERATOR), int(Reason.ARM_NOT_READY), int(Reason.BLOCKED)
+AMBIGUOUS, TOOL_SPEED, CLUTCH = int(Reason.AMBIGUOUS), int(Reason.TOOL_SPEED), int(Reason.CLUTCH)
+ARM_ERROR, ARM_SILENT, GUIDED = int(Reason.ARM_ERROR), int(Reason.ARM_SILENT), int(Reason.GUIDED)

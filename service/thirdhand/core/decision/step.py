@@ -1,0 +1,274 @@
+"""Compiled step of the decision: determine mode and reason from arm, hands and skill."""
+
+from __future__ import annotations
+
+import math
+
+from kmp.compiled import compiled
+from thirdhand.core.codes import (
+    AMBIGUOUS,
+    ARM_ERROR,
+    ARM_GUIDED,
+    ARM_HEARD,
+    ARM_INSIDE,
+    ARM_SILENT,
+    ARM_STILL,
+    BLOCKED,
+    CLUTCH,
+    CLUTCH_RELEASED,
+    CONTESTED,
+    FAR,
+    FAULT,
+    FOLLOW,
+    GUIDED,
+    HANDS_KNOWN,
+    HELD,
+    HELD_SEEN,
+    HELD_UNSEEN,
+    HOLD,
+    NO_HANDS,
+    NONE,
+    NOT_READY,
+    NOTICED,
+    ONE_HAND,
+    OPERATOR,
+    READY,
+    RETURNING,
+    STAGE_AMBIGUOUS,
+    STALE_HAND,
+    STARTS_ASSUMED,
+    STARTS_MEASURED,
+    TOOL_SPEED,
+    TWO_SOURCES,
+    UNSEEN,
+    UNSEEN_HAND_NEEDED,
+)
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.vectors import distance
+
+
+@compiled
+def step(
+    states: Records,
+    frames: Records,
+    heres: Records,
+    parameters: Records,
+    conditions: int,
+    gate_m: float,
+    threshold: float,
+) -> tuple[int, float, float]:
+    """Mode and reason of this tick, written to state and frame; compiled part of `Decision.step`.
+
+    A fault remains until a reset. Otherwise the arm may cause a fault (`_arm`), or a reason
+    (`_why_hold`, or BLOCKED: the tool is stuck, and the arm waits or moves along a way out, see
+    `_stuck`) causes a hold; without one, the arm follows.
+
+    Returns STARTS_ASSUMED or STARTS_MEASURED if the arm starts, else 0, and the result of
+    `measured_error`, or -1 twice if nothing was measured.
+    """
+    state, frame, starts, error, speed = states[0], frames[0], 0, -1.0, -1.0
+    if state.mode != FAULT:
+        starts, fault, error, speed = _arm(states, heres, parameters, conditions)
+        if fault != NONE:
+            state.mode, state.reason = FAULT, fault
+        else:
+            _note_hold(states, conditions)
+            reason = _why_hold(states, parameters, conditions, gate_m, threshold)
+            if reason == NONE:
+                state.stuck = _stuck(states, frames, heres, parameters)
+                reason = BLOCKED if state.stuck == HELD else NONE
+            state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+            if reason == NONE:
+                state.followed_tick = state.tick
+    frame.mode, frame.reason = state.mode, state.reason
+    return starts, error, speed
+
+
+@compiled
+def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: float, threshold: float) -> int:
+    """The first reason for a hold in this order, or NONE:
+
+    * TWO_SOURCES: a hand or the arm is contested.
+    * GUIDED: the arm is led by hand. This is an operator's hold, which lasts afterwards.
+    * NOT_READY: the arm is not ready. While the clutch is released, an arm that would move back by
+      itself holds for a later reason.
+    * OPERATOR: the operator holds it.
+    * CLUTCH: the clutch is released.
+    * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
+      been seen or is not seen now.
+    * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
+      follow yet.
+    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share
+      threshold, or a hand has jumped within the last jumpy_s.
+    * AMBIGUOUS: the stage of the task is not known.
+    """
+    state = states[0]
+    if conditions & CONTESTED:
+        return TWO_SOURCES
+    if conditions & ARM_GUIDED and not parameters[0].is_assumed:
+        return GUIDED
+    if state.arm_ready != READY and not (state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED):
+        return NOT_READY
+    if state.operator_hold:
+        return OPERATOR
+    if conditions & CLUTCH_RELEASED:
+        return CLUTCH
+    if math.isnan(gate_m):
+        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not conditions & ONE_HAND
+        return NO_HANDS if unseen else STALE_HAND
+    if conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
+        return STALE_HAND
+    if gate_m > threshold:
+        return FAR
+    if state.reason == FAR:
+        jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
+        is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
+        if is_jumpy or gate_m > parameters[0].end_share * threshold:
+            return FAR
+    return AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
+
+
+@compiled
+def _arm(states: Records, heres: Records, parameters: Records, conditions: int) -> tuple[int, int, float, float]:
+    """Update the state of the arm: it starts, is no longer ready, or causes a fault. Returns
+    STARTS_ASSUMED, STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or
+    -1 twice.
+
+    * An assumed arm starts at its configured posture and is ready.
+    * An arm that is led by hand is not ready. Its commanded joints come to rest. From then on they
+      are set to the measured ones in each tick.
+    * Any other arm starts at its measured posture, once this is constant and the commanded joints
+      are at rest. If it is outside its limits it is RETURNING, else READY. An arm inside of an
+      obstacle starts only after the operator's confirmation (`leaves`), and is RETURNING.
+    * A RETURNING arm becomes READY once it is within its limits, and either inside of no obstacle
+      or without motion for stuck_s.
+    * A silent arm is a fault (ARM_SILENT) if it follows or moves; at rest, it is no longer ready.
+    * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
+    * A tool faster than `fault_speed` for more than too_fast_s is a fault (TOOL_SPEED).
+    """
+    state, config, heard, inside = states[0], parameters[0], conditions & ARM_HEARD, conditions & ARM_INSIDE
+    if config.is_assumed:
+        starts = 0 if state.arm_ready else STARTS_ASSUMED
+        state.arm_ready = READY
+        return starts, NONE, -1.0, -1.0
+    moving = False
+    for joint in range(state.joints.shape[1]):
+        moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    if conditions & ARM_GUIDED:
+        state.operator_hold, state.arm_ready, state.leaves, state.guided_tick = 1, 0, 0, state.tick
+        state.stuck = state.way_count = 0
+        return 0 if moving else STARTS_MEASURED, NONE, -1.0, -1.0
+    if not state.arm_ready:
+        state.stuck = state.way_count = 0
+        if not conditions & ARM_STILL:
+            state.leaves = 0
+        # Commanded joints that move come to rest first; the reported posture must be constant.
+        if not conditions & ARM_STILL or moving or (inside and not state.leaves):
+            return 0, NONE, -1.0, -1.0
+        state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
+        state.slow_tick = state.stuck_tick = state.tick
+        return STARTS_MEASURED, NONE, -1.0, -1.0
+    if not heard:
+        if state.mode == FOLLOW or moving:
+            return 0, ARM_SILENT, -1.0, -1.0
+        state.arm_ready = 0
+        return 0, NONE, -1.0, -1.0
+    if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
+        if moving:
+            state.stuck_tick = state.tick
+        if not inside or (state.tick - state.stuck_tick) * config.period_s > config.stuck_s:
+            state.arm_ready, state.leaves = READY, 0
+    error, speed = measured_error(states, heres, parameters)
+    if error > config.max_error_rad:
+        return 0, ARM_ERROR, error, speed
+    if speed <= config.fault_speed:
+        state.slow_tick = state.tick
+    fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > config.too_fast_s else NONE
+    return 0, fault, error, speed
+
+
+@compiled
+def _note_hold(states: Records, conditions: int) -> None:
+    """Store hands and stage at the start of an operator's hold; its end clears them.
+
+    The stage is the most probable one, if its probability is above 1/2.
+    """
+    state = states[0]
+    if state.operator_hold and not state.held:
+        state.held = HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
+        state.held_tick, state.held_stage = state.tick, -1
+        for side in range(2):
+            for axis in range(3):
+                state.held_hands[side, axis] = state.hands[side, 0, axis]
+        for stage in range(len(state.stage_belief)):
+            if state.stage_belief[stage] > 0.5:
+                state.held_stage = stage
+    elif not state.operator_hold:
+        state.held = 0
+
+
+@compiled
+def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
+    """Progress of the tool toward its target: HELD while the arm waits or moves along a way out,
+    NOTICED when the tool has come no nearer for stuck_s, else 0.
+
+    With g = |target - tool| now and g_0 at `stuck_tick`, the tool makes progress if
+
+        g_0 - g > min(progress_share g_0, freed_share max_speed stuck_s)
+
+    and, once NOTICED, if g_0 - g > freed_share g_0. Then `stuck_tick`, g_0 and the target are set
+    to the present ones. This also happens if the arm does not follow, if g < stuck_gap_m, or if the
+    target has moved by more than stuck_gap_m. While the setpoint engages, engaging_speed takes the
+    place of max_speed.
+
+    HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
+    `way_timeout_s` has passed. If no way out was found, it lasts until the target has moved by
+    another_target_m.
+    """
+    state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
+    gap, moved = distance(frame.target, tool), distance(frame.target, state.stuck_target)
+    passed_s = (state.tick - state.stuck_tick) * config.period_s
+    if state.way_next < state.way_count and passed_s < config.way_timeout_s:
+        return HELD
+    if state.stuck == HELD and not state.way_count and moved < config.another_target_m:
+        return HELD
+    state.way_next = state.way_count = 0
+    if state.stuck == NOTICED:
+        least = config.freed_share * state.stuck_gap
+    else:
+        max_speed = config.engaging_speed if state.engaging else config.max_speed
+        least = min(config.progress_share * state.stuck_gap, config.freed_share * max_speed * config.stuck_s)
+    if state.mode != FOLLOW or gap < config.stuck_gap_m or state.stuck_gap - gap > least or moved > config.stuck_gap_m:
+        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
+        return 0
+    return NOTICED if passed_s >= config.stuck_s else 0
+
+
+@compiled
+def _is_outside(joints: Vector, parameters: Records) -> bool:
+    """True if a joint (J,) [rad] is outside its limits."""
+    outside = False
+    for j in range(len(joints)):
+        outside = outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
+    return outside
+
+
+@compiled
+def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
+    """Largest joint error [rad] and speed of the tool [m/s], as measured:
+
+        error = max_j |q_j - measured_j| / per_rad_j,   speed = |J_p measured_velocities|
+
+    q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
+    Jacobian there.
+    """
+    state, here = states[0], heres[0]
+    error = speed = 0.0
+    for joint in range(len(here.joints)):
+        error = max(error, abs(here.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
+    for axis in range(3):
+        along = 0.0
+        for joint in range(len(here.joints)):
+            along += here.tasks[axis, joint] * state.measured_velocities[joint]
+        speed += along * along
+    return error, math.sqrt(speed)

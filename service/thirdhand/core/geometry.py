@@ -1,0 +1,358 @@
+"""Quaternions x y z w, and distances of segments and boxes; arrays in and out, [m], frame base.
+
+Functions of two shapes write to `near` (9,): the nearest point of the first shape, the nearest
+point of the second, and the unit normal from the first to the second.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from kmp.elementary import atan2, sin_cos
+from thirdhand.core.frame import Records, Vector
+
+ROUND_TO = 1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
+_TINY = 1e-12  # a smaller sine is rounding
+
+
+def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
+    """Rotation matrix (3, 3) of a quaternion x y z w, which is normalised first."""
+    x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def angles(a: Vector, b: Vector) -> Vector:
+    """Angles (...) [rad] between quaternions (..., 4) of norm 1: 2 arccos |a · b|."""
+    return np.asarray(2.0 * np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0.0, 1.0)))
+
+
+def off_target(tool: Vector, target: Vector, *, direction: bool) -> Vector:
+    """Angles (...) [rad] between tools and their targets, quaternions (..., 4) of norm 1.
+
+    With `direction`, only the angle between their +z axes.
+    """
+    if not direction:
+        return angles(tool, target)
+    cosines = (_axes(tool) * _axes(target)).sum(axis=-1)
+    return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+
+def _axes(quaternions: Vector) -> Vector:
+    """Directions (..., 3) of +z after the rotation by quaternions (..., 4) of norm 1."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+@compiled
+def quaternion_of(matrix: Vector, out: Vector) -> None:
+    """Write into out (4,) the quaternion of a rotation matrix (3, 3), rounded.
+
+    The largest component is computed first (Shepperd 1978).
+    """
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    largest, most = 3, trace
+    for i in range(3):
+        if matrix[i, i] > most:
+            largest, most = i, matrix[i, i]
+    if largest == 3:
+        out[0], out[1] = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0]
+        out[2], out[3] = matrix[1, 0] - matrix[0, 1], 1.0 + trace
+    else:
+        i = largest
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = 1.0 - trace + 2.0 * matrix[i, i]
+        out[j], out[k] = matrix[j, i] + matrix[i, j], matrix[k, i] + matrix[i, k]
+        out[3] = matrix[k, j] - matrix[j, k]
+    normalise(out)
+
+
+@compiled
+def normalise(quaternion: Vector) -> None:
+    """Scale a quaternion (4,) to norm 1 with w >= 0, and round it, in place."""
+    length = 0.0
+    for i in range(4):
+        length += quaternion[i] * quaternion[i]
+    length = math.copysign(math.sqrt(length), quaternion[3])
+    for i in range(4):
+        quaternion[i] = np.rint(quaternion[i] / length * ROUND_TO) / ROUND_TO
+
+
+@compiled
+def axis_of(quaternion: Vector, out: Vector) -> None:
+    """Write into out (3,) the direction of +z after the rotation by a quaternion (4,).
+
+    The result is 0 if the quaternion is 0 or not finite.
+    """
+    largest = max(abs(quaternion[0]), abs(quaternion[1]), abs(quaternion[2]), abs(quaternion[3]))
+    out[:] = 0.0
+    if not 0.0 < largest < math.inf:
+        return
+    x, y, z, w = quaternion[0] / largest, quaternion[1] / largest, quaternion[2] / largest, quaternion[3] / largest
+    square = x * x + y * y + z * z + w * w
+    out[0], out[1] = 2.0 * (x * z + y * w) / square, 2.0 * (y * z - x * w) / square
+    out[2] = 1.0 - 2.0 * (x * x + y * y) / square
+
+
+@compiled
+def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
+    """Write into out (3,) [rad] the shortest rotation from a direction (3,) to a quaternion's +z.
+
+    The direction has norm 1. The result is a rotation vector; it is 0 if one of the two has no
+    length, or if they are opposite, where no direction is shorter.
+    """
+    end = np.empty(3)
+    axis_of(quaternion, end)
+    x = start[1] * end[2] - start[2] * end[1]
+    y = start[2] * end[0] - start[0] * end[2]
+    z = start[0] * end[1] - start[1] * end[0]
+    sine = math.sqrt(x * x + y * y + z * z)
+    out[:] = 0.0
+    if sine > 1e-9:
+        size = atan2(sine, start[0] * end[0] + start[1] * end[1] + start[2] * end[2]) / sine
+        out[0], out[1], out[2] = size * x, size * y, size * z
+
+
+@compiled
+def turn_between(start: Vector, end: Vector, out: Vector) -> None:
+    """Write into out (3,) [rad] the shortest rotation vector between two quaternions (4,).
+
+    The result is 0 if one of them is 0.
+    """
+    ax, ay, az, aw = start[0], start[1], start[2], start[3]
+    bx, by, bz, bw = end[0], end[1], end[2], end[3]
+    x = bw * -ax + aw * bx - (by * az - bz * ay)
+    y = bw * -ay + aw * by - (bz * ax - bx * az)
+    z = bw * -az + aw * bz - (bx * ay - by * ax)
+    w = bw * aw + bx * ax + by * ay + bz * az
+    sine = math.sqrt(x * x + y * y + z * z)
+    size = 2.0 * atan2(sine, abs(w)) / max(sine, _TINY)
+    if w < 0.0:
+        size = -size
+    out[0], out[1], out[2] = size * x, size * y, size * z
+
+
+@compiled
+def turn_on(quaternion: Vector, turn: Vector) -> None:
+    """Rotate a quaternion (4,) by a rotation vector (3,) [rad] of the base frame, in place."""
+    angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    sine, cosine = sin_cos(0.5 * angle)
+    size = 0.5 if angle < 1e-6 else sine / angle
+    ax, ay, az, aw = size * turn[0], size * turn[1], size * turn[2], cosine
+    bx, by, bz, bw = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    quaternion[0] = aw * bx + bw * ax + ay * bz - az * by
+    quaternion[1] = aw * by + bw * ay + az * bx - ax * bz
+    quaternion[2] = aw * bz + bw * az + ax * by - ay * bx
+    quaternion[3] = aw * bw - ax * bx - ay * by - az * bz
+    normalise(quaternion)
+
+
+LEAST = 1e-9  # [m] segments at a smaller distance intersect; [m²] a segment of smaller squared length is a point
+HALVINGS = 40  # bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
+CAPSULE = np.dtype(
+    [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]
+)
+
+
+@compiled
+def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
+    """Write into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m].
+
+    The capsules are ordered by link.
+    """
+    turn, at = np.eye(3), np.zeros(3)
+    own, moved, there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    capsule, count = 0, len(capsules)
+    for link in range(len(q) + 1):
+        if link > 0:
+            frame = frames[link - 1]
+            for i in range(3):
+                there[i] = at[i]
+                for k in range(3):
+                    there[i] += turn[i, k] * frame[k, 3]
+            slides = axes[link - 1, 3] != 0.0
+            _about(axes[link - 1], 0.0 if slides else q[link - 1], own)
+            for i in range(3):
+                for j in range(3):
+                    moved[i, j] = 0.0
+                    for k in range(3):
+                        moved[i, j] += turn[i, k] * frame[k, j]
+            if slides:
+                for i in range(3):
+                    for k in range(3):
+                        there[i] += moved[i, k] * axes[link - 1, k] * q[link - 1]
+            for i in range(3):
+                at[i] = there[i]
+                for j in range(3):
+                    turn[i, j] = 0.0
+                    for k in range(3):
+                        turn[i, j] += moved[i, k] * own[k, j]
+        while capsule < count and capsules[capsule].link == link:
+            for end in range(2):
+                for i in range(3):
+                    out[capsule, end, i] = at[i]
+                    for k in range(3):
+                        out[capsule, end, i] += turn[i, k] * capsules[capsule].ends[end, k]
+            capsule += 1
+
+
+@compiled
+def _about(axis: Vector, angle: float, out: Vector) -> None:
+    """Write into out (3, 3) the rotation about a unit axis by an angle [rad]."""
+    x, y, z = axis[0], axis[1], axis[2]
+    s, c = sin_cos(angle)
+    v = 1.0 - c
+    out[0, 0], out[0, 1], out[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
+    out[1, 0], out[1, 1], out[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x
+    out[2, 0], out[2, 1], out[2, 2] = v * x * z - s * y, v * y * z + s * x, c + v * z * z
+
+
+@compiled
+def _unit(share: float) -> float:
+    """Limit a share to 0 ... 1."""
+    return min(max(share, 0.0), 1.0)
+
+
+@compiled
+def between_segments(one: Vector, other: Vector, near: Vector) -> float:
+    """Distance [m] between two segments (2, 3), and their nearest points and normal.
+
+    After Ericson, Real-Time Collision Detection, 5.1.9. If the segments intersect, the normal
+    points from the middle of the first to the middle of the second; downward if these coincide.
+    """
+    a = b = c = d = e = 0.0
+    for i in range(3):
+        u, v, w = one[1, i] - one[0, i], other[1, i] - other[0, i], one[0, i] - other[0, i]
+        a += u * u
+        b += u * v
+        c += u * w
+        d += v * v
+        e += v * w
+    if a <= LEAST and d <= LEAST:
+        s = t = 0.0
+    elif a <= LEAST:
+        s, t = 0.0, _unit(e / d)
+    elif d <= LEAST:
+        s, t = _unit(-c / a), 0.0
+    else:
+        slant = a * d - b * b
+        s = _unit((b * e - c * d) / slant) if slant > 1e-9 * a * d else 0.0
+        t = (b * s + e) / d
+        if t < 0.0:
+            s, t = _unit(-c / a), 0.0
+        elif t > 1.0:
+            s, t = _unit((b - c) / a), 1.0
+    square = 0.0
+    for i in range(3):
+        near[i] = one[0, i] + s * (one[1, i] - one[0, i])
+        near[3 + i] = other[0, i] + t * (other[1, i] - other[0, i])
+        near[6 + i] = near[3 + i] - near[i]
+        square += near[6 + i] * near[6 + i]
+    distance = math.sqrt(square)
+    if distance > LEAST:
+        for i in range(3):
+            near[6 + i] /= distance
+        return distance
+    square = 0.0
+    for i in range(3):
+        near[6 + i] = other[0, i] + other[1, i] - one[0, i] - one[1, i]
+        square += near[6 + i] * near[6 + i]
+    length = math.sqrt(square)
+    for i in range(3):
+        near[6 + i] = near[6 + i] / length if length > LEAST else (-1.0 if i == 2 else 0.0)
+    return distance
+
+
+@compiled
+def carry_back(near: Vector, then: Vector, now: Vector) -> None:
+    """Move the first point of `near` from the segment `then` (2, 3) to the same share of `now`."""
+    long = whole = 0.0
+    for i in range(3):
+        way = then[1, i] - then[0, i]
+        long += way * (near[i] - then[0, i])
+        whole += way * way
+    share = long / whole if whole > 0.0 else 0.0
+    for i in range(3):
+        near[i] = now[0, i] + share * (now[1, i] - now[0, i])
+
+
+@compiled
+def nearest_to_box(segment: Vector, box: Vector) -> float:
+    """Share, 0 to 1, of a segment (2, 3) at its point nearest to a box (2, 3).
+
+    The box is given by its lower and upper corner. The slope of the squared distance grows along
+    the segment; bisection finds its root.
+    """
+    if _slope(segment, box, 0.0) >= 0.0:
+        return 0.0
+    if _slope(segment, box, 1.0) <= 0.0:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if _slope(segment, box, middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    return 0.5 * (low + high)
+
+
+@compiled
+def _slope(segment: Vector, box: Vector, share: float) -> float:
+    """Half the slope of the squared distance from a box, at the point p at a share of a segment.
+
+    (p - nearest point of the box) · (end - start)
+    """
+    total = 0.0
+    for i in range(3):
+        way = segment[1, i] - segment[0, i]
+        at = segment[0, i] + share * way
+        total += (at - min(max(at, box[0, i]), box[1, i])) * way
+    return total
+
+
+@compiled
+def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
+    """Signed distance [m] of the point at a share of a segment (2, 3) from a box (2, 3).
+
+    Inside of the box it is negative, minus the distance to the nearest face, and the normal points
+    from that face inward.
+    """
+    square, least, face, side = 0.0, math.inf, 2, -1.0
+    for i in range(3):
+        at = segment[0, i] + share * (segment[1, i] - segment[0, i])
+        near[i] = at
+        near[3 + i] = min(max(at, box[0, i]), box[1, i])
+        near[6 + i] = near[3 + i] - at
+        square += near[6 + i] * near[6 + i]
+        if at - box[0, i] < least:
+            least, face, side = at - box[0, i], i, 1.0
+        if box[1, i] - at < least:
+            least, face, side = box[1, i] - at, i, -1.0
+    distance = math.sqrt(square)
+    if distance > LEAST:
+        for i in range(3):
+            near[6 + i] /= distance
+        return distance
+    for i in range(3):
+        near[6 + i] = side if i == face else 0.0
+    return -least
+
+
+@compiled
+def round_to(values: Vector, parts: float) -> None:
+    """Round values (3, 3) to `parts` parts of a unit, in place.
+
+    Results that follow are then equal on machines that differ in the last bits.
+    """
+    for i in range(3):
+        for j in range(3):
+            values[i, j] = np.rint(values[i, j] * parts) / parts

@@ -1,0 +1,59 @@
+"""Plausibility of the arm's joint samples: within the joints' range, near the newest sample, and
+near the posture of an arm at rest.
+
+Tolerances are in rad. For a prismatic joint they are multiplied by `per_rad` [m/rad].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.settings.config import JointSettings, Settings
+
+TURN = 2.0 * math.pi
+
+
+def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
+    """Joint positions (..., J) [rad], those of continuous joints shifted by whole turns to be the
+    nearest to the positions `near` (..., J).
+    """
+    is_continuous = np.array(joints.every_kind) == "continuous"
+    return position + np.where(is_continuous, TURN * np.rint((near - position) / TURN), 0.0)
+
+
+def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
+    """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
+    return settings.ticks_in(tuning.intake.max_late_s)
+
+
+@compiled
+def compared(states: Records, parameters: Records, position: Vector, velocity: Vector) -> tuple[bool, float, float]:
+    """Check of joint positions and velocities (J,) [rad, rad/s] against plausible ranges and known
+    ones.
+
+    Returns: true if every joint is within `plausible_joints` and not faster than max_joint_radps;
+    the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
+    Differences are divided by `per_rad`.
+    """
+    state, config, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
+    for i in range(len(position)):
+        near = near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
+        near = near and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        off = max(off, abs(position[i] - state.measured[i]) / config.per_rad[i])
+        moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
+    return near, off, moved
+
+
+@compiled
+def unwrap(states: Records, parameters: Records, position: Vector) -> None:
+    """Shift continuous joints (J,) [rad] by whole turns to be nearest to the newest sample, in
+    place. A driver that wraps at ±π and one that counts turns then give the same positions.
+    """
+    for i in range(len(position)):
+        if parameters[0].is_continuous[i] and math.isfinite(position[i]):
+            position[i] += TURN * np.rint((states[0].measured[i] - position[i]) / TURN)

@@ -1,0 +1,228 @@
+"""Late and overtaken samples of a hand: the tick in which each was made, and their filtering at
+that tick.
+
+A tracker's clock is that of another machine, so its stamps only show how much longer the delay of
+one sample is than that of another. Samples with the minimum delay of the last one to two seconds
+are taken to be made when they arrive; a sample with a longer delay was made earlier by the
+difference. A tracker's clock is trusted while the minimum delays of consecutive seconds agree.
+While it is not trusted, samples are taken to be made when they arrive. Samples that overtook each
+other are always put in the order of their stamps.
+
+The newest KEPT samples of each hand are retained in rings, each with the state of the filter after
+it. `order` counts them backward from the newest, which is 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kmp.compiled import compiled
+from thirdhand.core.codes import TRUSTED
+from thirdhand.core.frame import Record, Records, Vector
+from thirdhand.core.intake import KEPT, SETTLED_SAMPLES
+from thirdhand.core.intake.hand_estimator import (
+    advance_hand,
+    filter_in,
+    look_ahead,
+    order_of,
+    seconds_after,
+    settle,
+    slot,
+)
+from thirdhand.core.intake.motion_model import CHANGE
+from thirdhand.core.numerics import TICK_ROUNDING
+from thirdhand.core.vectors import squared_distance
+
+
+@compiled
+def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, period_s: float) -> int:
+    """Tick in which a sample of this `order` was made, between the ticks of its neighbours by
+    stamp.
+
+    It is the current tick minus `late`. For a sample that was overtaken (`order` > 0) by a clock
+    that is not trusted, it is the newest sample's tick minus the difference of the stamps.
+    """
+    state = states[0]
+    tick = state.tick - late
+    if order > 0:
+        behind = slot(states, side, order - 1)
+        if state.clock[side] != TRUSTED:
+            passed_s = seconds_after(state.kept_stamps_ns[side, slot(states, side, 0)], stamp_ns)
+            tick = state.kept_ticks[side, slot(states, side, 0)] - int(passed_s / period_s + TICK_ROUNDING)
+        tick = min(tick, state.kept_ticks[side, behind])
+    if order < state.kept[side]:
+        tick = max(tick, state.kept_ticks[side, slot(states, side, order)])
+    return int(tick)
+
+
+@compiled
+def expected(states: Records, models: Records, side: int, order: int, tick: int, out: Vector) -> None:
+    """Predicted position of a hand at a tick, p = Σ_j μ_j F_j[0, :3] m_j, written to `out` (3,)
+    [m].
+
+    μ_j, m_j are probability and mean of mode j after retained sample number `order`, F_j is the
+    transition since then. For a sample older than all retained ones, p is the oldest one's
+    position.
+    """
+    state = states[0]
+    if order == 0 and tick == state.tick:
+        out[:] = state.hands[side, 0]
+    elif order == state.kept[side]:
+        out[:] = state.kept_positions[side, slot(states, side, order - 1)]
+    else:
+        at = slot(states, side, order)
+        means, modes = state.kept_means[side, at], state.kept_probabilities[side, at]
+        over = models[min(tick - state.kept_ticks[side, at], len(models) - 1)].transition
+        for axis in range(3):
+            total = 0.0
+            for mode in range(len(modes)):
+                for row in range(3):
+                    total += modes[mode] * over[mode, 0, row] * means[mode, row, axis]
+            out[axis] = total
+
+
+@compiled
+def _fits(
+    states: Records, parameters: Records, models: Records, side: int, order: int, tick: int, position: Vector
+) -> bool:
+    """True if a sample x (3,) [m] made at a tick fits a hand's filter as it was after the retained
+    sample of this `order`:
+
+        |x - p|² < outlier_variances (P + r)
+
+    p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
+    """
+    state, at, there, variance = states[0], slot(states, side, order), np.empty(3), 0.0
+    before = state.kept_covariances[side, at, CHANGE]
+    over = models[min(tick - state.kept_ticks[side, at], len(models) - 1)]
+    expected(states, models, side, order, tick, there)
+    for row in range(3):
+        for column in range(3):
+            variance += over.transition[CHANGE, 0, row] * before[row, column] * over.transition[CHANGE, 0, column]
+    variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, at, 0]
+    return bool(squared_distance(position, there) < parameters[0].outlier_variances * variance)
+
+
+@compiled
+def wrong_samples(states: Records, parameters: Records, models: Records, side: int, tick: int, position: Vector) -> int:
+    """Number of the newest retained samples that a sample (3,) [m], which jumped and was made at
+    `tick`, shows to be wrong; 0 if none are.
+
+    It is the least number n, at most SETTLED_SAMPLES, for which the filter as it was before these n
+    samples fits the new sample, and none of the n. Samples since a confirmed jump are not wrong.
+    """
+    state = states[0]
+    for order in range(1, min(SETTLED_SAMPLES + 1, state.kept[side])):
+        newest = slot(states, side, order - 1)
+        if state.kept_restarts[side, newest] > 0:
+            return 0
+        wrong = _fits(states, parameters, models, side, order, tick, position)
+        for newer in range(order):
+            at = slot(states, side, newer)
+            made, sample = state.kept_ticks[side, at], state.kept_positions[side, at]
+            wrong = wrong and not _fits(states, parameters, models, side, order, made, sample)
+        if wrong:
+            return order
+    return 0
+
+
+@compiled
+def drop(states: Records, side: int, count: int) -> None:
+    """Drop the newest retained samples of a hand; `take_late` then restores the filter as it was
+    before them. They remain among the `past_samples`, as evidence of a second source, but no noise
+    variance is computed from them.
+    """
+    state = states[0]
+    state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
+    at = slot(states, side, 0)
+    state.kept_past[side, at], state.kept_noise[side, at, 2] = state.past_samples[side], 0.0
+
+
+@compiled
+def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, position: Vector, restarts: bool) -> None:
+    """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
+    filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
+    them again.
+    """
+    state = states[0]
+    state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
+    state.kept[side] = min(state.kept[side] + 1, KEPT)
+    for newer in range(order):
+        to, of = slot(states, side, newer), slot(states, side, newer + 1)
+        state.kept_stamps_ns[side, to] = state.kept_stamps_ns[side, of]
+        state.kept_ticks[side, to] = state.kept_ticks[side, of]
+        state.kept_late[side, to] = state.kept_late[side, of]
+        state.kept_restarts[side, to] = state.kept_restarts[side, of]
+        state.kept_positions[side, to] = state.kept_positions[side, of]
+    at = slot(states, side, order)
+    state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, tick
+    state.kept_late[side, at], state.kept_restarts[side, at] = state.tick - tick, restarts
+    state.kept_positions[side, at] = position
+
+
+@compiled
+def take_late(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    stamp_ns: int,
+    tick: int,
+    position: Vector,
+    restarts: bool,
+) -> None:
+    """Filter a sample (3,) [m] of one hand at the tick in which it was made.
+
+    The filter is restored to its state after the next older sample. The new sample and all newer
+    ones are then filtered in the order of their stamps, and the filter is advanced to the current
+    tick. If the sample `restarts` the filter (a confirmed jump), it starts from this sample alone.
+    """
+    state, config = states[0], parameters[0]
+    order, kept = order_of(states, side, stamp_ns), state.kept[side]
+    if kept > 0:
+        _recall(states, side, slot(states, side, min(order, kept - 1)))
+    first = order == kept
+    insert(states, side, order, stamp_ns, tick, position, restarts)
+    for newer in range(order, -1, -1):
+        at = slot(states, side, newer)
+        first = first and newer == order
+        ticks = 0 if first else state.kept_ticks[side, at] - state.kept_ticks[side, slot(states, side, newer + 1)]
+        anew = first or state.kept_restarts[side, at] > 0
+        if not anew:
+            _advance_by(states, models, side, ticks)
+        filter_in(states, parameters, side, at, config.tracker_memory_s if first else ticks * config.period_s, anew)
+    ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
+    _advance_by(states, models, side, ticks)
+    settle(states, parameters, models, side)
+    look_ahead(states, models, side)
+
+
+@compiled
+def _advance_by(states: Records, models: Records, side: int, ticks: int) -> None:
+    """Advance all modes of one hand by some ticks; 0 ticks change nothing."""
+    if ticks > 0:
+        at = min(ticks, len(models) - 1)
+        advance_hand(states, side, models[at : at + 1])
+
+
+@compiled
+def _recall(states: Records, side: int, at: int) -> None:
+    """Restore one hand's filter to the state stored at ring index `at`."""
+    state, noise = states[0], states[0].kept_noise[side, at]
+    state.mode_means[side] = state.kept_means[side, at]
+    state.mode_covariances[side] = state.kept_covariances[side, at]
+    state.mode_probabilities[side] = state.kept_probabilities[side, at]
+    state.past_samples[side] = state.kept_past[side, at]
+    state.noise_variance[side], state.noise_samples[side] = noise[0], int(noise[1])
+    state.even_samples[side], state.sample_interval_s[side] = int(noise[2]), noise[3]
+
+
+def lateness_ms(state: Record, side: int, period_s: float) -> tuple[float, float] | None:
+    """Delay of a hand's retained samples above the minimum delay, mean and 95th percentile [ms];
+    None while the tracker's clock is not trusted.
+    """
+    if state["clock"][side] != TRUSTED or not state["kept"][side]:
+        return None
+    newest = (int(state["kept_newest"][side]) - np.arange(int(state["kept"][side]))) % KEPT
+    late_ms = 1e3 * period_s * state["kept_late"][side][newest]
+    return float(np.mean(late_ms)), float(np.percentile(late_ms, 95))

@@ -1,0 +1,348 @@
+"""Interacting-multiple-model filter of one hand (Blom and Bar-Shalom, IEEE TAC 33(8), 1988).
+
+A hand rests, reaches, or changes its motion. Each mode is a Kalman filter with the linear system of
+`motion_model`: position p, velocity v, acceleration a, tremor y and its velocity w. A sample
+measures p + y; tremor is seen by the tracker but is no part of the hand's motion.
+
+Modes are mixed at the time of a sample, after the prediction. Three rules are added to the
+published filter:
+
+* The mode CHANGE has no tremor (σ = 0) until one is evident (`tremor`), because the beginning of a
+  change would otherwise be explained as tremor. An evident tremor is the same in all modes.
+* A resting hand is slow and its tremor is bounded (`_beyond_rest`). No mode explains the fastest
+  motions; without the bound, the mode that allows the largest change between two samples wins.
+* A hand enters REST only when it is slow (`_switched`), conditioned on being slow
+  (`_come_to_rest`). On leaving REST, its tremor becomes motion (`_leave_rest`).
+
+Arrays of one hand: `means` (MODES, STATES, 3) hold (p, v, a, y, w) of each mode, by axis [m, m/s,
+m/s², m, m/s]; `covariances` (MODES, STATES, STATES) are shared by the three axes; `modes` (MODES,)
+are the probabilities of the modes. All functions change them in place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kmp.compiled import compiled
+from kmp.elementary import exp, log
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.intake import MODES, STATES
+from thirdhand.core.intake.motion_model import (
+    CHANGE,
+    REACH,
+    REST,
+    STEADY,
+)
+from thirdhand.core.vectors import square
+
+
+@compiled
+def start(
+    parameters: Records,
+    means: Vector,
+    covariances: Vector,
+    modes: Vector,
+    noise: float,
+    position: Vector,
+    tremor: Vector,
+) -> None:
+    """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
+
+        mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
+
+    with σ_v = start_speed_std_mps, and the rate ω and the mode's σ² of the `tremor` (1 + MODES,).
+    The variance of the acceleration is the stationary one of the mode CHANGE. The probabilities are
+    mode_prior.
+    """
+    config = parameters[0]
+    of_acceleration = config.mode_intensities_m2ps5[CHANGE] / (2.0 * config.mode_acceleration_reversions_per_s[CHANGE])
+    means[:] = 0.0
+    covariances[:] = 0.0
+    for mode in range(MODES):
+        for axis in range(3):
+            means[mode, 0, axis] = position[axis]
+        covariances[mode, 0, 0] = noise
+        covariances[mode, 1, 1] = config.start_speed_std_mps**2
+        covariances[mode, 2, 2] = of_acceleration
+        _tremble(means[mode], covariances[mode], tremor, mode)
+        modes[mode] = config.mode_prior[mode]
+
+
+@compiled
+def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremor: Vector) -> None:
+    """Prediction of all modes over an interval. `overs` (1,) is a record of `motion_model.model`,
+    `rate` the index of the tremor's rate, and `tremor` (1 + MODES,) has its variance in each mode.
+
+    With an evident tremor, REACH has the motion STEADY: otherwise the steady innovation of a hand
+    whose velocity does not revert would count as a change, and a change follows the tremor.
+    """
+    for mode in range(MODES):
+        motion = STEADY if mode == REACH and tremor[1 + CHANGE] > 0.0 else mode
+        move_on(means[mode], covariances[mode], overs, motion, rate, tremor[1 + mode])
+
+
+@compiled
+def move_on(mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float) -> None:
+    """Prediction of one filter: m = F m, P = F P Fᵀ + Q, in place.
+
+    F and Q (STATES, STATES) have a motion block (3, 3), number `motion` of `motion_model.model`,
+    and a tremor block (2, 2), that of the `rate`. That of Q is multiplied by the variance `tremor`
+    [m²].
+    """
+    moved, product, over = np.empty((STATES, 3)), np.empty((STATES, STATES)), np.empty((STATES, 3))
+    moves, trembles = overs[0].transition[motion], overs[0].tremor[rate]
+    driving, trembling = overs[0].noise[motion], overs[0].tremor_noise[rate]
+    for row in range(STATES):
+        for k in range(3 if row < 3 else 2):
+            over[row, k] = moves[row, k] if row < 3 else trembles[row - 3, k]
+    for row in range(STATES):
+        first, count = (0, 3) if row < 3 else (3, 2)  # F is block-diagonal: motion and tremor
+        for column in range(STATES):
+            p = 0.0
+            for k in range(count):
+                p += over[row, k] * covariance[first + k, column]
+            product[row, column] = p
+        for axis in range(3):
+            m = 0.0
+            for k in range(count):
+                m += over[row, k] * mean[first + k, axis]
+            moved[row, axis] = m
+    mean[:] = moved
+    for row in range(STATES):
+        for column in range(row, STATES):
+            p = 0.0
+            if column < 3:
+                p = driving[row, column]
+            elif row >= 3:
+                p = tremor * trembling[row - 3, column - 3]
+            first, count = (0, 3) if column < 3 else (3, 2)
+            for k in range(count):
+                p += product[row, first + k] * over[column, k]
+            covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def measure(mean: Vector, p: Vector, noise: float, position: Vector) -> tuple[float, float]:
+    """Update of one filter, in place, by a sample z (3,) [m] of noise variance r [m²], with H = [1,
+    0, 0, 1, 0]:
+
+        S = H P Hᵀ + r,   K = P Hᵀ / S,   m = m + K (z - H m),   P = P - K S Kᵀ
+
+    Returns S and |z - H m|² / S before the update.
+    """
+    seen, error = np.empty(STATES), 0.0
+    for row in range(STATES):
+        seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
+    variance = seen[0] + seen[3] + noise
+    for axis in range(3):
+        innovation = position[axis] - mean[0, axis] - mean[3, axis]
+        error += innovation * innovation
+        for row in range(STATES):
+            mean[row, axis] += seen[row] / variance * innovation
+    for row in range(STATES):
+        for column in range(row, STATES):
+            p[row, column] -= seen[row] * seen[column] / variance
+            p[column, row] = p[row, column]
+    return variance, error / variance
+
+
+@compiled
+def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> None:
+    """Reset the tremor of one mode to its stationary distribution: mean 0, variances σ² of y and (ω
+    σ)² of w, uncorrelated with the motion.
+    """
+    mean[3:] = 0.0
+    covariance[3:, :] = 0.0
+    covariance[:, 3:] = 0.0
+    covariance[3, 3], covariance[4, 4] = tremor[1 + mode], tremor[1 + mode] * tremor[0] ** 2
+
+
+@compiled
+def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None:
+    """Condition a moving mode on being slow: a Kalman update by v = 0 with standard deviation
+    rest_speed_std_mps, then by a = 0 with as many m/s²: a resting hand changes its drift by as much
+    in a second.
+    """
+    spread = parameters[0].rest_speed_std_mps
+    for known in range(1, 3):
+        row_of = covariance[known].copy()
+        variance = row_of[known] + spread * spread
+        for axis in range(3):
+            off = mean[known, axis]
+            for row in range(STATES):
+                mean[row, axis] -= row_of[row] / variance * off
+        for row in range(STATES):
+            for column in range(STATES):
+                covariance[row, column] -= row_of[row] * row_of[column] / variance
+
+
+@compiled
+def _leave_rest(mean: Vector, covariance: Vector) -> None:
+    """Turn the tremor of the mode REST into motion: p = p + y and v = v + w, in mean and
+    covariance. The samples showed both, so the filter restarts from the unsmoothed state.
+    """
+    for row in range(2):
+        for axis in range(3):
+            mean[row, axis] += mean[row + 3, axis]
+        for column in range(STATES):
+            covariance[row, column] += covariance[row + 3, column]
+    for column in range(2):
+        for row in range(3):
+            covariance[row, column] += covariance[row, column + 3]
+
+
+@compiled
+def bounded(parameters: Records, innovation: float) -> float:
+    """Squared, normalised innovation x on three axes, at most so large that exp(-½ x) =
+    least_mode_probability³, a factor for each axis: a less probable sample does not distinguish
+    modes.
+    """
+    most: float = 6.0 * parameters[0].outlier_variances
+    return min(innovation, most)
+
+
+@compiled
+def _switched(
+    parameters: Records, means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector
+) -> None:
+    """Joint probabilities s (MODES, MODES), written to `shares`, of mode i before an interval Δ and
+    mode j after it:
+
+        s_ij = μ_i ((1 - exp(-λ_i Δ)) ρ_j + δ_ij exp(-λ_i Δ))
+
+    μ are the probabilities `modes`, λ is mode_switch_rates_per_s, ρ is mode_prior. The transition
+    from a moving mode i to REST is weighted by how slow that mode is; s_ii keeps the rest:
+
+        slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + rest_speed_std_mps²)))
+    """
+    config = parameters[0]
+    for i in range(MODES):
+        stay = exp(-config.mode_switch_rates_per_s[i] * interval_s)
+        for j in range(MODES):
+            shares[i, j] = modes[i] * ((1.0 - stay) * config.mode_prior[j] + (stay if i == j else 0.0))
+        if i != REST:
+            speed = square(means[i, 1])
+            variance = covariances[i, 1, 1] + config.rest_speed_std_mps * config.rest_speed_std_mps
+            slow = exp(-0.5 * bounded(parameters, speed / variance))
+            shares[i, i] += (1.0 - slow) * shares[i, REST]
+            shares[i, REST] *= slow
+
+
+@compiled
+def _mix(
+    parameters: Records, means: Vector, covariances: Vector, shares: Vector, expected: Vector, tremor: Vector
+) -> None:
+    """Mixed initial condition of each mode j from the `shares` s (MODES, MODES) of `_switched`, in
+    place; the predicted probabilities c (MODES,) are written to `expected`.
+
+        c_j = Σ_i s_ij,   m_j = Σ_i s_ij m_ij / c_j
+        P_j = Σ_i s_ij (P_ij + Σ_axes (m_ij - m_j)(m_ij - m_j)ᵀ / 3) / c_j
+
+    m_ij and P_ij are those of mode i; for i ≠ j, after `_come_to_rest` (j = REST). Without an
+    evident tremor (σ = 0 in CHANGE), also after `_leave_rest` (i = REST), and with the tremor of
+    mode j reset. Of each P_j, only the upper triangle is computed.
+    """
+    of_means, of_covariances = np.empty((MODES, MODES, STATES, 3)), np.empty((MODES, MODES, STATES, STATES))
+    is_evident = tremor[1 + CHANGE] > 0.0
+    for j in range(MODES):
+        for i in range(MODES):
+            of_means[j, i], of_covariances[j, i] = means[i], covariances[i]
+            if i != j and j == REST:
+                _come_to_rest(parameters, of_means[j, i], of_covariances[j, i])
+            if i != j and not is_evident:
+                if i == REST:
+                    _leave_rest(of_means[j, i], of_covariances[j, i])
+                _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
+    for j in range(MODES):
+        expected[j], mixed, spread = 0.0, means[j], covariances[j]
+        for i in range(MODES):
+            expected[j] += shares[i, j]
+        mixed[:], spread[:] = 0.0, 0.0
+        for i in range(MODES):
+            share = shares[i, j] / expected[j]
+            for a in range(STATES):
+                for b in range(3):
+                    mixed[a, b] += share * of_means[j, i, a, b]
+        for i in range(MODES):
+            share, mean = shares[i, j] / expected[j], of_means[j, i]
+            for a in range(STATES):
+                for b in range(a, STATES):
+                    between = 0.0
+                    for k in range(3):
+                        between += (mean[a, k] - mixed[a, k]) * (mean[b, k] - mixed[b, k])
+                    spread[a, b] += share * (of_covariances[j, i, a, b] + between / 3.0)
+
+
+@compiled
+def _beyond_rest(parameters: Records, mean: Vector, tremor: Vector) -> float:
+    """Squared, normalised excess of the speed and tremor of the mode REST over their bounds:
+
+        max(|v|² - v_max², 0) / σ_v² + max(|y|² + |w|² / ω² - y_max², 0) / σ²
+
+    with v_max = rest_max_speed_mps, σ_v = rest_speed_std_mps, y_max = max_tremor_m and the tremor's
+    σ.
+    """
+    config = parameters[0]
+    speed, amplitude = square(mean[1]), 0.0
+    for axis in range(3):
+        amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
+    trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + REST])
+    drifts: float = max(speed - config.rest_max_speed_mps**2, 0.0) / config.rest_speed_std_mps**2
+    return drifts + trembles
+
+
+@compiled
+def update(
+    parameters: Records,
+    means: Vector,
+    covariances: Vector,
+    modes: Vector,
+    noise: float,
+    position: Vector,
+    interval_s: float,
+    tremor: Vector,
+) -> None:
+    """Posterior of all modes after a sample z (3,) [m] with noise variance r [m²], `interval_s`
+    after the sample before. The modes must have been advanced to the time of the sample.
+
+    Without an evident tremor, that of CHANGE is cleared first, as it may have been evident before.
+    The modes are mixed (`_switched`, `_mix`), then each is updated (`measure`), with the tremor of
+    rate ω and variances σ² in `tremor` (1 + MODES,):
+
+        log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
+
+    The innovation in log L is that before the update. For REST, log L is reduced by half of
+    `_beyond_rest`. The probabilities μ stay above about least_mode_probability.
+    """
+    shares, expected, likelihood = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES)
+    if tremor[1 + CHANGE] == 0.0:
+        _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
+    _switched(parameters, means, covariances, modes, interval_s, shares)
+    _mix(parameters, means, covariances, shares, expected, tremor)
+    best = -1e300
+    for i in range(MODES):
+        mean, p = means[i], covariances[i]
+        for row in range(STATES):
+            for column in range(row):
+                p[row, column] = p[column, row]
+        variance, error = measure(mean, p, noise, position)
+        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(parameters, error)
+        if i == REST:
+            likelihood[i] -= 0.5 * _beyond_rest(parameters, mean, tremor)
+        best = max(best, likelihood[i])
+    for i in range(MODES):
+        modes[i] = expected[i] * exp(likelihood[i] - best)
+    _normalise(modes)
+    for i in range(MODES):
+        modes[i] = max(modes[i], parameters[0].least_mode_probability)
+    _normalise(modes)
+
+
+@compiled
+def _normalise(modes: Vector) -> None:
+    """Divide the probabilities (MODES,) by their sum, in place."""
+    total = 0.0
+    for i in range(MODES):
+        total += modes[i]
+    for i in range(MODES):
+        modes[i] /= total

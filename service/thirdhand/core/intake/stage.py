@@ -1,0 +1,217 @@
+"""Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
+at the tick. The clutch, the wish for the gripper and reports of hand guiding are taken in here too.
+
+`plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thirdhand.contract.channels import BY_KEY
+from thirdhand.contract.joint_states import measured
+from thirdhand.contract.messages import (
+    BASE,
+    JointState,
+    PoseStamped,
+    WireError,
+)
+from thirdhand.contract.records import SIDES, SOURCES, Cause
+from thirdhand.core.frame import (
+    Event,
+    Record,
+    as_array,
+    parameters,
+)
+from thirdhand.core.geometry import rotation
+from thirdhand.core.intake.arm_samples import still_ticks
+from thirdhand.core.intake.hand_estimator import HandEstimator
+from thirdhand.core.intake.motion_model import models
+from thirdhand.core.intake.step import (
+    ARM,
+    report,
+    take_arm,
+    take_hand,
+)
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.settings.config import HandSettings, Settings
+
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
+
+
+def z_reversed(sample: PoseStamped) -> PoseStamped:
+    """A pose in left-handed axes, as it is in right-handed ones whose z points the other way."""
+    (x, y, z), (i, j, k, w) = sample.position, sample.orientation
+    return sample._replace(position=(x, y, -z), orientation=(-i, -j, k, w))
+
+
+def base_from(hands: HandSettings) -> NDArray[np.float64]:
+    """The mapping (3, 4) of positions in a tracker's frame and unit to frame `base` [m]."""
+    origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+    return np.column_stack((UNIT_M[hands.unit] * axes, origin))
+
+
+def _stale_ticks(key: str, settings: Settings) -> int:
+    """Number of ticks, at least one, after which a channel's source is silent."""
+    section, name = BY_KEY[key].stale_after or ("", "")
+    duration_ms: float = getattr(getattr(settings, section), name)
+    return max(1, settings.ticks_in(duration_ms / 1000))
+
+
+class Refused(NamedTuple):
+    """A rejected sample, with the stamp [ns] of the newest accepted sample; for the arm, also with
+    the joint positions of that one.
+    """
+
+    cause: Cause
+    sample: PoseStamped | JointState
+    newest_ns: int
+    joints: tuple[float, ...] = ()
+
+
+class Intake:
+    """Intake of hand and arm samples into the state: the estimate of each hand, the newest sample
+    of the arm.
+
+    Two attributes are for reports only and are no part of the state: `rejected` (sources, causes)
+    counts the rejected samples, and `refused` has the newest rejected sample of each source and
+    cause.
+    """
+
+    def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
+        hands, numbers = settings.hands, tuning.intake
+        self._stale_ticks = _stale_ticks("hands/left", settings)
+        self._silent_ticks = _stale_ticks("joints/state", settings)
+        self._still_ticks = still_ticks(settings, tuning)
+        self._names = settings.joints.names
+        self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
+        # The longest interval: between samples of a hand that reappears, and a late sample's age.
+        longest_s = hands.longest_stale_ms / 1000
+        stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
+        unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        self._unseen_ticks = unseen_ticks
+        longest_late_s = max(numbers.max_late_s, longest_s)
+        late_ticks = math.ceil(longest_late_s / settings.period_s)
+        self._models = models(settings.period_s, unseen_ticks + late_ticks + 1, numbers)
+        joints = settings.joints
+        limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
+        self.parameters = parameters(
+            period_s=settings.period_s,
+            stale_ticks=self._stale_ticks,
+            stale_max_ticks=stale_max_ticks,
+            longest_late_s=longest_late_s,
+            unseen_ticks=unseen_ticks,
+            silent_ticks=self._silent_ticks,
+            still_ticks=self._still_ticks,
+            joint_jump_speed=max(numbers.joint_jump_radps, float((np.array(joints.velocity) / per_rad).max())),
+            plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
+            per_rad=per_rad,
+            has_clutch=int(hands.clutch == "key"),
+            **numbers._asdict(),
+            start_speed_std_mps=numbers.start_speed_std_mps,
+            # A faster hand does not rest: reaches are seen at once.
+            rest_max_speed_mps=numbers.outlier_stds * numbers.rest_speed_std_mps,
+            # Squared deviation / variance of an outlier; what differs by less continues its filter.
+            outlier_variances=numbers.outlier_stds**2,
+            # No mode becomes less probable than an outlier on two axes, so that each can return.
+            least_mode_probability=round(math.exp(-(numbers.outlier_stds**2)), 9),
+            tremor_rates_per_s=numbers.tremor_rates_per_s,
+            jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
+            sources_apart_m=numbers.scatter_on_m,
+            # Below twice the acceleration of the strongest tremor, a hand may move to and fro.
+            to_and_fro_mps2=2.0 * numbers.max_tremor_m * numbers.tremor_rate_per_s**2,
+            # Alternating samples raise the contested share up to this limit.
+            to_and_fro_max_share=2.0 * numbers.contested_on_share,
+            contested_off_share=numbers.contested_off_share,
+            scatter_on_m=numbers.scatter_on_m,
+            scatter_off_m=numbers.scatter_off_m,
+            # With fewer, one outlier in four differences looks like scatter.
+            scatter_least_samples=numbers.noise_samples // 2,
+            max_joint_radps=numbers.max_joint_radps,
+            is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
+        )
+        self._mappings = {
+            frame: (base_from(of_frame := settings.hands_in(frame)), of_frame.axes == "left-handed")
+            for frame in settings.tracker_frames
+        }
+        if hands.frame not in ("", BASE):
+            # If the tracker has a frame of its own, samples in frame base have been mapped already.
+            self._mappings[BASE] = np.eye(3, 4), False
+        self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
+        self.refused: dict[tuple[str, Cause], Refused] = {}
+        self._estimator = HandEstimator(self.parameters, self._models, numbers)
+
+    def begin(self, state: Record) -> None:
+        """Set the values that hold before the first sample, in a state of zeros."""
+        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
+            state[field] = -1
+        state["stale_ticks"] = self._stale_ticks
+        self._estimator.begin(state)
+
+    def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
+        """Advance the state by some ticks and take the samples in. Returns the flags of
+        `codes.Condition` that `step.report` lists.
+        """
+        self.advance(state, ticks)
+        for event in samples:
+            match event.kind:
+                case "joints/state":
+                    self.take_arm(state, event.value)
+                case "clutch":
+                    state["clutch_until_tick"] = state["tick"] + self._clutch_ticks if event.value else 0
+                case "joints/guided":
+                    state["guided_until_tick"] = state["tick"] + self._guided_ticks if event.value else 0
+                case "gripper/wish":
+                    state["gripper_wish"] = event.value
+                case _:
+                    self.take_hand(state, SIDES.index(event.kind[6:]), event.value)
+        return int(report(as_array(state), as_array(frame), self.parameters))
+
+    def advance(self, state: Record, ticks: int) -> None:
+        """Advance the state by some ticks: hands seen lately move on, others stand still."""
+        self._estimator.advance(state, ticks, self._unseen_ticks)
+
+    def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
+        """Filter a sample of one hand, or count it as rejected."""
+        if (known := self._mappings.get(sample.frame_id)) is None:
+            state["rejected"][Cause.WRONG_FRAME] += 1
+            self._note(state, side, Cause.WRONG_FRAME, sample)
+            return
+        mapping, is_left_handed = known
+        if is_left_handed:
+            sample = z_reversed(sample)
+        cause = take_hand(
+            as_array(state),
+            self.parameters,
+            self._models,
+            side,
+            sample.stamp_ns,
+            sample.position,
+            sample.orientation,
+            mapping,
+        )
+        if cause >= 0:
+            self._note(state, side, cause, sample)
+
+    def take_arm(self, state: Record, sample: JointState) -> None:
+        """Store a sample of the arm in the state, or count it as rejected."""
+        try:
+            position, velocity = measured(sample, self._names)
+        except WireError:
+            state["rejected"][Cause.INCOMPLETE] += 1
+            self._note(state, ARM, Cause.INCOMPLETE, sample)
+            return
+        cause = take_arm(as_array(state), self.parameters, sample.stamp_ns, np.array(position), np.array(velocity))
+        if cause >= 0:
+            self._note(state, ARM, cause, sample)
+
+    def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+        """Count a rejected sample, and retain it for reports."""
+        newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
+        joints = tuple(state["measured"].tolist()) if source == ARM else ()
+        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
+        self.rejected[source, cause] += 1  # last, so that another thread that sees the count finds `refused`

@@ -1,0 +1,364 @@
+"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from kmp.elementary import exp
+from thirdhand.contract.records import SOURCES, Cause
+from thirdhand.core.codes import (
+    ARM_GUIDED,
+    ARM_HEARD,
+    ARM_STILL,
+    CLUTCH_RELEASED,
+    CONTESTED,
+    FAULT,
+    HANDS_KNOWN,
+    TWO_SOURCES,
+    UNSEEN,
+)
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.geometry import ROUND_TO
+from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
+from thirdhand.core.intake.arm_samples import compared, unwrap
+from thirdhand.core.intake.hand_estimator import (
+    goes_on,
+    note_clock,
+    order_of,
+    take,
+    ticks_late,
+    turn_to,
+)
+from thirdhand.core.intake.late_samples import (
+    drop,
+    expected,
+    take_late,
+    tick_made,
+    wrong_samples,
+)
+from thirdhand.core.intake.plausibility import (
+    is_confirmed,
+    is_of_another,
+    is_swapped,
+    is_to_and_fro,
+)
+from thirdhand.core.vectors import distance, squared_distance
+
+NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
+REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
+JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
+
+
+@compiled
+def is_contested(states: Records, parameters: Records, already: bool) -> bool:
+    """True if a hand or the arm is contested: two sources report it.
+
+    A source is contested if its `contested` share is above contested_on_share, or if the noise of a
+    hand's samples is above scatter_on_m. If it was contested `already`, the lower limits
+    contested_off_share and scatter_off_m apply.
+    """
+    state, config = states[0], parameters[0]
+    share, scatter_m = config.contested_on_share, config.scatter_on_m
+    if already:
+        share, scatter_m = config.contested_off_share, config.scatter_off_m
+    for side in range(2):
+        known = already or state.noise_samples[side] >= config.scatter_least_samples
+        if known and state.noise_variance[side] > scatter_m**2:
+            return True
+    return bool(state.contested.max() > share)
+
+
+@compiled
+def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float) -> int:
+    """Cause for which a stamp is rejected: REPEATED, AHEAD, OLDER; -1 if it is accepted.
+
+    The newest sample arrived `passed_s` ago with the stamp `newest_ns`. A stamp may be ahead of
+    that by `passed_s` + `silent_s`, and older than that by `late_s`. After a silence (not `fresh`),
+    every stamp but the newest one is accepted.
+    """
+    if stamp_ns == newest_ns:
+        return REPEATED
+    if not fresh:
+        return -1
+    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of two integers may overflow
+    if ahead_s > passed_s + silent_s:
+        return AHEAD
+    return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
+
+
+@compiled
+def note(states: Records, parameters: Records, source: int, jumped: bool, most_s: float) -> None:
+    """Update the share c of a source's recent samples that contradict the others:
+
+        c = c + (1 - exp(-Δ / tracker_memory_s)) (jumped - c)
+
+    Δ is half the time since the tick with a sample before the last one; for a further sample in the
+    same tick, it is the time since the last tick with one. Δ is at most `most_s`, after which the
+    source is silent. So the samples of two trackers that take turns have the same weight, however
+    soon one follows the other.
+    """
+    state = states[0]
+    ticks, share = state.sample_ticks[source], state.contested[source]
+    passed = float(state.tick - ticks[0])
+    if ticks[1] < state.tick:
+        passed *= 0.5  # half the time since the sample before the last one
+        ticks[0], ticks[1] = ticks[1], state.tick
+    passed_s = min(passed * parameters[0].period_s, most_s)
+    share += (1.0 - exp(-passed_s / parameters[0].tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
+    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
+
+
+@compiled
+def has_jumped(
+    states: Records, parameters: Records, side: int, position: Vector, expected: Vector, interval_s: float
+) -> bool:
+    """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
+    than a hand can move and a tracker's noise explains:
+
+        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
+
+    `interval_s` is the time since the sample from which p was predicted.
+    """
+    state, config = states[0], parameters[0]
+    gate = max(
+        config.jump_m + config.jump_speed_mps * interval_s,
+        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
+    )
+    return bool(squared_distance(position, expected) > gate * gate)
+
+
+@compiled
+def _turns_hard(states: Records, parameters: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
+    """True if a hand at x_0 (3,) [m], h_0 after the retained sample x_1 at ring index `at`, which
+    followed x_2 after h_1, would have accelerated by at least to_and_fro_mps2:
+
+        |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= to_and_fro_mps2
+
+    Intervals h are at least a period, also those within a tick.
+    """
+    past, wanted, period_s = states[0].kept_past[side, at], 0.0, parameters[0].period_s
+    after_s, before_s = max(after_s, period_s), max(states[0].kept_noise[side, at, 3], period_s)
+    for axis in range(3):
+        turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
+        wanted += (2.0 * turned / (after_s + before_s)) ** 2
+    return bool(wanted >= parameters[0].to_and_fro_mps2 ** 2)
+
+
+@compiled
+def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
+    """Store a sample of the arm's joints (J,) [rad, rad/s] in the state; compiled part of
+    `Intake.take_arm`. Returns the cause for which it was rejected, or -1.
+    """
+    state, config = states[0], parameters[0]
+    passed = state.tick - state.arm_tick
+    passed_s, silent_s = passed * config.period_s, config.silent_ticks * config.period_s
+    fresh = state.arm_tick >= 0 and passed < config.silent_ticks
+    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+        state.rejected[NOT_FINITE] += 1
+        return NOT_FINITE
+    # Before it is ready, and after a silence, an arm is in the turn that it reports, because it may
+    # have restarted. While it is commanded, its turns are counted on.
+    if fresh or (state.arm_ready and state.mode != FAULT):
+        unwrap(states, parameters, position)
+    near, off, moved = compared(states, parameters, position, velocity)
+    cause = -1 if near else OUT_OF_RANGE
+    if near:
+        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
+    if near and cause != REPEATED:
+        jumped = fresh and off > config.joint_jump_rad + config.joint_jump_speed * passed_s
+        note(states, parameters, ARM, jumped, silent_s)
+        if jumped and cause < 0:
+            cause = JUMPED
+    if near and (moved > config.arm_still_rad or not fresh):
+        state.arm_still_posture[:] = position
+        state.arm_still_tick = state.tick
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return cause
+    state.measured[:], state.measured_velocities[:] = position, velocity
+    state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
+    return -1
+
+
+@compiled
+def _malformed(
+    parameters: Records,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    in_base: Vector,
+) -> int:
+    """Cause for which the pose itself is rejected: NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE; -1 if
+    it is accepted. `in_base` (3,) [m] is the position in frame base.
+    """
+    norm = far = 0.0
+    for k in range(4):
+        norm += turn[k] * turn[k]
+    for i in range(3):
+        far += in_base[i] * in_base[i]
+    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+        return NOT_FINITE
+    if not abs(math.sqrt(norm) - 1.0) <= 0.01:
+        return NOT_A_ROTATION
+    most_m = parameters[0].max_hand_distance_m
+    return -1 if far <= most_m * most_m else OUT_OF_RANGE
+
+
+@compiled
+def _in_time(
+    states: Records, parameters: Records, side: int, stamp_ns: int, in_base: Vector, fresh: bool
+) -> tuple[int, int, int]:
+    """Cause for which a sample of a hand is rejected by its stamp, or -1; its `order` among the
+    retained samples; and the tick in which it was made.
+
+    The retained samples are forgotten if a hand that is not `fresh` does not continue its filter at
+    `in_base` (3,) [m], or its clock was set back.
+    """
+    state, config, order = states[0], parameters[0], 0
+    newest_ns, period_s = state.hand_stamps_ns[side], config.period_s
+    passed_s = (state.tick - state.hand_ticks[side]) * period_s
+    stale_s = state.stale_ticks[side] * period_s
+    cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.longest_late_s)
+    if cause >= 0:
+        return cause, 0, state.tick
+    if not fresh and (stamp_ns < newest_ns or not goes_on(states, parameters, side, in_base)):
+        state.kept[side] = 0
+    elif fresh and stamp_ns < newest_ns:
+        order = order_of(states, side, stamp_ns)
+    late = ticks_late(states, side, stamp_ns, period_s, config.longest_late_s)
+    if order >= KEPT - 1:
+        return OLDER, 0, state.tick
+    if order < 0:
+        return REPEATED, order, state.tick
+    made = tick_made(states, side, stamp_ns, order, late, period_s) if order > 0 or late > 0 else state.tick
+    return -1, order, made
+
+
+@compiled
+def take_hand(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    stamp_ns: int,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    frame: Vector,
+) -> int:
+    """Filter a sample of one hand; compiled part of `Intake.take_hand`. Returns the cause for which
+    it was rejected, or -1.
+
+    `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
+    `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
+    """
+    state, config, in_base = states[0], parameters[0], np.empty(3)
+    period_s = config.period_s
+    for i in range(3):
+        in_base[i] = frame[i, 3]
+        for k in range(3):
+            in_base[i] += frame[i, k] * position[k]
+    fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
+    jumped, order, made, wrong = False, 0, state.tick, 0
+    cause = _malformed(parameters, position, turn, in_base)
+    if cause < 0:
+        cause, order, made = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
+        another = False
+        if fresh and cause != REPEATED:
+            there = state.hands[side, 0].copy()
+            if order > 0 or made != state.tick:
+                expected(states, models, side, order, made, there)
+            at = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
+            passed_s = abs(made - state.kept_ticks[side, at]) * period_s
+            jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
+            another = jumped and is_of_another(states, parameters, side, in_base, there)
+            if jumped and not another and cause < 0 and order == 0:
+                wrong = wrong_samples(states, parameters, models, side, made, in_base)
+            if not another and order < state.kept[side] and state.contested[side] < config.to_and_fro_max_share:
+                # a higher share would only decay later
+                another = _turns_hard(states, parameters, side, at, in_base, passed_s)
+                another = another and is_to_and_fro(states, parameters, side, order, in_base)
+            jumped = jumped and wrong == 0
+        if cause != REPEATED:
+            note(states, parameters, side, another, state.stale_ticks[side] * period_s)
+            if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
+                jumped = is_swapped(states, parameters, side, in_base)
+        if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
+            cause = SWAPPED if state.jump_is_swap[side] else JUMPED
+    if cause >= 0:
+        state.rejected[cause] += 1
+        return cause
+    before = state.hands[side, 0].copy()
+    if wrong > 0:
+        drop(states, side, wrong)
+    if order == 0 and made == state.tick and wrong == 0:
+        take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
+    else:
+        note_clock(states, parameters, side, stamp_ns, fresh)
+        take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
+    if order == 0:
+        _note_correction(states, parameters, side, wrong, before)
+        state.jump_count[side] = state.jump_is_swap[side] = 0
+        state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
+        turn_to(states, side, turn, frame)
+        state.hand_stamps_ns[side] = stamp_ns
+        state.hand_ticks[side] = state.tick
+    return -1
+
+
+@compiled
+def _note_correction(states: Records, parameters: Records, side: int, wrong: int, before: Vector) -> None:
+    """Note how far a hand was moved when `wrong` samples were dropped, from the estimate `before`
+    (3,) [m].
+
+    Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
+    confirmed_s, the hand may be as far away from it (`hand_doubt_m`).
+    """
+    state, config = states[0], parameters[0]
+    if wrong > 0:
+        moved = distance(before, state.hands[side, 0])
+        state.hand_doubt_m[side] = max(state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO)
+        state.corrected_tick[side], state.doubted_samples[side] = state.tick, CONFIRMED_SAMPLES
+    elif state.doubted_samples[side] > 0:
+        state.doubted_samples[side] -= 1
+    passed_s = (state.tick - state.corrected_tick[side]) * config.period_s
+    if state.doubted_samples[side] == 0 and passed_s >= config.confirmed_s:
+        state.hand_doubt_m[side] = 0.0
+
+
+@compiled
+def report(states: Records, frames: Records, parameters: Records) -> int:
+    """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Condition`
+    that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL,
+    ARM_GUIDED, CONTESTED, CLUTCH_RELEASED.
+    """
+    frame, state, config = frames[0], states[0], parameters[0]
+    left, right = state.hand_ticks[0], state.hand_ticks[1]
+    if left == right:
+        frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
+    else:
+        frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
+    for side in range(2):
+        seen = state.hand_ticks[side]
+        frame.hand_ages[side], frame.stale_ticks[side] = -1 if seen < 0 else state.tick - seen, state.stale_ticks[side]
+        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
+    frame.tick = state.tick
+    frame.rejected[:] = state.rejected
+    known, ages, stale = 0, frame.hand_ages, frame.stale_ticks
+    is_seen = ages[0] < stale[0], ages[1] < stale[1]
+    if ages.min() >= 0 and ages.max() < config.unseen_ticks and (is_seen[0] or is_seen[1]):
+        known = HANDS_KNOWN
+        for side in range(2):
+            if not is_seen[side]:
+                known |= UNSEEN[side]
+    if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
+        known |= ARM_HEARD
+        if state.tick - state.arm_still_tick >= config.still_ticks:
+            known |= ARM_STILL
+        if state.tick < state.guided_until_tick:
+            known |= ARM_GUIDED
+    if config.has_clutch and state.tick >= state.clutch_until_tick:
+        known |= CLUTCH_RELEASED
+    contested = is_contested(states, parameters, state.reason == TWO_SOURCES)
+    return known | CONTESTED if contested else known

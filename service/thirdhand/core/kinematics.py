@@ -1,0 +1,175 @@
+"""Kinematics of the arm at some joints: the tool's pose, and its motion as the joints move."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from kmp.elementary import sin_cos
+from thirdhand.core.arm.least_squares import factorise, substitute
+from thirdhand.core.frame import Records, Vector
+
+
+class Kinematics:
+    """The arm at some joints, as one record (1,); `Arm.at` computes it."""
+
+    __slots__ = ("record",)
+
+    def __init__(self, record: Records) -> None:
+        self.record = record
+
+    @property
+    def joints(self) -> Vector:
+        """Joint positions (J,) [rad, m]."""
+        return self.record["joints"][0]  # type: ignore[no-any-return]
+
+    @property
+    def position(self) -> Vector:
+        """Position of the tool (3,) [m], frame base."""
+        return self.record["position"][0]  # type: ignore[no-any-return]
+
+    @property
+    def rotation(self) -> Vector:
+        """Rotation of the tool (3, 3), frame base."""
+        return self.record["rotation"][0]  # type: ignore[no-any-return]
+
+    @property
+    def tasks(self) -> Vector:
+        """Task matrix (5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity.
+
+        Rows 0 to 2 are linear, in frame base; the others turn the tool about its own x, y (and z).
+        """
+        return self.record["tasks"][0]  # type: ignore[no-any-return]
+
+    @property
+    def damping(self) -> float:
+        """Damping of the tasks [m²]."""
+        return float(self.record["damping"][0])
+
+    @property
+    def jacobian(self) -> Vector:
+        """Jacobian of the tool (6, J), linear before angular rows, frame base."""
+        return self.record["jacobian"][0]  # type: ignore[no-any-return]
+
+
+@compiled
+def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float, float]:
+    """Speed of the tool now, its maximum as accelerations are ended, and a bound of both [m/s].
+
+    With Jv (3, J) the first rows of the tasks:
+
+        now   = |Jv dq|
+        crest = max(now, |Jv (dq + ddq |ddq| / 2 jerk)|)
+        total = sum over the joints of |Jv_j| (|dq_j| + ddq_j² / (2 jerk_j))
+
+    The second term of crest is the speed once each joint has brought its acceleration to 0. The
+    total is a bound even if the motions of the joints no longer cancel each other.
+    """
+    tasks = heres[0].tasks
+    now = crest = total = 0.0
+    for axis in range(3):
+        v = v_crest = 0.0
+        for joint in range(len(dq)):
+            v += tasks[axis, joint] * dq[joint]
+            gained = ddq[joint] * abs(ddq[joint]) / (2.0 * jerk[joint])
+            v_crest += tasks[axis, joint] * (dq[joint] + gained)
+        now += v * v
+        crest += v_crest * v_crest
+    for joint in range(len(dq)):
+        column = math.sqrt(tasks[0, joint] ** 2 + tasks[1, joint] ** 2 + tasks[2, joint] ** 2)
+        total += column * (abs(dq[joint]) + ddq[joint] ** 2 / (2.0 * jerk[joint]))
+    return math.sqrt(now), math.sqrt(max(now, crest)), total
+
+
+@compiled
+def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
+    """Speed of the tool [m/s] at joint velocities dq (J,), after displacements `way` (J,) [rad, m].
+
+    It is exact, by the product of exponentials. A revolute joint i is a screw with axis w and
+    moment u = o × w, o a point of the axis; a prismatic joint has w = 0 and the direction u. Both
+    follow from the present Jacobian. The joints before i move its screw by (R, s) = exp(screw_1
+    way_1) ... exp(screw_(i-1) way_(i-1)):
+
+        w' = R w,  u' = R u + s × w',  and with all joints  tool' = R tool + s
+
+    The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
+    """
+    here, joints = heres[0], len(dq)
+    jacobian, tool = here.jacobian, here.position
+    rotation, shift, turned, moved = np.eye(3), np.zeros(3), np.empty((3, 3)), np.empty(3)
+    linear, angular, axis, moment = np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
+    own, own_shift = np.empty((3, 3)), np.empty(3)
+    for j in range(joints):
+        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        # moment about the origin: the tool's velocity less w × tool
+        ux = jacobian[0, j] - (wy * tool[2] - wz * tool[1])
+        uy = jacobian[1, j] - (wz * tool[0] - wx * tool[2])
+        uz = jacobian[2, j] - (wx * tool[1] - wy * tool[0])
+        for i in range(3):
+            axis[i] = rotation[i, 0] * wx + rotation[i, 1] * wy + rotation[i, 2] * wz
+            moment[i] = rotation[i, 0] * ux + rotation[i, 1] * uy + rotation[i, 2] * uz
+        linear[0] += dq[j] * (moment[0] + shift[1] * axis[2] - shift[2] * axis[1])
+        linear[1] += dq[j] * (moment[1] + shift[2] * axis[0] - shift[0] * axis[2])
+        linear[2] += dq[j] * (moment[2] + shift[0] * axis[1] - shift[1] * axis[0])
+        for i in range(3):
+            angular[i] += dq[j] * axis[i]
+        s, c = sin_cos(way[j])
+        turns = wx * wx + wy * wy + wz * wz > 0.5
+        if not turns:
+            c, s = 1.0, 0.0
+        v = 1.0 - c
+        own[0, 0], own[0, 1], own[0, 2] = c + v * wx * wx, v * wx * wy - s * wz, v * wx * wz + s * wy
+        own[1, 0], own[1, 1], own[1, 2] = v * wx * wy + s * wz, c + v * wy * wy, v * wy * wz - s * wx
+        own[2, 0], own[2, 1], own[2, 2] = v * wx * wz - s * wy, v * wy * wz + s * wx, c + v * wz * wz
+        if turns:  # about the point o = w × u of the axis: o - own o
+            ox, oy, oz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
+            own_shift[0] = ox - (own[0, 0] * ox + own[0, 1] * oy + own[0, 2] * oz)
+            own_shift[1] = oy - (own[1, 0] * ox + own[1, 1] * oy + own[1, 2] * oz)
+            own_shift[2] = oz - (own[2, 0] * ox + own[2, 1] * oy + own[2, 2] * oz)
+        else:
+            own_shift[0], own_shift[1], own_shift[2] = ux * way[j], uy * way[j], uz * way[j]
+        for i in range(3):
+            moved[i] = shift[i]
+            for k in range(3):
+                moved[i] += rotation[i, k] * own_shift[k]
+                turned[i, k] = rotation[i, 0] * own[0, k] + rotation[i, 1] * own[1, k] + rotation[i, 2] * own[2, k]
+        rotation[:], shift[:] = turned, moved
+    for i in range(3):
+        moved[i] = rotation[i, 0] * tool[0] + rotation[i, 1] * tool[1] + rotation[i, 2] * tool[2] + shift[i]
+    x = linear[0] + angular[1] * moved[2] - angular[2] * moved[1]
+    y = linear[1] + angular[2] * moved[0] - angular[0] * moved[2]
+    z = linear[2] + angular[0] * moved[1] - angular[1] * moved[0]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
+    """Write the share of each joint's planned limit per unit of tool motion into out (3, 3, J).
+
+    The first index is the order: velocity, acceleration, jerk. The second is the axis i. With Jv
+    (3, J) the first rows of the tasks, S = diag(spared) of the order, and M = Jv S:
+
+        out[order, i] = S M^T (M M^T + damping I)^-1 e_i / (PLANNED_LIMIT_SHARES[order] joint limit)
+
+    These are the damped least-squares joint motions that move the tool along one axis and leave its
+    orientation free. S makes joints with higher limits move more.
+    """
+    arm, here = arms[0], heres[0]
+    joints = here.tasks.shape[1]
+    scaled, root, right = np.empty((3, joints)), np.empty((3, 3)), np.empty(3)
+    for order in range(3):
+        for i in range(3):
+            for joint in range(joints):
+                scaled[i, joint] = here.tasks[i, joint] * arm.spared[order, joint]
+        factorise(scaled, here.damping, root)
+        for axis in range(3):
+            right[:] = 0.0
+            right[axis] = 1.0
+            substitute(root, right)
+            for joint in range(joints):
+                moved = 0.0
+                for i in range(3):
+                    moved += scaled[i, joint] * right[i]
+                out[order, axis, joint] = moved / arm.planned_limits[order, joint]

@@ -1,0 +1,316 @@
+"""Compiled step of separation: from hands and posture to inequalities in joint velocity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from kmp.elementary import exp
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.geometry import (
+    between_segments,
+    carry_back,
+    nearest_to_box,
+    place,
+    to_box,
+)
+from thirdhand.core.separation import FARTHEST_REPORTED_M
+from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
+from thirdhand.core.vectors import norm
+
+
+@compiled
+def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
+    """Largest speed v [m/s] toward an object, from which a stop still ends at the clearance.
+
+    The object is at the distance d and approaches with constant speed u = `hand_speed`. The arm
+    moves on for the reaction time T, then brakes with B. It keeps the clearance c if
+
+        d - c = (v + u) T + v² / 2B + u v / B,
+
+        v = max(0, sqrt(u² + (B T)² + 2 B (d - c)) - B T - u)
+    """
+    square = hand_speed**2 + (brake * reaction) ** 2 + 2.0 * brake * (distance - clearance)
+    return max(0.0, math.sqrt(max(square, 0.0)) - brake * reaction - hand_speed)
+
+
+@compiled
+def step(
+    states: Records,
+    heres: Records,
+    parameters: Records,
+    capsules: Records,
+    pairs: Vector,
+    boxes: Vector,
+    contacts: Records,
+    constraints: Records,
+) -> tuple[int, float, float, float]:
+    """Write the constraints; return their number, nearest_m, speed_limit and setpoint_share.
+
+    For the nearest points p1, p2 of two capsules (or of a capsule and a box), with the unit normal
+    n from p1 to p2 and the distance d of the surfaces, a constraint is
+
+        row · dq <= limit,    row = n^T (dp1/dq - dp2/dq)    [m/s]
+
+    where p2 of a hand or a box does not depend on q. With s = `allowed_speed`, the limits are
+
+        hands           allowed = max(contact, s(d, u)) + braked + slip_speed_mps
+                        planned = `_planned`(d, u)
+        boxes, itself   `_limit`
+
+    u is the speed of the hand toward the part: the measured one, or unknown_speed for a hand that
+    was just seen. contact is contact_speed for the tool's part near a hand that may be touched,
+    else 0.
+
+    A moving hand is also evaluated at the times h = moving lookahead_s, with moving = `_swiftness`
+    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = brake_ramp_s,
+    at
+
+        p + h v + τ (h - f) a,    with the velocity v + f a,    f = τ (1 - exp(-h / τ))
+
+    braked = brake max(h - brake_ramp_s, 0) is the speed [m/s] that the arm can brake until then.
+
+    A hand that has been out of sight for t seconds longer than it may be is assumed to accelerate
+    toward the arm by g = unseen_acceleration_mps2 during t: u grows by w = min(g t, unknown_speed),
+    d shrinks by w (t - w / 2g). After a correction, d also shrinks by `hand_doubt_m`, and u is
+    unknown_speed.
+
+    Only constraints that the joints can violate are kept.
+    """
+    state, here, config = states[0], heres[0], parameters[0]
+    joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
+    later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
+    now, then = placed[0], placed[1]
+    place(here.joints, config.frames, config.axes, capsules, now)
+    nearest_m, setpoint_share = FARTHEST_REPORTED_M, 1.0
+    speed_limit = capsules[0].max_speed
+    for capsule in range(len(capsules)):
+        speed_limit = max(speed_limit, capsules[capsule].max_speed)
+    for side in range(2):
+        if state.hand_ticks[side] < 0:
+            continue
+        variance = 0.0
+        for mode in range(state.mode_probabilities.shape[1]):
+            variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
+        doubt = state.hand_doubt_m[side]
+        known, receives = (
+            variance <= config.unknown_velocity_std_mps * config.unknown_velocity_std_mps and doubt == 0.0,
+            _receives(contacts, state.hands, side, config.contact_margin_m),
+        )
+        age_s = (state.tick - state.hand_ticks[side]) * config.period_s
+        # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
+        unseen_s = age_s - config.unseen_s[0] if config.unseen_s[0] < age_s < config.unseen_s[1] else 0.0
+        speed_up = min(config.unseen_acceleration_mps2 * unseen_s, config.unknown_speed)
+        nearer = doubt + speed_up * (unseen_s - 0.5 * speed_up / config.unseen_acceleration_mps2)
+        moment = _swiftness(state.hands[side, 1], config.tremor_speed) if known else 0.0
+        for k in range(len(config.lookahead_s) if moment > 0.0 else 1):
+            ahead = moment * config.lookahead_s[k]
+            parts = now if k == 0 else then
+            if k > 0:
+                for j in range(joints):
+                    later[j] = here.joints[j] + ahead * state.joints[1, j]
+                place(later, config.frames, config.axes, capsules, then)
+            faster = config.brake_ramp_s * (1.0 - exp(-ahead / config.brake_ramp_s))
+            for i in range(3):
+                v, a = state.hands[side, 1, i], state.hands[side, 2, i]
+                velocity[i] = v + faster * a
+                moved = ahead * v + config.brake_ramp_s * (ahead - faster) * a
+                forearm[0, i] = state.hands[side, 0, i] + moved
+                forearm[1, i] = forearm[0, i] + config.forearm[i]
+            braked = config.brake[PEOPLE] * max(ahead - config.brake_ramp_s, 0.0)
+            for capsule in range(config.first, len(capsules)):
+                part, constraint = capsules[capsule], constraints[count]
+                distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
+                if k == 0:
+                    nearest_m = min(nearest_m, distance)
+                distance -= nearer
+                coming = 0.0
+                for i in range(3):
+                    coming -= near[6 + i] * velocity[i]
+                coming = max(coming, 0.0) + speed_up if known else config.unknown_speed
+                least = config.contact_speed if receives and part.link == joints else 0.0
+                if k == 0:
+                    most = max(least, _allowed(parameters, PEOPLE, distance, coming))
+                    speed_limit = min(speed_limit, most)
+                planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+                if planned < part.max_speed:
+                    constraint.planned = planned
+                    constraint.allowed = (
+                        max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + config.slip_speed_mps
+                    )
+                    if k > 0:
+                        carry_back(near, then[capsule], now[capsule])
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, config.max_velocity)
+    for capsule in range(config.first, len(capsules)):
+        part = capsules[capsule]
+        for box in range(len(boxes)):
+            inner = nearest_to_box(now[capsule], boxes[box])
+            for where in range(3):  # the ends have constraints too: a capsule along a face may tip
+                share = inner if where == 0 else where - 1.0
+                distance = to_box(now[capsule], share, boxes[box], near) - part.radius
+                planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
+                twice = where > 0 and share == inner
+                if not twice and planned < part.max_speed:
+                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                    planned = _limit(constraints, count, parameters, THINGS, distance, planned)
+                    if part.link == joints:
+                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
+                    count += _may_pass(constraints, count, planned, config.max_velocity)
+    for pair in range(len(pairs)):
+        one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
+        distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
+        planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
+        if planned < one.max_speed + other.max_speed:
+            _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
+            _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
+            planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
+            count += _may_pass(constraints, count, planned, config.max_velocity)
+    return count, nearest_m, speed_limit, setpoint_share
+
+
+@compiled
+def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
+    """Speed [m/s] that the rule (PEOPLE, THINGS or ITSELF) allows at this distance [m]."""
+    config = parameters[0]
+    return allowed_speed(distance, coming, config.brake[rule], config.reaction_s[rule], config.clearance[rule])
+
+
+@compiled
+def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
+    """Speed [m/s] that motion is planned with: lower than what the rule allows.
+
+        max(planned_brake_share least, allowed_speed) + planned_brake_share braked
+
+    with the planned brake and reaction time, and with the planned margin added to the clearance.
+    """
+    config = parameters[0]
+    brake, reaction_s = config.planned_brake[rule], config.planned_reaction_s[rule]
+    planned = allowed_speed(distance, coming, brake, reaction_s, config.clearance[rule] + config.planned_margin)
+    share: float = config.planned_brake_share
+    return max(share * least, planned) + share * braked
+
+
+@compiled
+def _limit(constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float) -> float:
+    """Set the limits of constraint k to a thing or another part; return the planned speed [m/s].
+
+        left    = distance - clearance
+        allowed = allowed_speed(distance) + slip_speed_mps min(max(1 + left / slip_depth_m, 0.1), 1)
+        planned = min(planned, max(clearance_gain_per_s left, -retreat_speed_mps))
+
+    Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
+    move them at retreat_authority_mps.
+    """
+    config, constraint = parameters[0], constraints[k]
+    left = distance - config.clearance[rule]
+    slip = min(max(1.0 + left / config.slip_depth_m, 0.1), 1.0) * config.slip_speed_mps
+    constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
+    planned = min(planned, max(config.clearance_gain_per_s * left, -config.retreat_speed_mps))
+    if planned < 0.0 and not _may_pass(constraints, k, config.retreat_authority_mps, config.max_velocity):
+        planned = 0.0
+    constraint.planned = planned
+    return planned
+
+
+@compiled
+def _may_pass(constraints: Records, k: int, limit: float, max_velocity: Vector) -> int:
+    """1 if the joints can exceed a limit along row k, sum of |row_j| max_velocity_j > limit."""
+    most = 0.0
+    for j in range(len(max_velocity)):
+        most += abs(constraints[k].row[j]) * max_velocity[j]
+    return 1 if most > limit else 0
+
+
+@compiled
+def _swiftness(velocity: Vector, tremor_speed: float) -> float:
+    """Share of motion: 0 for a hand that rests or trembles, 1 from twice the tremor speed on.
+
+    |velocity| / tremor_speed - 1, limited to 0 ... 1
+    """
+    return min(max(norm(velocity) / tremor_speed - 1.0, 0.0), 1.0)
+
+
+@compiled
+def _share(near: Vector, limit: float, velocity: Vector) -> float:
+    """Largest share, at most 1, of a velocity (3,) that keeps a limit along the normal."""
+    along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    limit = max(limit, 0.0)
+    return limit / along if along > limit else 1.0
+
+
+@compiled
+def _receives(contacts: Records, hands: Vector, side: int, margin_m: float) -> bool:
+    """True if the hands are at a via-point where the tool goes with the hand of this side.
+
+    Each coordinate of both hands is within the via-point's radius and `margin_m`.
+    """
+    for contact in contacts:
+        if contact.side == side:
+            far = 0.0
+            for hand in range(2):
+                for i in range(3):
+                    far = max(far, abs(hands[hand, 0, i] - contact.hands[hand, i]))
+            if far <= contact.radius + margin_m:
+                return True
+    return False
+
+
+@compiled
+def _bring_together(
+    constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
+) -> None:
+    """Add to row k the speed along the normal of the point p = near[at:at + 3] of a link.
+
+        row_j += sign n · (v_j + w_j × (p - tool)),    j = 0 ... link - 1
+
+    v_j and w_j are the linear and angular columns of the tool's Jacobian, n = near[6:9]. A positive
+    sign first sets the row to 0.
+    """
+    row, tool, jacobian = constraints[k].row, heres[0].position, heres[0].jacobian
+    if sign > 0.0:
+        row[:] = 0.0
+    x, y, z = near[at] - tool[0], near[at + 1] - tool[1], near[at + 2] - tool[2]
+    n0, n1, n2 = near[6], near[7], near[8]
+    for j in range(link):
+        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        speed = n0 * (jacobian[0, j] + wy * z - wz * y)
+        speed += n1 * (jacobian[1, j] + wz * x - wx * z)
+        speed += n2 * (jacobian[2, j] + wx * y - wy * x)
+        row[j] += sign * speed
+
+
+@compiled
+def share_of(constraints: Records, count: int, velocity: Vector, parameters: Records) -> float:
+    """Largest share, at most 1, of joint velocities (J,) that keeps all planned limits.
+
+    min over k of max(planned_k, slip_speed_mps / 2) / (row_k · velocity)
+    """
+    share = 1.0
+    for k in range(count):
+        speed = 0.0
+        for j in range(len(velocity)):
+            speed += constraints[k].row[j] * velocity[j]
+        limit = max(constraints[k].planned, 0.5 * parameters[0].slip_speed_mps)
+        if speed > limit:
+            share = min(share, limit / speed)
+    return share
+
+
+@compiled
+def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
+    """`Separation.excess`, and the number of the constraint with the largest excess."""
+    most, which = -math.inf, 0
+    for k in range(count):
+        constraint = constraints[k]
+        now = crest = 0.0
+        for j in range(len(dq)):
+            now += constraint.row[j] * dq[j]
+            crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
+        if max(now, crest) - constraint.allowed > most:
+            most, which = max(now, crest) - constraint.allowed, k
+    return most, which

@@ -1,0 +1,271 @@
+"""Compiled step of the setpoint: `stage` describes the method, `bounds` the bounds it keeps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from thirdhand.core.codes import BROKEN, PLANNED, STOPPED
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.kinematics import joint_costs
+from thirdhand.core.numerics import LEAST_SPEED_MPS
+from thirdhand.core.setpoint.bounds import (
+    between,
+    bounds_around,
+    broken_bound,
+    stopping,
+    take_safe,
+)
+from thirdhand.core.setpoint.orientation import turn_orientation
+from thirdhand.core.vectors import distance, norm
+
+
+@compiled
+def slow_down(setpoint: Vector, tool: Vector, share: float, parameters: Records) -> float:
+    """Share of max_speed [m/s] that a setpoint (3, 3) may use while its tool (3,) [m] is behind.
+
+        1 / (1 + max(0, |setpoint - tool| - gap_free_m) / gap_slow_m)
+
+    It is 1 if the setpoint moves toward its tool. If separation allows only a share < 1 of the
+    setpoint's speed, the result is at most share |v| / max_speed.
+    """
+    config = parameters[0]
+    along = gap = 0.0
+    for i in range(3):
+        ahead = setpoint[0, i] - tool[i]
+        along += ahead * setpoint[1, i]
+        gap += ahead * ahead
+    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - config.gap_free_m) / config.gap_slow_m)
+    if share < 1.0:
+        slow = min(slow, share * norm(setpoint[1]) / config.max_speed)
+    return slow
+
+
+@compiled
+def lead(
+    states: Records,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    parameters: Records,
+    box: Vector,
+    costs: Vector,
+    slow: float,
+) -> int:
+    """Move the position setpoint of the state one period on; see `SetpointGenerator.step`.
+
+    The tracker's jerk j is constant over the period dt:
+
+        x' = x + v dt + a dt² / 2 + j dt³ / 6
+        v' = v + a dt + j dt² / 2
+        a' = a + j dt
+
+    `take_safe` accepts this step or replaces it by the fall-back.
+    """
+    state, config, setpoint = states[0], parameters[0], states[0].setpoint
+    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
+    target[0], target[1], target[2] = position, velocity, acceleration
+    state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
+    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), config.period_s
+    met = _track(setpoint, target, parameters, costs, slow, box, jerk)
+    for i in range(3):
+        x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
+        ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
+        ahead[1, i] = v + dt * (a + dt * j / 2.0)
+        ahead[2, i] = a + dt * j
+    if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
+        met = STOPPED
+    if broken_bound(setpoint, before, state.hull, box, parameters):
+        setpoint[:] = before
+        return BROKEN
+    return met
+
+
+@compiled
+def _track(
+    setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, box: Vector, jerk: Vector
+) -> int:
+    """Write the tracker's jerk (3,) [m/s³], reduced along the motion where a barrier requires it.
+
+    The tracker, with gains k (5,) of `tracker_gains` and φ = min(1, V / |v target|):
+
+        jerk = k0 (x target - x) + k1 φ v target + k2 a target + k3 v + k4 a
+
+    Without k2 if φ < 1: accelerations of a target beyond the speed limit are not followed.
+
+    `_approach_sides` and `_limit_jerk` limit this. Then the jerk along the velocity is reduced
+    until h' >= retained h for each of three barriers, where h' is the value of h one period later.
+    Along the unit vector of the velocity:
+
+        v, a      speed and acceleration of the setpoint
+        w         distance to the target
+        v_t, a_t  speed, φ v target, and acceleration of the target
+        B, C      deceleration and jerk that are planned with, within the limits of tool and joints
+        top       speed that is planned with, `slow` times the limit of tool and joints
+
+        stop      h = w + o - stop_distance(v, a, B, C)
+                  o    = stop_overshoot_m + stop_room v_p² / (2 hand_brake_mps2)
+                  v_p  = max(0, v_t + deceleration_lookahead_s min(a_t, 0))    predicted speed
+        meeting   h = w + stop_overshoot_m - stop_distance(v - v_t, a - a_t, M, C)
+                  M = max(B + min(a_t, 0), meeting_brake_least_share B)
+        speed     h = top - (v + a |a| / 2C)
+
+        retained = 1 - min(barrier_rate_per_s dt, barrier_time_s / dt)
+
+    In the stop, w grows by min(v_p, v) dt in a period. The meeting applies only while the setpoint
+    is faster than its target. The jerk is at least -C and, for stop and meeting, at least the one
+    with which the setpoint just comes to rest; below that one it would reverse.
+
+    Returns PLANNED if a barrier reduced the jerk, else 0.
+    """
+    config = parameters[0]
+    gains, dt = config.gains, config.period_s
+    max_speed = config.max_speed
+    speed, target_speed = norm(setpoint[1]), norm(target[1])
+    feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
+    for i in range(3):
+        jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
+        if feasible == 1.0:  # accelerations of a target beyond the speed limit are not followed
+            jerk[i] += gains[2] * target[2, i]
+        jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
+    _approach_sides(setpoint, parameters, box, jerk)
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    if speed <= LEAST_SPEED_MPS:
+        return 0
+    along = np.empty(3)
+    a = u = distance = v_target = a_target = 0.0
+    for i in range(3):
+        along[i] = setpoint[1, i] / speed
+        a += along[i] * setpoint[2, i]
+        u += along[i] * jerk[i]
+        distance += along[i] * (target[0, i] - setpoint[0, i])
+        v_target += along[i] * feasible * target[1, i]
+        a_target += along[i] * target[2, i]
+    brake = config.planned_brake_share * min(config.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
+    change = config.planned_brake_share * min(config.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
+    change = min(change, config.stop_jerk_error_m * gains[0])
+    top = slow * config.planned_speed_share * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
+    predicted_speed = max(0.0, v_target + config.deceleration_lookahead_s * min(a_target, 0.0))
+    overshoot = config.stop_overshoot_m + config.stop_room * predicted_speed * predicted_speed / (
+        2.0 * config.hand_brake_mps2
+    )
+    # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
+    now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
+    lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
+    # each barrier's distance shrinks at barrier_rate_per_s at most
+    retained = 1.0 - min(config.barrier_rate_per_s * dt, config.barrier_time_s / dt)
+    chosen = stopping(
+        distance + overshoot, min(predicted_speed, speed) * dt, speed, a, (brake, change), (u, lowest), retained, dt
+    )
+    faster, a_faster = speed - v_target, a - a_target
+    if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
+        meeting = max(brake + min(a_target, 0.0), config.meeting_brake_least_share * brake)
+        chosen = stopping(
+            distance + config.stop_overshoot_m, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
+        )
+    limit = top - retained * (top - now)
+    coasting = _coasting(speed, a, chosen, change, dt)
+    chosen = between(chosen, -change, coasting, _coasting(speed, a, -change, change, dt), limit)
+    if chosen >= u:
+        return 0
+    for i in range(3):
+        jerk[i] += (chosen - u) * along[i]
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    return PLANNED
+
+
+@compiled
+def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Vector) -> None:
+    """Limit the jerk (3,) so that the setpoint approaches the workspace's sides without passing.
+
+    With h the distance to the side, (d/dt + p)³ h >= 0, that is
+
+        jerk <= p³ h - 3 p² velocity - 3 p acceleration,    p = -gains[4] / 2.
+
+    A setpoint whose target lies on a side then comes to rest there. Without this limit, the tracker
+    would pass its target a little, begin the fastest stop each time, and oscillate. Beyond a side,
+    h is 0: the setpoint moves no farther out, and its targets bring it back.
+    """
+    config = parameters[0]
+    p = -0.5 * config.gains[4]
+    for i in range(3):
+        x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
+        damping = -3.0 * p * (p * v + a)
+        highest = max(p * p * p * max(box[1, i] - x, 0.0) + damping, -config.stop_jerk)
+        lowest = min(p * p * p * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk)
+        jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
+
+
+@compiled
+def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> float:
+    """Speed [m/s] when the acceleration has come to 0, after a period dt at a constant jerk.
+
+    v + dt (a + dt jerk / 2) + a' |a'| / (2 change),    a' = a + dt jerk
+    """
+    then = a + dt * jerk
+    return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
+
+
+@compiled
+def _largest(costs: Vector, motion: Vector) -> float:
+    """Largest share of a joint's limit that a tool motion (3,) needs: max over j |motion · cost_j|.
+
+    `costs` (3, J): share of each joint's limit for a unit of motion along each axis.
+    """
+    largest = 0.0
+    for joint in range(costs.shape[1]):
+        needed = costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
+        largest = max(largest, abs(needed))
+    return largest
+
+
+@compiled
+def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
+    """Scale the jerk (3,) down to the limits of tool and joints, in place.
+
+    First the acceleration after the period, a + dt jerk, is scaled to its limits, which gives the
+    jerk; then the jerk itself is scaled to its own.
+    """
+    config, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
+    for i in range(3):
+        ahead[i] = acceleration[i] + dt * jerk[i]
+    excess = max(norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] = (ahead[i] / excess - acceleration[i]) / dt
+    excess = max(norm(jerk) / config.max_jerk, _largest(costs[2], jerk))
+    if excess > 1.0:
+        for i in range(3):
+            jerk[i] /= excess
+
+
+@compiled
+def ready(
+    states: Records, heres: Records, arms: Records, parameters: Records, share: float, costs: Vector
+) -> tuple[float, float]:
+    """Write the `joint_costs` of tool motion. Returns the share of speed that `slow_down` allows,
+    and the setpoint's distance from the tool [m].
+    """
+    joint_costs(arms, heres, costs)
+    setpoint, tool = states[0].setpoint, heres[0].position
+    return slow_down(setpoint, tool, share, parameters), distance(setpoint[0], tool)
+
+
+@compiled
+def finish(states: Records, frames: Records, parameters: Records) -> None:
+    """Turn the orientation setpoint for one period, and write the setpoints into the frame."""
+    state, frame = states[0], frames[0]
+    turn_orientation(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
+    write(states, frames)
+
+
+@compiled
+def write(states: Records, frames: Records) -> None:
+    """Write the state's setpoints and gripper into the frame."""
+    state, frame = states[0], frames[0]
+    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
+    frame.setpoint_acceleration[:] = state.setpoint[2]
+    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
+    frame.gripper = state.gripper

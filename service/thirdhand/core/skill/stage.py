@@ -1,0 +1,149 @@
+"""The core's stage of the skill: predict the tool at each sample of a hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thirdhand.core.frame import Record, as_array, parameters
+from thirdhand.core.numerics import UNPRIMED_DECIDED
+from thirdhand.core.skill import ORDER, TURNS
+from thirdhand.core.skill.memory import recall, turn_lag_s
+from thirdhand.core.skill.model import Seen, Target, Wanted
+from thirdhand.core.skill.pose import NO_GRIPPER
+from thirdhand.core.skill.skill import (
+    NEVER,
+    Skill,
+    clamp,
+    reach_of,
+)
+from thirdhand.core.skill.step import (
+    IS_AMBIGUOUS,
+    IS_OUTSIDE,
+    conclude,
+    tell_stage,
+)
+from thirdhand.core.skill.task_clock import move
+from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
+from thirdhand.core.skill.unseen import deviation_m, off_m
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.settings.config import Settings
+
+
+class SkillStage:
+    """Skill in force; its prediction at the newest sample of a hand is kept in the state."""
+
+    def __init__(self, settings: Settings, skill: Skill, *, tuning: Tuning = TUNING) -> None:
+        self._hands = tuning.intake
+        self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
+        self._take(skill)
+
+    def _take(self, skill: Skill) -> None:
+        """Put a skill into force, with the time constant of the hands' memory that it needs."""
+        self.skill = skill
+        late_s = skill.model.delay_s - self._lead_s
+        delay_s = max(late_s, 0.0)
+        past, turns, still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
+        # `recall` writes to this; belief and clock are those of the state
+        self._seen = Seen(
+            np.empty((3, 6)), still, past, turns, turn_lag_s(late_s), np.empty((3, 6)), np.empty(0), self._period_s
+        )
+        self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
+        self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
+        self._clock, side = skill.model.clock_rows, skill.conductor
+        self._sides = np.array([0, 1] if side is None else [side, side])
+        regions = skill.regions
+        self._doubts = regions.alarm > 0.0 and bool(skill.model.names)
+        self.rules = parameters(
+            period_s=self._period_s,
+            end_share=self._hands.end_share,
+            mode_prior=self._hands.mode_prior,
+            mode_switch_rate=max(self._hands.mode_switch_rates_per_s),
+            lag_s=self._lag_s,
+            turn_lag_s=self._turn_lag_s,
+            late_s=late_s,
+            sides=self._sides,
+            workspace=skill.workspace,
+            reach=reach_of(self._reach),
+            scale=regions.scale,
+            std_s=regions.std_s,
+            ratios=regions.ratios,
+            alarm=regions.alarm,
+        )
+
+    def adopt(self, state: Record, skill: Skill) -> None:
+        """Replace the skill. The belief is kept if the new skill has the same via-points, the
+        memory of the hands if it has the same filters, and the clock if it has the same clock.
+        """
+        if skill.model.names != self.skill.model.names:
+            state["stage_belief"] = state["unprimed_belief"] = 0.0
+        before, turn_before_s = self.skill.model, self._turn_lag_s
+        if skill.model.clock != before.clock:
+            state["task_clock"] = 0.0
+        self._take(skill)
+        is_same = skill.model.remembers == before.remembers and skill.model.delay_s == before.delay_s
+        if not is_same or self._turn_lag_s != turn_before_s:
+            state["memory_ticks"] = -1
+        state["skill"] = np.frombuffer(skill.digest, np.uint8)
+        state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
+        state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
+
+    def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
+        """Request of the skill for the hands in the state, which must be known; `unseen` is the
+        side of a hand that is not seen now. Covariances and closure are computed at new samples
+        only. The doubt is the probability that the task did not begin at its first stage.
+        """
+        states, frames, rules = as_array(state), as_array(frame), self.rules
+        self._count(state)
+        seen = Seen(*self._seen[:6], state["stage_belief"], self._period_s, state["task_clock"])
+        is_new, before, known = recall(states, rules, seen), None, state["covariance"]
+        if not is_new:
+            before = (
+                known,
+                state["orientation_covariance"],
+                float(states["closure"][0]),
+                float(states["known_gate_m"][0]),
+            )
+        found = self.skill.predicted(seen, before)
+        if is_new:
+            state["known_gate_m"] = found.gate_m
+        off = 0.0
+        if unseen is not None:
+            columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
+            again = found.covariance, found.turn.covariance, found.closure, found.gate_m  # need not be computed
+            deviation = deviation_m(states, rules, unseen)
+            off = off_m(lambda hands: self.skill.predicted(hands, again).position, seen, columns, deviation)
+        doubt, unprimed = 0.0, state["unprimed_belief"]
+        if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
+            doubt = self.skill.model.elsewhere(seen.now, seen.stillness, self._period_s, seen.belief, unprimed)
+        outcome = conclude(states, frames, rules, found[:6], found.turn, found.closure, off, doubt)
+        target = Target(*found[:3], clamped=False)
+        if outcome & IS_OUTSIDE:
+            target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
+            frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
+        is_ambiguous = bool(outcome & IS_AMBIGUOUS)
+        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
+
+    def _count(self, state: Record) -> None:
+        """Advance the clock of the task to this tick, if the skill has one. While a hand is not
+        seen, it waits.
+        """
+        if self._clock is None:
+            return
+        before = int(state["memory_ticks"].max())
+        passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
+        move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
+
+    def set_stage(self, state: Record, name: str) -> None:
+        """Set the belief to the stage that begins at the via-point of this name (at the last
+        via-point, the stage that ends there). Unknown names are ignored.
+        """
+        if name in (names := self.skill.model.names):
+            state["stage_belief"], state["unprimed_belief"] = 0.0, UNPRIMED_DECIDED
+            state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
+
+    def nothing(self, state: Record, frame: Record) -> None:
+        """Write into the frame that nothing is predicted: the target is the setpoint."""
+        state["unsure"], state["sure_tick"] = 0, state["tick"]
+        frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
+        frame["closure"] = state["closure"]
+        tell_stage(as_array(state), as_array(frame))

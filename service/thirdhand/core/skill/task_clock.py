@@ -1,0 +1,201 @@
+"""Clock of a task, or of each of its stages: how long ago the hands began it.
+
+The clock t [s] starts when a hand first moves faster than CLOCK_START_MPS after rest. Over the time
+t' [s] it advances at a rate r, which follows its goal g with the time constant CLOCK_LAG_S:
+
+    dt/dt' = r,   dr/dt' = (g - r) / CLOCK_LAG_S
+
+* g = 1 for a clock that runs. g = 1 - s for a clock that waits, with the stillness s of the hand
+  that is less still.
+* g = 0 once t has reached `longest_s`, the end of the longest demonstration.
+* g = 0 once the hands have rested for `rest_s`, longer than in any demonstration. If the task may
+  be over then (t at least `over_s`), the next motion starts the clock anew. Otherwise the user has
+  paused, and the clock continues.
+* t = r = 0 once the hands have rested for `home_s` where demonstrations begin, or have come back to
+  where they rested before they began, longer than in any demonstration there. The task begins
+  again: the memory of the hands is that of hands that have always been there, no stage is known,
+  and the next motion starts the clock.
+* If the task has stages, the clock starts anew in each. When the most probable stage changes, or
+  after a rest of `rest_s` where the stage begins, the clock is set to 0, and starts with the next
+  motion.
+
+So the clock is continuous within a stage, and constant where nothing was demonstrated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.compiled import compiled
+from kmp.elementary import exp
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.numerics import MEMORY_STEP_S
+from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
+from thirdhand.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS, OWN_NEAR_M
+from thirdhand.core.vectors import norm, squared_distance
+
+CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE, PROGRESS, OWN_BEGIN = range(7)
+CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
+NOT_BEGUN, NEAR_BEGIN, GONE = 0.0, 1.0, 2.0  # progress: hands that rest, that moved, that left where they began
+WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
+LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
+
+
+class TaskClock(NamedTuple):
+    """Parameters of the clock of a skill."""
+
+    waits: bool  # true if the clock waits while both hands rest
+    # As an input, a second counts as this length [m], with stages as this share of a segment. With
+    # 0, the clock is no input, and only tells when a task begins again.
+    weight: float
+    longest_s: float  # the clock stops at this time
+    over_s: float  # from this time on the task may be over
+    rest_s: float  # a longer rest ends the task, or is a pause
+    home_s: float  # at most `rest_s`: after a longer rest near a begin the task begins again
+    near_m: float  # hands within this distance of `begin` are where demonstrations begin
+    begin: tuple[float, ...]  # (6,) [m] mean hands at the begin of the demonstrations
+
+    @property
+    def numbers(self) -> Vector:
+        """The parameters (13,) as one array, as compiled functions and a skill's file have them."""
+        return np.array([*self[:-1], *self.begin], np.float64)
+
+    def rows(self, begins: Vector) -> Vector:
+        """The parameters (K, 13) in each of K stages that begin with the hands `begins` (K, 6)
+        [m].
+        """
+        out = np.tile(self.numbers, (len(begins), 1))
+        out[:, BEGIN_AT:] = begins
+        return out
+
+    @staticmethod
+    def of(numbers: Iterable[float]) -> TaskClock:
+        """The clock with these `numbers`. Raises ValueError if they are no clock's."""
+        values = [float(number) for number in numbers]
+        if len(values) != BEGIN_AT + 6:
+            raise ValueError(f"task_clock has {len(values)} numbers, {BEGIN_AT + 6} needed")
+        waits, weight, longest_s, over_s, rest_s, home_s, near_m = values[:BEGIN_AT]
+        largest = (1.0, MOST_CLOCK_WEIGHT, *4 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
+        is_in_range = all(abs(value) <= most for value, most in zip(values, largest, strict=True))
+        if not is_in_range or min(values[:BEGIN_AT]) < 0.0:
+            raise ValueError(f"task_clock is {values}: numbers from 0 to {largest[:BEGIN_AT]} and a begin [m] needed")
+        return TaskClock(waits > 0.0, weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:]))
+
+
+@compiled
+def _are_near(hands: Vector, begin: Vector, near_m: float) -> bool:
+    """True if both hands (6,) [m] are within `near_m` [m] of where they are in `begin` (6,) [m]."""
+    for side in range(2):
+        part = slice(3 * side, 3 * side + 3)
+        if squared_distance(hands[part], begin[part]) > near_m**2:
+            return False
+    return True
+
+
+@compiled
+def _have_returned(hands: Vector, numbers: Vector, clock: Vector) -> bool:
+    """True if the hands (6,) [m] are where demonstrations begin, or again where they began."""
+    if _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
+        return True
+    return clock[PROGRESS] == GONE and _are_near(hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M))
+
+
+@compiled
+def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> bool:
+    """Advance a clock (12,) by one period `period_s` [s]; see the equations of this module. The
+    faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
+    `still`. Returns true if the task begins again.
+
+    `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, the
+    stage, the progress (NOT_BEGUN, NEAR_BEGIN or GONE), and where (6,) [m] these hands rested
+    before they began. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages
+    has one row.
+    """
+    numbers = rows[stage]
+    begins_again = False
+    if clock[CLOCK_STAGE] != stage:
+        clock[:CLOCK_STAGE] = 0.0
+        clock[CLOCK_STAGE] = stage
+
+    if clock[PROGRESS] == NOT_BEGUN and still > 0.5:
+        clock[OWN_BEGIN:] = hands
+    if speed > CLOCK_START_MPS:
+        if clock[PROGRESS] == NOT_BEGUN:
+            clock[PROGRESS] = NEAR_BEGIN
+        elif not _are_near(hands, clock[OWN_BEGIN:], OWN_NEAR_M):
+            clock[PROGRESS] = GONE
+        if clock[REST_LEFT_S] <= 0.0 and clock[CLOCK_S] >= numbers[OVER_AT]:
+            clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
+        clock[REST_LEFT_S] = numbers[REST_AT]
+    else:
+        before_s = clock[REST_LEFT_S]
+        clock[REST_LEFT_S] = max(before_s - period_s, 0.0)
+        has_rested = clock[REST_LEFT_S] <= numbers[REST_AT] - numbers[HOME_AT]
+        if before_s > 0.0 and has_rested and _have_returned(hands, rows[0], clock):
+            begins_again = True
+            clock[:CLOCK_STAGE] = 0.0
+            clock[PROGRESS] = NOT_BEGUN
+        elif before_s > 0.0 and clock[REST_LEFT_S] == 0.0 and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
+            clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
+
+    goal = 0.0
+    if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
+        goal = 1.0 - still if numbers[WAITS_AT] > 0.0 else 1.0
+    clock[CLOCK_RATE] += (1.0 - exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
+    clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
+    clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
+    return begins_again
+
+
+@compiled
+def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
+    """Advance the clock in the state by `count`, in the most probable stage; memory and belief end
+    where the task begins again. The speeds are those of the hands `sides` (2,) without their
+    tremor.
+    """
+    state, hands, speed, still, stage = states[0], np.empty(6), 0.0, 1.0, 0
+    for i in range(2):
+        hands[3 * i : 3 * i + 3] = state.hands[sides[i], 0]
+        speed = max(speed, norm(state.hand_velocity_lowpass[sides[i]]))
+        still = min(still, state.hand_stillness[sides[i]])
+    for k in range(len(rows)):
+        if state.stage_belief[k] > state.stage_belief[stage]:
+            stage = k
+    if count(hands, speed, still, passed_s, stage, rows, state.task_clock):
+        state.memory_ticks[:] = -1
+        state.stage_belief[:] = 0.0
+        state.unprimed_belief[:] = 0.0
+
+
+@compiled
+def _counted(moving: Vector, stages: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector) -> None:
+    clock = np.zeros(CLOCK_SIZE)
+    for t in range(len(moving)):
+        for step in range(steps if t else 0):
+            now = moving[t - 1] + (step + 1) / steps * (moving[t] - moving[t - 1])
+            count(now[:6], now[6], now[7], period_s / steps, stages[t], rows, clock)
+        out[t] = clock[CLOCK_S]
+
+
+def counted(
+    hands: Vector,
+    speeds: Vector,
+    stillness: Vector,
+    period_s: float,
+    rows: Vector,
+    stages: NDArray[np.int64] | None = None,
+) -> Vector:
+    """The clock (T,) [s] along hands (T, 6) [m], in the `stages` (T,). `speeds` (T,) [m/s] are
+    those of the faster hand, `stillness` (T,) is that of the less still one. `rows` are those of
+    `count`.
+    """
+    out, steps = np.empty(len(hands)), max(1, math.ceil(period_s / MEMORY_STEP_S))
+    if stages is None:
+        stages = np.zeros(len(hands), np.int64)
+    _counted(np.column_stack([hands, speeds, stillness]), stages, period_s, steps, rows, out)
+    return out

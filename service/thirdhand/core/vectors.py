@@ -1,0 +1,58 @@
+"""Compiled arithmetic on vectors (3,). Each sum starts from 0 and adds the axes in order, which
+fixes its last bit, which that of BLAS is not: it differs between processors.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kmp.compiled import compiled
+from thirdhand.core.frame import Vector
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    """Inner product a · b."""
+    total = 0.0
+    for i in range(3):
+        total += a[i] * b[i]
+    return total
+
+
+@compiled
+def square(a: Vector) -> float:
+    """Squared norm |a|²."""
+    return dot(a, a)
+
+
+@compiled
+def norm(a: Vector) -> float:
+    """Euclidean norm |a|."""
+    return math.sqrt(dot(a, a))
+
+
+@compiled
+def times(matrix: Vector, vector: Vector) -> Vector:
+    """Product (N,) of a matrix (N, M) and a vector (M,)."""
+    product = np.zeros(len(matrix))
+    for row in range(len(matrix)):
+        for column in range(len(vector)):
+            product[row] += matrix[row, column] * vector[column]
+    return product
+
+
+@compiled
+def squared_distance(a: Vector, b: Vector) -> float:
+    """|a - b|²."""
+    total = 0.0
+    for i in range(3):
+        total += (a[i] - b[i]) ** 2
+    return total
+
+
+@compiled
+def distance(a: Vector, b: Vector) -> float:
+    """|a - b|."""
+    return math.sqrt(squared_distance(a, b))

@@ -1,0 +1,290 @@
+"""The daemon's subscribers and publishers of its cell's streams."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from statistics import median
+from typing import Any
+
+import numpy as np
+import zenoh
+from zenoh.handlers import RingChannel
+
+from thirdhand.client import publisher
+from thirdhand.contract import cdr, channels, ros2
+from thirdhand.contract.joint_states import JointStates
+from thirdhand.contract.messages import JointState, PoseStamped, WireError
+from thirdhand.contract.records import SIDES
+from thirdhand.core.frame import Event, Frame, Record
+from thirdhand.daemon.ros2_domain import Ros2Domain
+from thirdhand.settings.config import Settings
+
+KEPT_DELAYS = 256  # the delays of this many messages are stored
+CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
+HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
+TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
+EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
+LEAP_STEPS = 5.0  # a hand that was lost appears this many steps away; one that rested goes on from where it was
+SMOOTH_SHARE = 0.05  # of the median step: with noise, one step in 10 000 is as small
+LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
+ARM_STATE = "joints/state"
+CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
+    ARM_STATE: lambda settings: settings.arm.source == "state",
+    "joints/guided": lambda settings: settings.arm.source == "state",
+    "clutch": lambda settings: settings.hands.clutch == "key",
+    "gripper/wish": lambda settings: settings.hands.gripper == "key",
+}
+# After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
+MAX_ARRIVALS = 4  # messages of a hand
+MAX_JOINT_STATES = 16  # messages of the arm's topic, on which grippers and other parts may publish too
+MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
+
+
+class Arrivals:
+    """Statistics of the messages received on one channel. The loop writes, other threads read."""
+
+    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "why")
+
+    def __init__(self) -> None:
+        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, arrival - stamp [ns]
+        self.count = self.malformed = self.frozen = self.at_ns = 0
+        self.newest: PoseStamped | JointState | None = None
+        self.why = ""
+
+    def take(self, message: PoseStamped | JointState | bool | float, at_ns: int) -> None:
+        """Note a message and its arrival by the system clock [ns]; of a clutch, a wish or a
+        report of guiding, which have no stamp, only that it arrived.
+        """
+        if isinstance(message, PoseStamped | JointState):
+            self.newest, self.at_ns = message, at_ns
+            self._delays.append((message.stamp_ns, at_ns - message.stamp_ns))
+        self.count += 1
+
+    def held_up_s(self, accepted_ns: int, stamp_ns: int) -> float | None:
+        """Extra delay [s] of the message stamped `accepted_ns`, compared with the later message
+        stamped `stamp_ns`; None if a clock was set between them.
+
+        No delay is shorter than the minimum: a message with a shorter delay has a stamp from a
+        clock that was set. Before the first messages, the minimum delay is assumed to be 0.
+        """
+        delays = tuple(self._delays)
+        stamps = [stamp for stamp, _ in delays]
+        if accepted_ns not in stamps or stamp_ns not in stamps:
+            return None
+        accepted = stamps.index(accepted_ns)
+        min_delay_ns = min((delay for _, delay in delays[:accepted]), default=0)
+        delay_ns = delays[stamps.index(stamp_ns)][1]
+        held_up_ns = delays[accepted][1] - delay_ns
+        is_delay = held_up_ns > HELD_UP_NS and delay_ns > min_delay_ns - CLOCK_STEP_NS
+        return held_up_ns / 1e9 if is_delay else None
+
+    def batches_ms(self, accepted_ms: float) -> float:
+        """Interval [ms] of the batches in which messages arrive: the median of the pauses between
+        arrivals that are longer than accepted; 0 with fewer than three of them.
+        """
+        arrivals_ms = np.array([stamp_ns + delay_ns for stamp_ns, delay_ns in tuple(self._delays)]) / 1e6
+        pauses_ms = np.diff(arrivals_ms)
+        long_ms = pauses_ms[pauses_ms > accepted_ms]
+        return float(np.median(long_ms)) if len(long_ms) >= LEAST_BATCHES else 0.0
+
+    def is_set_back(self, accepted_ns: int) -> bool:
+        """True if all messages after the one stamped `accepted_ns` are stamped before it, and there
+        are several: the source's clock was set back. A second source would take turns with it.
+        """
+        stamps = [stamp for stamp, _ in tuple(self._delays)]
+        later = stamps[stamps.index(accepted_ns) + 1 :] if accepted_ns in stamps else []
+        return len(later) > 1 and max(later) < accepted_ns
+
+    def refuse(self, why: str) -> None:
+        """Note bytes that cannot be decoded, and the reason."""
+        self.why = why
+        self.count += 1
+        self.malformed += 1
+
+
+class FrozenHand:
+    """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
+
+    A program's hands rest exactly: repeated poses are accepted if the hand came to rest smoothly,
+    or if most rests so far began with its stream or ended without a leap, as `learn` does in takes.
+    """
+
+    def __init__(self) -> None:
+        self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
+        self._steps: deque[float] = deque(maxlen=50)  # distances between poses that differ, in the tracker's unit
+        self._repeated_ns = 0  # stamp of its newest repetition
+        self._varies_since_ns = 0  # stamp since which each sample differs from the one before
+        self._is_tracked = False
+        self._rests = self._leaps = 0
+
+    def is_frozen(self, pose: PoseStamped) -> bool:
+        """True if a sample repeats the pose of a lost hand."""
+        before = self._pose
+        if before is None:
+            self._varies_since_ns = pose.stamp_ns
+        elif (pose.position, pose.orientation) == (before.position, before.orientation):
+            self._repeated_ns = self._varies_since_ns = pose.stamp_ns
+            lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
+            if not self._is_tracked or lasts_s < FROZEN_S or 2 * self._leaps < self._rests:
+                return False
+            return self._steps[-1] > SMOOTH_SHARE * median(self._steps)
+        else:
+            step = math.dist(pose.position, before.position)
+            if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
+                self._rests += 1
+                self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
+            self._steps.append(step)
+            self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)  # its clock may be set back
+            self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
+        self._pose = pose
+        self._repeated_ns = pose.stamp_ns
+        return False
+
+
+class CellStreams:
+    """A cell's subscribers and publishers, also in the ROS 2 domain if its settings name one.
+
+    `receive` and `publish` are for the loop. Each message is counted in `arrivals`, by channel;
+    `failed` is called with the message of an error on another thread.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        settings: Settings,
+        *,
+        arrivals: Mapping[str, Arrivals],
+        failed: Callable[[str], None],
+    ) -> None:
+        cell, domain = settings.cell, settings.network.ros2_domain
+        self._arrivals = arrivals
+        self.newest: dict[str, Event] = {}
+        self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
+        self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
+        inputs = [channel.key for channel in heard(settings)]
+        keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
+        if domain is not None:
+            topics = ros2.heard(cell, settings.ros2, inputs)
+            keys += [(one.channel, ros2.key(domain, one)) for one in topics if not one.frame]
+            for one in (topic for topic in topics if topic.frame):
+                frames.setdefault(ros2.key(domain, one), {})[one.frame] = one.channel
+            topics += [ros2.of_channel(cell, channel) for channel in ros2.SAID]
+            topics += [one for one in ros2.of_settings(settings.ros2) if not one.heard]
+        self._subscribers = [
+            (suffix, session.declare_subscriber(key, RingChannel(_most(suffix)))) for suffix, key in keys
+        ]
+        remote = zenoh.Locality.REMOTE  # the cell may publish frames of its own on the same topic
+        self._transforms = [
+            (by_frame, session.declare_subscriber(key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote))
+            for key, by_frame in frames.items()
+        ]
+        self._publishers = {
+            channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
+            for channel in channels.CHANNELS
+            if channel.direction == "out"
+        }
+        self._sent = Counter[str]()  # messages by channel
+        self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
+
+    def receive(self) -> list[Event]:
+        """The hands' messages since the last call, and the newest state of the arm. Messages that
+        cannot be decoded are counted.
+        """
+        events: list[Event] = []
+        for suffix, source in self._subscribers:
+            waiting = _waiting(source, _most(suffix))
+            arrived = [event for sample in waiting if (event := self._decoded(suffix, sample.payload))]
+            events += arrived[-1:] if suffix == ARM_STATE else arrived
+        for by_frame, source in self._transforms:
+            for suffix, poses in self._poses(by_frame, source).items():
+                encoded = map(cdr.encode_pose, poses[-MAX_ARRIVALS:])
+                events += [event for payload in encoded if (event := self._decoded(suffix, payload))]
+        return events
+
+    def _poses(self, by_frame: Mapping[str, str], source: Any) -> dict[str, list[PoseStamped]]:
+        """The poses by channel in the messages of a topic of transforms. Only the newest messages
+        with a frame of `by_frame` are decoded: most are of other nodes.
+        """
+        payloads = [sample.payload.to_bytes() for sample in _waiting(source, MAX_TRANSFORM_MESSAGES)]
+        named = [(one, [frame for frame in by_frame if cdr.bytes_of_frame(frame) in one]) for one in payloads]
+        found: dict[str, list[PoseStamped]] = {}
+        for payload, frames in [one for one in named if one[1]][-MAX_ARRIVALS:]:
+            try:
+                for frame, pose in cdr.decode_transforms(payload, tuple(by_frame)):
+                    found.setdefault(by_frame[frame], []).append(pose)
+            except WireError as error:
+                for frame in frames:
+                    self._arrivals[by_frame[frame]].refuse(str(error))
+        return found
+
+    def _decoded(self, suffix: str, raw: Any) -> Event | None:
+        channel, arrivals = channels.BY_KEY[suffix], self._arrivals[suffix]
+        try:
+            if len(raw) > cdr.MAX_BYTES:
+                raise WireError(f"{len(raw)} bytes, at most {cdr.MAX_BYTES} accepted")
+            payload, at_ns = bytes(raw), time.time_ns()
+            message = channel.codec.decode(payload)
+            if suffix == ARM_STATE:
+                now_s = time.monotonic()
+                state = self._joints.take(message, now_s) or self._joints.incomplete(message, now_s)
+                if state is None:
+                    return None
+                if state is not message:
+                    message, payload = state, cdr.encode_joints(state)
+            arrivals.take(message, at_ns)
+            hand = self._frozen.get(suffix)
+            if hand and hand.is_frozen(message):
+                arrivals.frozen += 1
+                return None
+            event = self.newest[suffix] = Event(suffix, payload, message)
+            return event
+        except WireError as error:
+            arrivals.refuse(str(error))
+            return None
+
+    def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Publish on a channel; a message that cannot be sent at once is dropped."""
+        one, number = self._publishers[suffix], self._sent[suffix]
+        self._sent[suffix] += 1
+        one.put(payload, attachment=attachment, source_info=zenoh.SourceInfo(one.id, number % channels.MESSAGE_NUMBERS))
+        if self._ros2 is not None:
+            self._ros2.publish(suffix, payload)
+
+    def show(self, frame: Frame, state: Record) -> None:
+        """Publish the frames of arm, hands and target for RViz and similar tools. Not for the
+        loop.
+        """
+        if self._ros2 is not None:
+            self._ros2.show(frame, state)
+
+    @property
+    def is_followed(self) -> bool:
+        """True if the commands have a subscriber."""
+        return bool(self._publishers["joints/command"].matching_status.matching)  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        """End the threads beside the loop."""
+        if self._ros2 is not None:
+            self._ros2.close()
+
+
+def heard(settings: Settings) -> list[channels.Channel]:
+    """The input channels of the loop that a cell with these settings subscribes to."""
+    return [c for c in ros2.HEARD if c.key not in CONFIGURED or CONFIGURED[c.key](settings)]
+
+
+def _most(suffix: str) -> int:
+    """Largest number of messages of a channel that are read in one tick."""
+    return MAX_JOINT_STATES if suffix == ARM_STATE else MAX_ARRIVALS
+
+
+def _waiting(source: Any, most: int) -> Iterator[zenoh.Sample]:
+    """The samples that wait in a ring, at most this number."""
+    for _ in range(most):
+        if (sample := source.try_recv()) is None:
+            return
+        yield sample

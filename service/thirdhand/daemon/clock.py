@@ -1,0 +1,206 @@
+"""The daemon's clock: phase-locked deadlines, real-time scheduling if the system grants it, and
+statistics of lateness.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from thirdhand.contract.requests import Percentiles
+from thirdhand.core.frame import Vector
+
+SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
+PREPARING_NS = 430_000  # the next tick is prepared within this time, which is that of a tick
+PREPARE_NS = 3 * PREPARING_NS // 2  # preparation begins this long before the deadline
+BESIDE_NS = 300_000  # work beside the loop is done in parts, most of which take less
+NO_TICK_S = 0.02  # work beside a loop that does not tick is done after this time
+STEP_NS = 20_000_000  # a larger difference from the system clock shows that the clock was set
+READ_NS = 1_000_000  # two clocks that were read within this time are compared
+DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
+CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
+_LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
+FIFO_PRIORITY = 80  # priority of the loop
+BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
+
+
+class Deadlines:
+    """Deadlines at a fixed rate since start.
+
+    Missed deadlines are skipped and counted; there is no burst to make up for them. `stamp_ns` is
+    the time of the newest deadline on the system clock [ns], and always grows. It advances by whole
+    periods and follows the system clock slowly. If the clock was set ahead, it follows at once; if
+    the clock was set back, it grows by CREEP_NS per deadline until the clock has passed it.
+    """
+
+    def __init__(
+        self,
+        rate_hz: int,
+        *,
+        spin_ns: int = 0,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        wall_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.period_ns = 1_000_000_000 // rate_hz
+        self.missed = 0
+        self._spin_ns = spin_ns
+        self._now_ns = now_ns
+        self._wall_ns = wall_ns
+        self._sleep = sleep
+        self._start_ns = now_ns()
+        self.stamp_ns = wall_ns() - self.period_ns
+        self._index = -1
+        self._sleeps_until_ns = 0
+        self._is_in_tick = threading.Lock()  # locked by `between_ticks`, released at the end of a tick
+
+    def between_ticks(self) -> None:
+        """Wait, on another thread, until the loop sleeps for at least BESIDE_NS more, or has just
+        begun to sleep.
+
+        A thread that holds the interpreter lock when the loop wakes delays it. Only one thread may
+        use this.
+        """
+        if self._now_ns() > self._sleeps_until_ns - BESIDE_NS:
+            self._is_in_tick.acquire(blocking=False)
+            self._is_in_tick.acquire(timeout=NO_TICK_S)
+
+    def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
+        """Wait for the next deadline and return its number and lateness [ns].
+
+        `prepare` is called PREPARE_NS before the deadline, unless it would end after it.
+        """
+        index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
+        passed = index - self._index
+        self.missed += passed - 1
+        self._index = index
+        deadline = self._start_ns + index * self.period_ns
+        self._sleeps_until_ns = deadline - (self._spin_ns if prepare is None else PREPARE_NS)
+        if self._is_in_tick.locked():
+            self._is_in_tick.release()
+        if prepare is not None:
+            self._sleep_until(deadline - PREPARE_NS)
+            if self._now_ns() < deadline - PREPARING_NS:
+                prepare()
+        self._sleep_until(deadline - self._spin_ns)
+        while (late := self._now_ns() - deadline) < 0:
+            pass
+        due = self.stamp_ns + passed * self.period_ns
+        off = self._wall_ns() - late - due
+        if -STEP_NS < off < STEP_NS:
+            self.stamp_ns = due + off // DRAW
+        else:
+            self.stamp_ns = due + off if off > 0 else self.stamp_ns + CREEP_NS
+        return index, late
+
+    def _sleep_until(self, at_ns: int) -> None:
+        """Sleep until a time [ns], unless it has passed."""
+        early = at_ns - self._now_ns()
+        if early > 0:
+            self._sleep(early / 1e9)
+
+    def rate_hz(self) -> float:
+        """Achieved ticks per second since start."""
+        elapsed = self._now_ns() - self._start_ns
+        return round((self._index + 1 - self.missed) * 1e9 / elapsed, 3) if elapsed > 0 else 0.0
+
+
+class SystemClock:
+    """The system clock, watched for steps against the monotonic one."""
+
+    def __init__(
+        self, *, now_ns: Callable[[], int] = time.monotonic_ns, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._now_ns, self._wall_ns = now_ns, wall_ns
+        self._apart_ns: int | None = None
+
+    def set_by(self) -> str:
+        """How far the clock was set since the last call, in words; empty if it was not.
+
+        A reading that took long, because others ran meanwhile, is left to the next call.
+        """
+        begin_ns = self._now_ns()
+        apart_ns = self._wall_ns() - begin_ns
+        if self._now_ns() - begin_ns > READ_NS:
+            return ""
+        set_ns = 0 if self._apart_ns is None else apart_ns - self._apart_ns
+        self._apart_ns = apart_ns
+        if -STEP_NS < set_ns < STEP_NS:
+            return ""
+        size = f"by {abs(set_ns) / 1e9:.2f} s"
+        return f"ahead {size}, or the machine was suspended meanwhile" if set_ns > 0 else f"back {size}"
+
+
+class Granted(NamedTuple):
+    """The requests of the loop that the operating system granted."""
+
+    realtime: bool  # real-time scheduling of the thread
+    locked: bool  # memory pages of the process remain in memory once they are used
+
+
+def ask_for_real_time() -> Granted:
+    """Request real-time scheduling for this thread and locked memory, and return what was granted.
+
+    Existing objects are exempted from garbage collection in any case, and it is enabled.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.enable()
+    sys.setswitchinterval(0.0005)
+    return Granted(_scheduled(), _locked())
+
+
+def _scheduled() -> bool:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except (PermissionError, AttributeError, OSError):
+        return False
+    return True
+
+
+def _locked() -> bool:
+    try:
+        return bool(ctypes.CDLL(None).mlockall(_LOCK_TOUCHED_PAGES) == 0)
+    except (OSError, AttributeError):
+        return False
+
+
+def run_beside_real_time() -> None:
+    """Schedule this thread before other processes, if granted: if it is preempted while it holds
+    the interpreter lock, it delays the loop.
+    """
+    with contextlib.suppress(PermissionError, AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
+
+
+class Window:
+    """A buffer of the last values of a quantity, written by one thread and read by another."""
+
+    def __init__(self, length: int) -> None:
+        self._values: Vector = np.zeros(length)
+        self._count = 0
+
+    def add(self, value: float) -> None:
+        """Add a value."""
+        self._values[self._count % len(self._values)] = value
+        self._count += 1
+
+    def largest(self, count: int) -> float:
+        """The largest of the `count` newest values; 0 while the window is empty."""
+        newest = self._values.take(range(self._count - min(count, self._count), self._count), mode="wrap")
+        return float(newest.max(initial=0.0))
+
+    def percentiles(self) -> Percentiles:
+        """Median, 99th percentile and maximum over the window; zeros while the window is empty."""
+        if not self._count:
+            return Percentiles()
+        return Percentiles(*np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist())

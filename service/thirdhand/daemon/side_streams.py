@@ -1,0 +1,77 @@
+"""Messages that the loop does not need, passed on to recording and viewers beside it: objects on
+the bench, and images of other programs.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from thirdhand.contract import channels
+from thirdhand.contract.images import image_in
+from thirdhand.contract.messages import WireError
+from thirdhand.contract.requests import encode_json
+from thirdhand.daemon.cell_streams import Arrivals
+from thirdhand.scribe.scribe import Scribe
+from thirdhand.settings.config import Settings
+
+OBJECTS_KEY = "objects"
+WAITING_IMAGES = 32  # of each key between two polls; beyond it, the oldest are left out
+
+
+class SideStream:
+    """A subscriber that passes the newest messages on one key, and their times [ns], to `take`, and
+    counts them in `arrivals`, also those of which `take` raises WireError. Between two polls,
+    `waiting` messages are kept.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        take: Callable[[bytes, int], object],
+        arrivals: Arrivals,
+        *,
+        waiting: int = 1,
+    ) -> None:
+        self._subscriber = session.declare_subscriber(key, RingChannel(waiting))
+        self._take, self._arrivals, self._waiting = take, arrivals, waiting
+
+    def poll(self, now_ns: int) -> None:
+        """Pass on the messages that arrived since the last call, with the time now [ns]."""
+        for _ in range(self._waiting):
+            if (sample := self._subscriber.try_recv()) is None:
+                return
+            try:
+                self._take(sample.payload.to_bytes(), now_ns)
+                self._arrivals.count += 1
+            except WireError as error:
+                self._arrivals.refuse(str(error))
+
+
+def side_keys(settings: Settings) -> list[str]:
+    """The channel of a cell's objects, and the keys of images in `[recording] also`."""
+    return [OBJECTS_KEY, *settings.recording.also]
+
+
+def side_streams(
+    session: zenoh.Session, settings: Settings, scribe: Scribe, arrivals: Mapping[str, Arrivals]
+) -> list[SideStream]:
+    """The streams on `side_keys`, counted in `arrivals`."""
+
+    def note_objects(payload: bytes, now_ns: int) -> None:
+        found = channels.BY_KEY[OBJECTS_KEY].codec.decode(payload)
+        scribe.note(OBJECTS_KEY, encode_json(found).decode(), now_ns)
+
+    def record_image(key: str, payload: bytes, now_ns: int) -> None:
+        scribe.image(key, image_in(payload, now_ns), now_ns)
+
+    objects = SideStream(session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY])
+    images = {key: functools.partial(record_image, key) for key in settings.recording.also}
+    return [
+        objects,
+        *(SideStream(session, key, take, arrivals[key], waiting=WAITING_IMAGES) for key, take in images.items()),
+    ]

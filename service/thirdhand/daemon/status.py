@@ -1,0 +1,247 @@
+"""The status of a cell: what its newest frame decided, and why, in words with figures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thirdhand.contract.evidence import (
+    Evidence,
+    Inside,
+    Outside,
+    Stuck,
+    explained,
+)
+from thirdhand.contract.incidents import MALFORMED, word
+from thirdhand.contract.messages import Vector3
+from thirdhand.contract.records import (
+    GONE_S,
+    SIDES,
+    Flag,
+    Mode,
+    Reason,
+)
+from thirdhand.contract.requests import Source, Status
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.codes import READY, RETURNING
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Frame, Record
+from thirdhand.core.geometry import off_target
+from thirdhand.core.separation.clearance import NEAR_ITSELF
+from thirdhand.core.separation.stage import Separation
+from thirdhand.core.skill.model import standard_deviations
+from thirdhand.core.skill.pose import CLOSED, OPEN
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.task_clock import CLOCK_S
+from thirdhand.core.tool_limits import binding
+from thirdhand.core.tuning import TUNING
+from thirdhand.daemon.input_monitor import KEY_OF_SOURCE
+from thirdhand.settings.config import Settings
+from thirdhand.skills.corrections import offer_of
+
+MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
+AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
+
+
+class CellStatus(NamedTuple):
+    """The newest frame, the controller and its state, the streams of input, and the last failure of
+    the service, from which a status is made.
+    """
+
+    frame: Frame
+    controller: Controller
+    state: Record
+    sources: dict[str, Source]
+    settings: Settings
+    failure: str = ""
+    inside: Inside | None = None  # what an arm that is not ready is inside of
+    busy: str = ""  # signs of a busy machine when the arm stopped
+    clutch: str = ""  # the problem with the clutch's messages
+    streams: Mapping[str, Source] = MappingProxyType({})  # other input, by key
+
+    def status(self, **more: Any) -> Status:
+        """The status; `more` are the fields that the core does not know."""
+        frame, sources, settings = self.frame, self.sources, self.settings
+        begun, seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
+        skill, (mode, reason) = self.controller.skill, outcome(frame)
+        flags, seen_now = Flag(int(frame["flags"])), self.evidence()
+        why = explained(Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now)
+        faulty = [(key, stream) for key, stream in self.streams.items() if stream.cause]
+        because = [f"what arrives on {key} is {stream.cause}: {stream.refused}" for key, stream in faulty]
+        low, high = skill.demonstrated
+        return Status(
+            cell=settings.cell,
+            mode=word(mode),
+            reason=word(reason) if begun else "",
+            because="; ".join(filter(None, [why.why, *because])),
+            remedy="; ".join(filter(None, dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)]))),
+            flags=tuple(map(word, flags)),
+            tick=int(frame["tick"]),
+            skill=skill.name,
+            residual_risk=skill.residual_risk,
+            hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
+            places=tuple(point.name for point in skill.via_points),
+            rejected=_by_cause({**sources, **self.streams}),
+            sources=sources,
+            streams=dict(self.streams),
+            frames=settings.tracker_frames,
+            trackers={
+                frame: settings.hands_in(frame).base_from_tracker
+                for frame in (settings.hands.frame, *settings.trackers)
+            },
+            joints=settings.joints.names,
+            hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
+            hand_distance_m=round(float(frame["hand_distance"]), 4),
+            hand_limit_m_s=round(float(frame["hand_limit"]), 4),
+            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
+            below_table_m={
+                side: depth_m for i, side in enumerate(SIDES) if seen[i] and (depth_m := self._below_table_m(i))
+            },
+            demonstrated_m={
+                side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
+            },
+            hands_at_m={name: (_point(at[:3]), _point(at[3:])) for name, at in _hands_at(skill)},
+            tool_m=_point(frame["tool"]) if begun else None,
+            setpoint_m=_point(frame["setpoint"]) if begun else None,
+            target_m=_point(frame["target"]) if aimed else None,
+            std_m=_std(frame["covariance"]) if aimed else None,
+            turn_off_rad=self._turned() if aimed else None,
+            turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
+            gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
+            closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
+            stage=skill.model.names[frame["stage"] : frame["stage"] + 2] if frame["stage_belief"] else (),
+            stage_belief=round(float(frame["stage_belief"]), 3),
+            task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
+            if skill.model.clock and skill.model.clock.weight
+            else None,
+            error_probability=round(float(frame["error_probability"]), 4) if aimed else None,
+            deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
+            threshold_m=round(skill.threshold, 5),
+            guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
+            offer=offer_of(skill),
+            binding=next((name for name, _ in binding(settings, np.asarray(frame).reshape(1))), "") if begun else "",
+            **more,
+        )
+
+    def _below_table_m(self, side: int) -> float:
+        """Depth of a hand below the table top [m]; 0 above it and beside it."""
+        x, y, z = (self.frame["hands"][side] - np.array(self.settings.table.centre)).tolist()
+        half_x, half_y = self.settings.table.half_size
+        return round(max(0.0, -z), 4) if abs(x) < half_x and abs(y) < half_y else 0.0
+
+    def _turned(self) -> float:
+        """Angle between the tool and its target, or between their directions [rad]."""
+        tool, target = self.frame["tool_orientation"], self.frame["orientation"]
+        return round(float(off_target(tool, target, direction=self.settings.tool.orientation == "direction")), 5)
+
+    def evidence(self) -> Evidence:
+        """The figures of the incidents that may be explained."""
+        settings, skill, (error_rad, speed) = self.settings, self.controller.skill, self.controller.decision.measured
+        errors = np.abs(self.frame["joints"] - self.state["measured"])
+        worst = int((errors / np.array(settings.joints.per_rad)).argmax())
+        limit = settings.tool.fault_speed
+        return Evidence(
+            sources={name: source for name, source in self.sources.items() if not self._is_unneeded(name, source)},
+            settings=settings,
+            contested=TUNING.intake.contested_off_share,
+            scatter_mm=1e3 * TUNING.intake.scatter_on_m,
+            gate_m=(float(self.frame["gate_m"]), skill.threshold),
+            measure=skill.model.measure,
+            outside=self._outside(),
+            inside=self.inside,
+            stuck=self._stuck() if self.state["stuck"] else None,
+            error_rad=(error_rad, settings.arm.fault_error_rad),
+            worst_joint=(settings.joints.names[worst], float(errors[worst]), settings.joints.units[worst]),
+            measured_speed=(speed, limit) if speed > limit else None,
+            commanded_speed=(speed, settings.tool.max_speed),
+            failure=self.failure,
+            clutch=self.clutch,
+            busy=self.busy,
+        )
+
+    def _is_unneeded(self, name: str, source: Source) -> bool:
+        """True for a hand that the skill does not need, and that has disappeared."""
+        side, gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
+        return side is not None and name in SIDES and name != SIDES[side] and gone
+
+    def _outside(self) -> Outside | None:
+        """The first joint outside its limits, if the arm moves back into them."""
+        joints, measured = self.settings.joints, self.state["measured"].tolist()
+        found = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
+        returning = int(self.state["arm_ready"]) == RETURNING
+        return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
+
+    def _stuck(self) -> Stuck:
+        """Joints that keep the tool from its target, and the way out."""
+        joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
+        at_limits = [
+            name
+            for name, at, low, high, per_rad in zip(
+                joints.names, q, joints.lower, joints.upper, joints.per_rad, strict=True
+            )
+            if min(at - low, high - at) < AT_LIMIT_RAD * per_rad
+        ]
+        off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
+        count = int(state["way_count"])
+        return Stuck(off_m, tuple(at_limits), min(int(state["way_next"]) + 1, count), count)
+
+
+class MeasuredArm:
+    """The pose of the arm at the joints that were measured last."""
+
+    def __init__(self, settings: Settings, urdf: str) -> None:
+        self._period_s, self._names = settings.period_s, settings.joints.names
+        # Own copies, because the loop uses its arm and separation at the same time.
+        self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
+
+    def inside(self, state: Record) -> Inside | None:
+        """What an arm that is not ready is inside of; None: nothing."""
+        if state["arm_ready"] == READY or state["arm_tick"] < 0:
+            return None
+        depth_m, joint, thing = self._separation.intrusion(state["measured"].copy())
+        if depth_m <= 0.0:
+            return None
+        things = {0: "the table", NEAR_ITSELF: "another part of the arm"}
+        return Inside(self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m)
+
+    def position(self, state: Record) -> Vector3 | None:
+        """The tool's position [m] in frame `base`; None if the measured joints are too old."""
+        if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= MAX_MEASURED_AGE_S:
+            return None
+        return _point(self._arm.at(state["measured"].copy()).position)
+
+
+def outcome(frame: Frame) -> tuple[Mode, Reason]:
+    """Mode and reason of a frame."""
+    return Mode(int(frame["mode"])), Reason(int(frame["reason"]))
+
+
+def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
+    """Rejected messages of all streams by cause; malformed ones by their key too."""
+    counts: Counter[str] = Counter()
+    for name, source in sources.items():
+        for cause, count in source.rejected.items():
+            counts[f"{MALFORMED} {KEY_OF_SOURCE.get(name, name)}" if cause == MALFORMED else cause] += count
+    return counts
+
+
+def _std(covariance: Any) -> float:
+    return round(float(standard_deviations(covariance)), 5)
+
+
+def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
+    """Names and hands (6,) [m] of the learned via-points, in the order of the task; for a skill
+    without via-points, one unnamed pair of demonstrated hands.
+    """
+    hands = skill.model.hands
+    found = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    return [(name, at) for name, at in found if np.isfinite(at).all()]
+
+
+def _point(values: Any) -> Vector3:
+    x, y, z = (round(v, 4) for v in values.tolist())
+    return x, y, z

@@ -1,0 +1,115 @@
+"""Demonstrations in a skill's file, from which the skill can be refined: a compressed .npz archive
+within the skill's.
+
+They are kept at up to KEPT_HZ, or less often if they are more than MOST_KEPT samples in all, as
+each recording holds the skill; in single precision, 0.3 µm at 5 m. The motion of hands has no more
+than about 10 Hz. The archive holds a JSON text about each demonstration, and for all of them
+the stamps (T,) [ns], poses (T, 21) of left hand, right hand and tool, and closures (T,).
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from thirdhand.contract.explain import in_words, validated
+from thirdhand.contract.printable import printable
+from thirdhand.contract.requests import Hands, ViaPoint
+from thirdhand.skills.demonstration import Demonstration, NamedDemonstration, check
+from thirdhand.skills.skill_file import SkillError, StoredSkill, arrays_in
+
+KEPT_HZ = 50.0
+MOST_KEPT = 50_000  # 5 MB
+REMEDY = "learn it anew from its demonstrations with this version, or learn from all demonstrations without --from"
+
+
+class _About(msgspec.Struct, frozen=True, kw_only=True):
+    """A demonstration but for its samples."""
+
+    name: str
+    samples: int
+    frame: str
+    places: tuple[ViaPoint, ...]
+    conducts: Hands
+    person: str
+    begins: tuple[int, ...]
+    has_gripper: bool
+
+
+def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
+    """The demonstrations as bytes."""
+    kept_hz = min(KEPT_HZ, MOST_KEPT / sum(one.period_s * len(one.stamps_ns) for _, one in demonstrations))
+    thin = [(name, one.every(max(1, int(1.0 / (kept_hz * one.period_s) + 1e-6)))) for name, one in demonstrations]
+    about = [
+        _About(
+            name=name,
+            samples=len(one.stamps_ns),
+            frame=one.frame,
+            places=one.places,
+            conducts=one.conducts,
+            person=one.person,
+            begins=one.begins,
+            has_gripper=one.gripper is not None,
+        )
+        for name, one in thin
+    ]
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        about=np.frombuffer(msgspec.json.encode(about), np.uint8),
+        stamps=np.concatenate([one.stamps_ns for _, one in thin]),
+        poses=np.concatenate([np.hstack([one.left, one.right, one.tool]) for _, one in thin]).astype(np.float32),
+        closures=np.concatenate(
+            [np.zeros(len(one.stamps_ns)) if one.gripper is None else one.gripper for _, one in thin]
+        ).astype(np.float32),
+    )
+    return out.getvalue()
+
+
+def stored_demonstrations(skill: StoredSkill) -> list[NamedDemonstration]:
+    """The demonstrations that a skill was learned from.
+
+    Raises SkillError if its file lacks them.
+    """
+    if not skill.demonstrations:
+        raise SkillError(
+            f"skill {skill.name!r} cannot be refined: its file does not hold the demonstrations that it was learned "
+            f"from; {REMEDY}"
+        )
+    try:
+        arrays = arrays_in(skill.demonstrations)
+        about = validated(msgspec.json.decode(arrays["about"].tobytes()), tuple[_About, ...])
+        ends = np.cumsum([one.samples for one in about])
+        columns = [np.split(arrays[name], ends) for name in ("stamps", "poses", "closures")]
+        out = [_demonstration(one, *parts) for one, *parts in zip(about, *(part[:-1] for part in columns), strict=True)]
+        for _, demonstration in out:
+            check(demonstration)
+    except (ValueError, KeyError, IndexError, zipfile.BadZipFile, msgspec.MsgspecError) as error:
+        raise SkillError(
+            f"skill {skill.name!r} cannot be refined: its demonstrations are damaged ({in_words(error, named=False)}); "
+            f"{REMEDY}"
+        ) from None
+    return out
+
+
+def _demonstration(about: _About, stamps: np.ndarray, poses: np.ndarray, closures: np.ndarray) -> NamedDemonstration:
+    left, right, tool = (poses[:, first : first + 7].astype(np.float64) for first in (0, 7, 14))
+    return NamedDemonstration(
+        printable(about.name),
+        Demonstration(
+            stamps.astype(np.int64),
+            left,
+            right,
+            tool,
+            about.frame,
+            about.places,
+            closures.astype(np.float64) if about.has_gripper else None,
+            about.conducts,
+            about.person,
+            about.begins,
+        ),
+    )

@@ -1,0 +1,144 @@
+"""Adaptation of a skill to via-points, their agreement with each other, and their errors."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp import ViaPointMissed
+from thirdhand.contract.requests import ViaPoint, ViaPointInForce
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.via_points import NEIGHBOURS, neighbourhoods, rest_of
+from thirdhand.skills.pose_via_points import (
+    NOTED_RAD,
+    check_turns,
+    gripper_through,
+    missed_by_rad,
+    turn_through,
+)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, with_file
+
+MAX_GAIN = 4.0  # [m/m] largest ratio of the tool's motion to the hands', of an affine mean and between via-points
+NEAR_M = 0.001  # tools this near to each other never contradict each other
+DEVIATIONS = 3.0  # nor do tools within this multiple of their standard deviations
+NOTED_M = 0.005  # via-points missed or moved by more are reported
+
+
+def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
+    """The skill adapted to these via-points and no others, by algorithm 1 of Huang et al. 2019.
+
+    Via-points between which the tool would move more than MAX_GAIN times as far as the hands
+    contradict each other, as the tool would amplify the trembling of resting hands. Via-points of a
+    task do not, as the skill's stages distinguish them.
+
+    Raises SkillError if the via-points contradict each other, or the tolerance [m] is negative.
+    """
+    if not tolerance >= 0:
+        names = [point.name for point in via_points]
+        raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
+    if skill.conductor is not None:
+        via_points = [of_one(point, skill.conductor) for point in via_points]
+    inputs = neighbourhoods(via_points)[0]
+    owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    check_agreement(via_points, skill)
+    check_turns(owners, inputs)
+    skill = replace(skill, via_points=tuple(via_points), tolerance=tolerance)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ViaPointMissed)  # `in_force` reports it
+            # The covariance of IJRR 2019 is N times that of a single point. The reference is scaled
+            # by 1 / N unless it is a mixture's, so the variance of a via-point is scaled, too.
+            weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
+            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
+            at = skill.model.inputs(inputs, [rest_of(point, skill.model.names) for point in owners])
+            turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
+    except ValueError as error:
+        raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
+    return with_file(replace(skill, turn=turn, gripper=gripper))
+
+
+def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
+    """The via-point with both hands at the position of the conducting one."""
+    at = (point.left, point.right)[conductor]
+    return msgspec.structs.replace(point, left=at, right=at)
+
+
+def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) -> None:
+    """Raise SkillError if via-points contradict each other that the skill cannot distinguish:
+
+    |tool_i - tool_j| > MAX_GAIN |hands_i - hands_j| + NEAR_M + DEVIATIONS (std_i + std_j)
+    """
+    inputs, outputs, deviations = neighbourhoods(via_points)
+    owners = [point for point in via_points for _ in range(points_made_of([point]))]
+    is_distinct = np.zeros((len(owners), len(owners)), bool) if skill is None else _are_distinct(skill, owners)
+    hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
+    tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
+    allowed = MAX_GAIN * hands + NEAR_M + DEVIATIONS * (deviations[:, None] + deviations)
+    for i, j in np.argwhere((tools > allowed) & ~is_distinct)[:1].tolist():
+        raise SkillError(
+            f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
+            f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
+            f"{MAX_GAIN:g} times the hands' distance and what their std allow"
+        )
+
+
+def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
+    """Return whether each pair (V, V) belongs to two via-points of the skill's task, to via-points
+    of two of its stages, or to one of each.
+    """
+    known = skill.model.names
+    names = np.array([p.name if p.name in known else f"{p.stage} ->" if p.stage in known else "" for p in owners])
+    return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
+
+
+def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
+    """The via-points in force, each with its error [m] and the error of its orientation [rad]."""
+    return tuple(
+        ViaPointInForce(
+            **msgspec.structs.asdict(point),
+            missed_by_m=math.dist(point.tool, tool_at(skill, point)),
+            missed_by_rad=missed_by_rad(skill, point),
+        )
+        for point in skill.via_points
+    )
+
+
+def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
+    """Warnings when one skill replaces another: via-points that are missed by more than NOTED_M,
+    and via-points of both skills that move by more.
+    """
+    out = [
+        f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was demonstrated or taught "
+        "near it says otherwise. A smaller std makes it count more; a greater tolerance removes what was shown there"
+        for point in in_force(after)
+        if point.missed_by_m > NOTED_M
+    ]
+    out += [
+        f"the orientation of via-point {point.name!r} is missed by {math.degrees(point.missed_by_rad):.0f}°: what was "
+        "demonstrated or taught near it says otherwise"
+        for point in in_force(after)
+        if point.missed_by_rad is not None and point.missed_by_rad > NOTED_RAD
+    ]
+    for point in set(before.via_points) & set(after.via_points):
+        moved_m = math.dist(tool_at(before, point), tool_at(after, point))
+        if moved_m > NOTED_M:
+            out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
+    return tuple(sorted(out))
+
+
+def tool_at(skill: Skill, point: ViaPoint) -> Vector:
+    """The tool position (3,) [m] for hands that rest at a via-point."""
+    found: Vector = skill.mean(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])[0]
+    return found
+
+
+def points_made_of(via_points: Sequence[ViaPoint]) -> int:
+    """The number of points that `neighbourhoods` makes of via-points."""
+    return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)

@@ -1,0 +1,362 @@
+"""The dynamic part of the drawing: the scene at 100 Hz, curves at the full rate of the loop.
+
+Where frames are missing, curves are interrupted and trails begin anew.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thirdhand.contract.incidents import word
+from thirdhand.contract.records import (
+    SIDES,
+    Flag,
+    Mode,
+    Reason,
+)
+from thirdhand.core.frame import STAGES, TIMING, Record
+from thirdhand.core.geometry import between_segments, off_target, place
+from thirdhand.core.separation import FARTHEST_REPORTED_M
+from thirdhand.core.skill.model import REGION_95, standard_deviations
+from thirdhand.core.skill.pose import CLOSED, UNKNOWN
+from thirdhand.settings import palette
+from thirdhand.settings.config import Settings
+from thirdhand.viewer.banner import banner, log_line
+from thirdhand.viewer.blueprint import TIMELINE
+from thirdhand.viewer.static import ArmModels
+
+SCENE_HZ = 100
+TRAIL_S, TRAIL_HZ = 3.0, 20
+TRAIL_BREAK_M = 0.15  # a longer step between two corners of a trail is not a motion of the hand
+NEAREST_SHOWN_M = 0.5  # a nearer hand is connected with the arm by a line
+SAME_M = 1e-5  # smaller differences of deviations come from rounding
+TINY = 1e-4  # scale that makes the links of an arm invisible; the viewer rejects 0
+LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
+PAUSE_FRAMES = 2  # a longer step between two frames, in intervals of a recording's frames, is a gap
+BREAK_NS = 1000  # a curve ends this long after the last frame before a gap
+REPEAT_S = 0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
+Columns = Callable[..., rr.chunk.Chunk]
+
+
+class DrawnFrame(NamedTuple):
+    """A frame, its time [ns], its timing, the joints (J,) measured last [rad], and whether frames
+    before it are missing.
+    """
+
+    frame: Record
+    time_ns: int
+    timing: Record | None
+    measured: NDArray[np.float64] | None
+    after_gap: bool = False
+
+
+class DynamicScene:
+    """Convert batches of frames into chunks, with the state that the next batch continues."""
+
+    def __init__(self, models: ArmModels, settings: Settings, *, start_ns: int | None = None) -> None:
+        """Seconds count from `start_ns` [ns] in a live view, and from the first frame in a file."""
+        rate_hz, names = settings.rate_hz, settings.joints.names
+        self._joints, self._ghost = (
+            [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
+        )
+        self._live, self._settings, self._repeat_ticks = start_ns is not None, settings, settings.ticks_in(REPEAT_S)
+        self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
+        self._max_step_ticks = PAUSE_FRAMES * settings.frame_every
+        self._period_ms = 1000.0 / rate_hz
+        self._direction = settings.tool.orientation == "direction"
+        self._stale_ticks = settings.ticks_in(settings.hands.stale_ms / 1000)
+        self._trails: dict[str, deque[NDArray[np.float32]]] = {
+            name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
+        }
+        self._body, people = models.body, settings.people
+        toward = np.array(people.toward_elbow)
+        self._forearm, self._hand_radius = people.length / np.linalg.norm(toward) * toward, people.radius
+        self._gate: float | None = None
+        self._missed = 0
+        self._followed = False
+        self._shown: tuple[int, int, bool] | None = None
+        self._mode_sent_tick = 0
+        self._last_tick = -1
+        self._last_ns = 0
+        self._start_ns = start_ns
+        self.end_s = 0.0
+        self.peaks: dict[str, list[float]] = {}  # peaks of each view, one for each batch
+        self._widths: dict[str, int] = {}  # number of values of each curve that has begun, by path
+
+    def set_gate(self, deviation_m: float) -> None:
+        """Sets the deviation [m] above which the skill in force holds."""
+        self._gate = deviation_m
+
+    def index(self, times_ns: NDArray[np.int64], *, to_ns: int = 1) -> list[rr.TimeColumn]:
+        """The time columns of these times [ns]; seconds since the start rounded to `to_ns`."""
+        if self._start_ns is None:
+            self._start_ns = int(times_ns[0])
+        since = np.maximum(times_ns - self._start_ns, 0) // to_ns * to_ns
+        self.end_s = max(self.end_s, float(since[-1]) / 1e9)
+        return [
+            rr.TimeColumn(TIMELINE, duration=since.view("timedelta64[ns]")),
+            rr.TimeColumn("time", timestamp=times_ns.view("datetime64[ns]")),
+        ]
+
+    def chunks(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
+        """The chunks that show a batch of frames."""
+        begin = 0
+        for i, shown in enumerate(batch):
+            step_ticks = int(shown.frame["tick"]) - int(batch[i - 1].frame["tick"] if i else self._last_tick)
+            if shown.after_gap or step_ticks > self._max_step_ticks:
+                yield from self._unbroken(batch[begin:i])
+                yield from self._interruption()
+                begin = i
+        yield from self._unbroken(batch[begin:])
+
+    def _interruption(self) -> Iterator[rr.chunk.Chunk]:
+        """The end of all curves and trails after the last frame."""
+        for trail in self._trails.values():
+            trail.clear()
+        after_ns = np.array([self._last_ns + BREAK_NS], np.int64)
+        for path, width in self._widths.items():
+            index = [rr.TimeColumn("tick", sequence=[self._last_tick + 1]), *self.index(after_ns)]
+            nothing = rr.Scalars.columns(scalars=[np.nan] * width).partition([width])
+            yield rr.chunk.Chunk.from_columns(path, index, [*nothing])
+        self._widths = {}
+
+    def _unbroken(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
+        """The chunks that show frames between which none is missing."""
+        if not batch:
+            return
+        frames = np.array([shown.frame for shown in batch])
+        times = np.array([shown.time_ns for shown in batch], np.int64)
+        ticks = frames["tick"]
+        self.index(times[:1])
+
+        def columns(path: str, rows: Any, *parts: Any) -> rr.chunk.Chunk:
+            to_ns = LOG_NS if path == "/log" else 1
+            index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows], to_ns=to_ns)]
+            return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
+
+        seen = frames["hand_ages"] >= 0
+        is_repeated = self._live and ticks[-1] - self._mode_sent_tick > self._repeat_ticks
+        if batch[0].measured is None and (self._shown is None or is_repeated):
+            yield from self._unmeasured(times[:1])
+        yield from self._curves(batch, frames, seen, columns)
+        yield from self._modes(frames, columns)
+        before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
+        self._last_ns = int(times[-1])
+        sampled = np.flatnonzero(ticks // self._every != before // self._every)
+        if len(sampled):
+            yield from self._scene(batch, frames, sampled, seen, columns)
+        corners = np.flatnonzero(ticks // self._trail_every != before // self._trail_every)
+        if len(corners):
+            yield from self._trail(frames, corners, columns)
+
+    def _unmeasured(self, time_ns: NDArray[np.int64]) -> Iterator[rr.chunk.Chunk]:
+        """The measured arm, too small to see: links without a pose are errors to the viewer."""
+        for number, joint in enumerate(self._ghost):
+            if joint is not None:
+                size = rr.Transform3D.columns(scale=[(TINY, TINY, TINY)])
+                at = [*joint.compute_transform_columns([0.0], clamp=False), *size]
+                yield rr.chunk.Chunk.from_columns(f"/measured/joints/{number}", self.index(time_ns), at)
+
+    def _curves(
+        self, batch: list[DrawnFrame], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns
+    ) -> Iterator[rr.chunk.Chunk]:
+        def scalars(path: str, rows: Any, values: NDArray[Any], view: str = "") -> Iterator[rr.chunk.Chunk]:
+            found = values[rows]
+            if len(found):
+                self.peaks.setdefault(view or path, []).append(float(np.nanmax(np.abs(found), initial=0.0)))
+                width = self._widths[path] = found[0].size
+                yield columns(path, rows, rr.Scalars.columns(scalars=found.ravel()).partition([width] * len(found)))
+
+        every = slice(None)
+        yield from scalars("/joints/position", every, frames["joints"])
+        yield from scalars("/joints/velocity", every, frames["joint_velocities"])
+        yield from scalars("/joints/acceleration", every, frames["joint_accelerations"])
+        yield from scalars("/speed/tool", every, np.linalg.norm(frames["setpoint_velocity"], axis=1), "/speed")
+        for side, name in enumerate(SIDES):
+            speeds = np.linalg.norm(frames["hand_velocities"][:, side], axis=1)
+            yield from scalars(f"/speed/{name}", np.flatnonzero(seen[:, side]), speeds, "/speed")
+        near = np.flatnonzero(seen.any(axis=1))
+        yield from scalars("/separation/distance", near, frames["hand_distance"])
+        yield from scalars("/separation/limit", near, frames["hand_limit"])
+        known = _predicted(frames, seen)
+        aimed = np.flatnonzero(known)
+        following = known & (frames["mode"] == Mode.FOLLOW)
+        off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
+        gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
+        self._followed = bool(following[-1])
+        yield from scalars("/error/target", np.flatnonzero(following | gap_starts), off_mm, "/error")
+        yield from scalars(
+            "/turn/target", np.flatnonzero(following | gap_starts), self._rotation_error(frames, following), "/turn"
+        )
+        std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
+        yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
+        staged = np.flatnonzero(frames["stage_belief"] > 0)
+        yield from scalars("/stage/number", staged, frames["stage"] + 1.0)
+        yield from scalars("/stage/probable", staged, frames["stage_belief"])
+        gripping = known & (frames["closure"] >= 0)
+        yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
+        is_commanded = gripping & (frames["gripper"] != UNKNOWN)
+        closed = 100.0 * (frames["gripper"] == CLOSED)
+        yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
+        yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
+        yield from scalars("/doubt/target", np.flatnonzero(known), 100.0 * frames["error_probability"], "/doubt")
+        other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
+        yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
+        if self._gate is not None and len(aimed):
+            yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
+        measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
+        off = np.zeros(len(batch))
+        off[measured] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured]
+        yield from scalars("/joints/error", measured, off)
+        timed = [i for i, shown in enumerate(batch) if shown.timing is not None]
+        if timed:
+            timings = np.zeros(len(batch), TIMING)
+            timings[timed] = [batch[i].timing for i in timed]
+            yield from scalars("/timing/lateness", timed, timings["lateness_us"])
+            yield from scalars("/timing/work", timed, timings["work_us"])
+            yield from scalars("/timing/stages", timed, timings["stages_us"].reshape(-1, len(STAGES)))
+            answered = np.flatnonzero(timings["latency_us"] > 0)
+            yield from scalars("/latency/hand", answered, timings["latency_us"] / 1e3, "/latency")
+            missed = int(timings["missed"][timed[-1]])
+            if missed > self._missed:
+                fresh = missed - self._missed
+                text = f"{fresh} deadline{'s' * (fresh > 1)} missed before tick {frames['tick'][timed[-1]]}"
+                yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
+            self._missed = missed
+        ages = np.where(seen, frames["hand_ages"] * self._period_ms, np.nan)
+        yield from scalars("/age", np.flatnonzero(seen.any(axis=1)), ages)
+
+    def _rotation_error(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
+        """Angle between tool and target (T,) [°], as `[tool] orientation` defines it; NaN while the
+        arm does not follow.
+        """
+        angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
+        for name in names:  # a frame may be damaged
+            following = following & (np.linalg.norm(frames[name], axis=1) > 0.5)
+        tool, target = (frames[name][following] for name in names)
+        angles[following] = np.degrees(off_target(tool, target, direction=self._direction))
+        return angles
+
+    def _modes(self, frames: NDArray[Any], columns: Columns) -> Iterator[rr.chunk.Chunk]:
+        """Mode, reason and engaging where they change; to live viewers also every REPEAT_S."""
+        changed, sent, ticks = [], [], frames["tick"].tolist()
+        engaging = (frames["flags"] & int(Flag.ENGAGING) > 0).tolist()
+        for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)):
+            if now != self._shown:
+                changed.append(i)
+                self._shown = now
+            elif not (self._live and ticks[i] - self._mode_sent_tick > self._repeat_ticks):
+                continue
+            sent.append(i)
+            self._mode_sent_tick = ticks[i]
+        if not sent:
+            return
+        modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
+        yield columns("/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
+        yield columns("/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
+        for i in sent:
+            picture = banner(modes[i], reasons[i], engaging[i])
+            layout = rr.components.ImageFormat(
+                width=picture.shape[1], height=picture.shape[0], color_model="RGB", channel_datatype="U8"
+            )
+            texture = rr.Mesh3D.columns(albedo_texture_buffer=[picture.tobytes()], albedo_texture_format=[layout])
+            yield columns("/scene/banner", [i], texture)
+        for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
+            level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
+            text = log_line(modes[i], reasons[i], engaging[i], self._settings)
+            yield columns("/log", [i], rr.TextLog.columns(text=[text], level=[level]))
+
+    def _scene(
+        self,
+        batch: list[DrawnFrame],
+        frames: NDArray[Any],
+        rows: NDArray[np.intp],
+        seen: NDArray[np.bool_],
+        columns: Columns,
+    ) -> Iterator[rr.chunk.Chunk]:
+        known = np.array([i for i in rows if batch[i].measured is not None], np.intp)
+        measured = [batch[i].measured for i in known]
+        for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
+            if joint is not None:
+                angles = frames["joints"][rows, number].tolist()
+                yield columns(f"/arm/joints/{number}", rows, joint.compute_transform_columns(angles, clamp=False))
+            if ghost is not None and len(known):
+                angles = [float(q[number]) for q in measured if q is not None]
+                yield columns(f"/measured/joints/{number}", known, ghost.compute_transform_columns(angles, clamp=False))
+        tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows])
+        yield columns("/scene/tool", rows, tool)
+        yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
+        for side, name in enumerate(SIDES):
+            shown = rows[seen[rows, side]]
+            if len(shown):
+                yield columns(f"/scene/{name}_hand", shown, rr.Points3D.columns(positions=frames["hands"][shown, side]))
+        shown = rows[_predicted(frames, seen)[rows]]
+        if len(shown):
+            variances, axes = np.linalg.eigh(frames["covariance"][shown])
+            axes[:, :, 0] *= np.linalg.det(axes)[:, None]
+            half = np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3)
+            unsure = frames["flags"][shown] & int(Flag.UNSURE) > 0
+            colours = [palette.GATE if one else palette.TARGET for one in unsure]
+            orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][shown]
+            region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations, colors=colours)
+            yield columns("/scene/target", shown, region)
+        if len(near := rows[seen[rows].any(axis=1)]):
+            lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)
+            strips = rr.LineStrips3D.columns(strips=lines, labels=labels)
+            yield columns("/scene/nearest", near, strips)
+
+    def _nearest(self, frame: Record, seen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], str]:
+        """The line (2, 3) from the nearest hand to the arm, and its length as text; without a hand
+        nearby, a point and no text.
+        """
+        body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
+        placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
+        place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
+        if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST_REPORTED_M):
+            for side in np.flatnonzero(seen):
+                hand = np.stack([frame["hands"][side], frame["hands"][side] + self._forearm])
+                for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
+                    distance = between_segments(ends, hand, near) - radius - self._hand_radius
+                    if distance < found[0]:
+                        surfaces = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]
+                        found = distance, np.stack(surfaces)
+        distance, line = found
+        return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
+
+    def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
+        """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
+        stale = np.maximum(frames["stale_ticks"], self._stale_ticks)  # older recordings have no limits of their own
+        tracks = [
+            (name, frames["hands"][:, side], frames["hand_ages"][:, side], stale[:, side])
+            for side, name in enumerate(SIDES)
+        ]
+        tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1), stale[:, 0]))
+        for name, positions, ages, limits in tracks:
+            trail, shown, strips = self._trails[name], [], []
+            for i in rows:
+                fresh = 0 <= ages[i] < limits[i]
+                if not fresh or (trail and np.linalg.norm(trail[-1] - positions[i]) > TRAIL_BREAK_M):
+                    trail.clear()
+                if fresh:
+                    trail.append(positions[i].astype(np.float32))
+                if ages[i] >= 0:
+                    shown.append(i)
+                    strips.append(np.array(trail, np.float32).reshape(-1, 3))
+            if shown:
+                yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
+
+
+def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (T,) of the frames with a target. If one hand leads and the other was never seen, the
+    covariance shows whether there is a prediction.
+    """
+    is_predicted = np.any(frames["covariance"], axis=(1, 2))
+    mask: NDArray[np.bool_] = np.where(is_predicted, seen.any(axis=1), seen.all(axis=1))
+    return mask

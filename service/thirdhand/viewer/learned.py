@@ -1,0 +1,160 @@
+"""A skill in the scene: demonstrations as faint lines, the reference as points, and via-points with
+the radius of their neighbourhood.
+
+The skill is read from the arrays of its file; missing ones are not drawn.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from thirdhand.contract.explain import in_words
+from thirdhand.contract.printable import as_markdown, printable, printable_values
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.frame import Vector
+from thirdhand.settings import palette
+from thirdhand.viewer.scene_objects import Column, row
+
+MAX_LINE_POINTS = 300
+Point = tuple[float, float, float]
+COLOURS = {"left": palette.LEFT, "right": palette.RIGHT, "tool": palette.TOOL}
+
+
+class MarkedViaPoint(NamedTuple):
+    """A via-point with a name: positions of hands and tool [m], and the radius of the hands'
+    neighbourhood [m]. Without a radius, it was demonstrated, not taught.
+    """
+
+    name: str
+    left: Point
+    right: Point
+    tool: Point
+    radius: float = 0.0
+    follow: str = "demonstrated"
+
+
+class SkillContents(NamedTuple):
+    """The contents of a skill's file: reference points of the tool (N, 3) [m], via-points, the
+    deviation above which the arm holds [m], the figures of its learning, and its demonstrations.
+    """
+
+    name: str
+    reference: Vector
+    via_points: tuple[MarkedViaPoint, ...]
+    threshold: float
+    figures: dict[str, Any]
+    demonstrations: list[Vector]
+
+
+def skill_contents(skill: bytes) -> SkillContents:
+    """The contents of a skill that can be drawn, from its .npz file's bytes. Raises ValueError."""
+    try:
+        with np.load(io.BytesIO(skill), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        reference = np.asarray(arrays.get("base_mean", np.empty((0, 3))), np.float64)
+        is_tool = "outputs: tool x y z [m]" in str(arrays.get("units", "")) and reference.shape[1:] == (3,)
+        via_points = {point.name: point for point in _demonstrated(arrays)}
+        via_points |= {
+            point.name: MarkedViaPoint(point.name, point.left, point.right, point.tool, point.radius, point.follow)
+            for point in msgspec.json.decode(str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...])
+        }
+        return SkillContents(
+            printable(str(arrays.get("name", ""))),
+            reference if is_tool else np.empty((0, 3)),
+            tuple(via_points.values()),
+            float(arrays.get("threshold", np.inf)),
+            printable_values(msgspec.json.decode(str(arrays["figures"]))) if "figures" in arrays else {},
+            demonstrations(arrays["demonstrations"].tobytes()) if "demonstrations" in arrays else [],
+        )
+    except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"a skill that cannot be drawn: {in_words(error)}") from None
+
+
+def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
+    """The named via-points in a skill's demonstrations."""
+    if "names" in arrays and "nominal" in arrays:
+        names = map(printable, msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...]))
+        for name, at in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
+            left, right, tool = ((x, y, z) for x, y, z in at)
+            yield MarkedViaPoint(name, left, right, tool)
+
+
+def demonstrations(archive: bytes) -> list[Vector]:
+    """The positions (T, 9) [m] of left hand, right hand and tool in each of the demonstrations that
+    a skill's file holds; see `skills.stored_demonstrations`.
+    """
+    with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
+        samples = [about["samples"] for about in msgspec.json.decode(arrays["about"].tobytes())]
+        positions = arrays["poses"].reshape(-1, 3, 7)[:, :, :3].reshape(-1, 9)
+    return np.split(positions, np.cumsum(samples)[:-1])
+
+
+def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
+    """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
+    for first, (name, colour) in enumerate(COLOURS.items()):
+        columns = slice(3 * first, 3 * first + 3)
+        lines = [one[:: 1 + len(one) // MAX_LINE_POINTS, columns] for one in skill.demonstrations]
+        style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}
+        yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
+    count = len(skill.reference)
+    style = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}
+    yield at("/skill/reference", *row(rr.Points3D, count, positions=skill.reference, **style))
+    points, count = skill.via_points, len(skill.via_points)
+    style = {"colors": [palette.PLACE] * count, "radii": [0.01] * count, "labels": [point.name for point in points]}
+    yield at("/skill/places/tool", *row(rr.Points3D, count, positions=[point.tool for point in points], **style))
+    for side, colour in (("left", palette.LEFT), ("right", palette.RIGHT)):
+        centres = [getattr(point, side) for point in points]
+        half = [[max(point.radius, 0.004)] * 3 for point in points]
+        style = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
+        style |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
+        yield at(f"/skill/places/{side}", *row(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style))
+    triples = [[point.left, point.tool, point.right] for point in points]
+    style = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
+    yield at("/skill/places/belong", *row(rr.LineStrips3D, count, strips=triples, **style))
+    text = about(skill)
+    yield at("/about/skill", *rr.TextDocument.columns(text=[text], media_type=["text/markdown"]))
+
+
+def about(skill: SkillContents) -> str:
+    """A description of the skill, as Markdown."""
+    rows = skill.figures.get("demonstrations", ())
+    shown = len(skill.demonstrations)
+    lines = [f"# {as_markdown(skill.name or 'skill')}", ""]
+    if len(skill.reference):
+        lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
+    lines.append(
+        f"Learned from {shown} demonstrations (faint lines)." if shown else "Its file holds no demonstrations."
+    )
+    lines.append(f"The arm holds if the deviation from what the skill knows exceeds {1000 * skill.threshold:.0f} mm.")
+    lines += ["", "## Via-points", ""]
+    if skill.via_points:
+        lines += ["| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |", "|---|---|---|---|"]
+        for point in skill.via_points:
+            at = ", ".join(f"{value:.3f}" for value in point.tool)
+            lines.append(f"| {as_markdown(point.name)} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
+    else:
+        lines.append("None.")
+    if rows:
+        lines += [
+            "",
+            "## Held-out errors",
+            "",
+            "| demonstration | error [mm] | worst [mm] | within the 95 % region [%] |",
+        ]
+        lines.append("|---|---|---|---|")
+        for row in rows:
+            cells = [
+                as_markdown(str(row.get("name"))),
+                *(f"{row.get(key, 0):.1f}" for key in ("error_mm", "worst_mm", "within_95")),
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+        lines += [f"- {as_markdown(text)}" for text in skill.figures.get("warnings", ())]
+        lines += [f"- residual risk: {as_markdown(text)}" for text in skill.figures.get("residual", ())]
+    return "\n".join(lines)

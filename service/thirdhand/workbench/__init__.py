@@ -1,0 +1,1 @@
+"""What a person does beside a running cell: teach, look, measure, set up."""

@@ -1,0 +1,110 @@
+"""`thirdhand bundle`: one archive for whoever is asked for help, without secrets."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import subprocess
+import tarfile
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+
+from thirdhand.cli.doctor import doctor
+from thirdhand.cli.status import status
+from thirdhand.cli.usage import check_writable, reaching
+from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand.recordings.mcap_file import machine
+from thirdhand.recordings.shipped import cell_of
+from thirdhand.scribe.paths import MB, named_after, stem_of
+from thirdhand.settings.config import Settings, without_secrets
+from thirdhand.settings.whole_file import whole
+
+LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
+_KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL)
+_PARAMETERS = re.compile(r"""\b([a-z][\w+-]*/[^\s"'#]+)#[^\s"']*[^\s"',]""")
+HEAD = """This archive holds no keys, certificates, parameters of endpoints or files of Zenoh.
+Recordings show how hands and arm moved. Read it before you pass it on.\n\n"""
+
+
+def bundle(args: argparse.Namespace) -> int:
+    """Write the archive and print what it holds; exit code 0 also if the daemon does not answer."""
+    settings, now = cell_of(str(args.config)) if args.config else None, datetime.now(UTC)
+    args.cell = args.cell or (settings or Settings()).cell
+    args.connect = list(reaching(args, settings).connect)
+    path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
+    check_writable(path)
+    installed = {(one.metadata["Name"], one.version) for one in metadata.distributions()}
+    texts = {
+        "status.json": _printed(status, args, json=True, watch=False, exit_code=False),
+        "doctor.txt": _printed(doctor, args, json=False, seconds=2.0),
+        "versions.txt": "".join(f"{name}: {value}\n" for name, value in (*machine().items(), *sorted(installed))),
+        "log.txt": _log(args),
+    }
+    folder = settings.files.record if settings else ""
+    texts |= {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()} if settings else {}
+    with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
+        folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
+    found = named_after(args.cell, Path(folder)) if folder else []
+    recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
+    about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
+    about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
+    if not texts["status.json"].startswith("{"):
+        about += f"no status: {without_keys(texts['status.json']).strip()}\n"
+    if not found:
+        unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
+        about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
+    texts["README.txt"] = HEAD + about
+    _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
+    print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")
+    return 0
+
+
+def without_keys(text: str) -> str:
+    """A text without private keys and without the parameters of endpoints."""
+    return _PARAMETERS.sub(r"\1#(left out)", _KEY.sub("(a private key, left out)", text))
+
+
+def _printed(command: Callable[[argparse.Namespace], int], args: argparse.Namespace, **more: object) -> str:
+    """The text that another command prints, or the reason why it failed."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        try:
+            command(argparse.Namespace(**vars(args) | more))
+        except (ExplainedError, OSError) as error:
+            print(in_words(error))
+    return out.getvalue()
+
+
+def _log(args: argparse.Namespace) -> str:
+    """The end of the log, from a file or from the journal of the cell's unit."""
+    if args.log:
+        with args.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - LOG_BYTES))
+            return str(file.read(LOG_BYTES).decode(errors="replace"))
+    unit = args.config.stem if args.config else stem_of(args.cell)
+    command = ["journalctl", "--unit", f"thirdhand@{unit}", "--no-pager", "--lines", str(JOURNAL_LINES)]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=JOURNAL_TIMEOUT_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"no journal: {in_words(error)}; --log FILE names a log\n"
+    return (done.stdout + done.stderr).decode(errors="replace")
+
+
+def _write(path: Path, texts: dict[str, str], recordings: list[Path]) -> None:
+    """Write the archive whole or not at all; a recording that still grows is cut."""
+    with whole(path) as part:
+        private = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with open(private, "wb") as file, tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive:
+            for name, text in texts.items():
+                entry, content = tarfile.TarInfo(name), text.encode()
+                entry.size, entry.mtime = len(content), time.time()
+                archive.addfile(entry, io.BytesIO(content))
+            for recording in recordings:
+                archive.add(recording, f"recordings/{recording.name}")

@@ -1,0 +1,307 @@
+"""The soldering scenario in closed loop: bench, service and scribe as separate processes, with
+via-points taught over Zenoh.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from thirdhand.cli.usage import UsageError
+from thirdhand.client import (
+    Client,
+    Tracker,
+    UnreachableError,
+    no_room_to_brake,
+    open_session,
+)
+from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand.contract.requests import Add, Status, decode_request
+from thirdhand.daemon.launch import engine_of, launched, played
+from thirdhand.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
+from thirdhand.process.child import python
+from thirdhand.process.progress import progress, say
+from thirdhand.recordings.shipped import ARMS, cell_of
+from thirdhand.workbench.cli.hands import invite
+from thirdhand.workbench.cli.web_address import page_served, web_address
+from thirdhand.workbench.trackers.cell_view import Latest
+from thirdhand.workbench.trackers.mouse_page import MousePage, PlayedTask
+from thirdhand.workbench.trackers.web_server import Address
+
+DEMO_CELL = "thirdhand"  # of the demo
+SCENE_TIMEOUT_S = 60.0
+DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
+TOO_BUSY = "too-busy"  # folder in --output of what such attempts recorded
+SLOW_RATE_HZ = 100  # at 500 Hz, a browser without a GPU, or a compiler, leaves two cores too little for the arm
+PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
+PAGE_WAIT_S = 600.0  # the page is opened within this time
+PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
+OUTCOME_S = 1.0  # the page shows the outcome before its server ends
+NEVER_THERE = "the hands were never at its places"
+REACHED_LINE = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
+CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
+VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
+EVENT_TITLES = {
+    "handover": "board handed over",
+    "grasp": "magnifying glass fetched",
+    "carry": "glass held over the board",
+}
+
+
+class DemoError(ExplainedError):
+    """The demo could not be run; the message has the cause."""
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Run the demo, print its report and return its exit code."""
+    if args.open and args.mouse is None:
+        raise UsageError("--open opens the page of --mouse; --mouse needed with it")
+    page = web_address("--mouse", args.mouse) if args.mouse is not None else None
+    busy_rate_hz = SLOW_RATE_HZ if args.rate is None and args.arm in ARMS else args.rate
+    rate_hz = busy_rate_hz if page else args.rate
+    for left in reversed(range(DEMO_ATTEMPTS)):
+        before = set(args.output.glob("*.mcap"))
+        try:
+            report = run(args, rate_hz, page)
+        except UnreachableError as error:
+            if page or not left:
+                raise
+            reason = in_words(error)
+        else:
+            if page or report["success"] or report["missing"] or not report["busy"] or not left:
+                break
+            reason = f"the task failed on a machine that was too busy, {report['busy']}"
+        rate_hz = busy_rate_hz
+        say(f"{reason}: it is tried again" + f" at {rate_hz} Hz" * (rate_hz is not None))
+        aside = args.output / TOO_BUSY
+        aside.mkdir(exist_ok=True)
+        for recording in set(args.output.glob("*.mcap")) - before:
+            shutil.move(recording, aside)
+    report["rrd"] = _drawn(Path(report["recording"]))
+    print(json.dumps(report, indent=2) if args.json else text(report))
+    return exit_code(report)
+
+
+def _drawn(recording: Path) -> str | None:
+    """The path of the drawing of a recording, beside it; None if it cannot be drawn."""
+    from thirdhand.workbench.cli.view import convert  # its import is slow
+
+    rrd = recording.with_suffix(".rrd")
+    try:
+        with progress(f"drawing {recording.name}") as done:
+            convert(recording, rrd, say=say, progress=done)
+    except (ExplainedError, OSError) as error:
+        say(f"there is no drawing: {in_words(error)}")
+        return None
+    return str(rrd)
+
+
+def exit_code(report: dict[str, Any]) -> int:
+    """Exit code 0 only if the task succeeded and the recording is complete."""
+    return 0 if report["success"] and not report["missing"] else 1
+
+
+def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> dict[str, Any]:
+    """Run the scenario once and return its report. With the address of a `page`, a person plays the
+    hands there. Raises DemoError, SettingsError.
+    """
+    out, engine, settings = args.output, engine_of(args.engine), cell_of(args.arm, rate_hz=rate_hz)
+    scene = [str(args.scene)] if args.scene else []
+    if reason := no_room_to_brake(settings.period_s):
+        raise DemoError(reason)
+    say("starting: the scene, then the service")
+    out.mkdir(parents=True, exist_ok=True)
+    request = _output("thirdhand_sim.scene", "--arm", args.arm, *scene)
+    add = decode_request(request.encode(), Add)
+    with launched(out, "--joints", "state", settings=settings, record=out, say=say) as service:
+        say(f"service at {service.endpoint}")
+        with open_session(connect=[service.endpoint]) as session:
+            client = Client(session)
+            reply = client.add(add.points, tolerance=add.tolerance)
+            names = ", ".join(
+                f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
+            )
+            say(f"taught while it runs, in force since tick {reply.tick}: {names}")
+            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", *scene] if scene else [])]
+            ends: list[tuple[Status, int]] = []  # the service ends before the bench: an arm that disappears is a fault
+            play = functools.partial(
+                played, service.endpoint, *bench, reported=lambda: ends.append((client.status(), service.stop()))
+            )
+            if page:
+                report = _played_on_page(session, client, play, page, browser=args.open)
+            else:
+                report = json.loads(play(say=say))
+        ((status, code),), missing = ends, service.missing()
+        if code != 0 and not missing:
+            raise DemoError(f"the service ended with code {code}; its log is {service.log}")
+    return _report(report, status) | {"missing": missing}
+
+
+def _played_on_page(
+    session: zenoh.Session,
+    client: Client,
+    play: Callable[..., str],
+    listen: Address,
+    *,
+    browser: bool,
+) -> dict[str, Any]:
+    """The report of the bench, which `play` runs and whose hands a person plays on a page. Raises
+    LaunchError, UsageError.
+    """
+    running: list[subprocess.Popen[str]] = []
+
+    def end() -> None:
+        for process in running:
+            process.terminate()
+
+    task = PlayedTask(end)
+
+    def heard(line: str) -> None:
+        say(line)
+        if found := REACHED_LINE.fullmatch(line):
+            task.lines.append(f"{EVENT_TITLES[found[1]]}, the tool was {found[2]} off")
+
+    with Tracker(session) as tracker:
+        shown = MousePage(tracker, client, Latest(session, DEMO_CELL), cell=DEMO_CELL, task=task)
+        with page_served(shown.server, "--mouse", listen) as address:
+            url = f"http://{address}/?token={shown.server.token}"
+            say(f"  {url}")
+            invite(url, address, browser=browser)
+            report: dict[str, Any] = json.loads(
+                play(
+                    *("--tracked-hands", str(PLAY_S), "--wait", str(PAGE_WAIT_S)),
+                    say=heard,
+                    begun=running.append,
+                    timeout_s=PLAY_TIMEOUT_S,
+                )
+                or "null"
+            )
+            if report is None:
+                raise DemoError("the task was ended before both hands were seen on the page")
+            reached = sum(event["reached"] for event in report["events"].values())
+            task.is_done = report["success"]
+            task.outcome = f"the task has ended: {reached} of {len(EVENT_TITLES)} events reached"
+            time.sleep(OUTCOME_S)
+    return report
+
+
+def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
+    from thirdhand.workbench.report.report import reported  # its import is slow: the first messages must come before
+
+    recording = status.scribe["recording"]
+    if recording is None:
+        raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
+    found = reported(recording)
+    timing = found.columns.timing
+    bench = too_busy(report)
+    begun_s = (report["begun_ns"] - found.columns.start_ns) / 1e9
+    for name, event in report["events"].items():
+        if event["error_mm"] is None:
+            event["why"] = NEVER_THERE
+        elif not event["reached"]:
+            event["why"] = _why(found, begun_s, report["events"], name)
+    return {
+        "success": report["success"],
+        "events": report["events"],
+        "ticks": len(found.columns.frames),
+        "missed": found.missed,
+        "rate_hz": round(found.rate_hz, 3),
+        "latency_ms": report["latency_ms"],
+        "lateness_us": _percentiles(timing["lateness_us"]),
+        "work_us": _percentiles(timing["work_us"]),
+        "realtime": status.realtime,
+        "busy": ", ".join(filter(None, (bench, status.busy))),
+        "recording": recording,
+    }
+
+
+def too_busy(report: dict[str, Any]) -> str:
+    """A message on a machine that was too busy for the bench; empty if it was not."""
+    periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
+    found = []
+    if skipped > MISSED_SHARE * periods:
+        found.append(f"the bench missed {skipped} of its {periods} periods")
+    if pause_ms > LATE_LOOP_MS:
+        found.append(f"the bench paused for {pause_ms:.0f} ms")
+    return ", ".join(found)
+
+
+def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
+    """The cause of a missed event, from the recording after the event before it."""
+    from thirdhand.workbench.report.report import why_missed
+
+    names = list(events)
+    before = [events[one]["time_s"] for one in names[: names.index(name)]]
+    until_s = events[name]["time_s"] + CAUSE_AFTER_S
+    return why_missed(found, VIA_POINT_OF_EVENT[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
+
+
+def _percentiles(values: Any) -> dict[str, float]:
+    import numpy as np
+
+    return dict(zip(("p50", "p99", "max"), np.percentile(values, (50, 99, 100)).round(1).tolist(), strict=True))
+
+
+def text(report: dict[str, Any]) -> str:
+    """The report in text, with each cause of a failure once."""
+    lines, causes = list[str](), list[str]()
+    for name, what in EVENT_TITLES.items():
+        event = report["events"][name]
+        if event["error_mm"] is None:
+            lines.append(f"  {what:<26} {'MISSED':>27}")
+            lines.append(f"      because {event['why']}")
+            continue
+        outcome = "reached" if event["reached"] else "MISSED"
+        lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
+        if why := event.get("why"):
+            lines.append("      for the same reason" if why in causes else f"      because {why}")
+            causes.append(why)
+    busy = ", ".join(part for part in report["busy"].split(", ") if part not in " ".join(causes))
+    latency, late, work = report["latency_ms"], report["lateness_us"], report["work_us"]
+    lines += [
+        "",
+        f"  loop     {report['rate_hz']:.2f} Hz, {report['ticks']} ticks, {report['missed']} missed"
+        f"{'' if report['realtime'] else ' (real-time scheduling was not granted)'}",
+        f"  latency  hand published to command received: p50 {latency['p50']:.2f}, "
+        f"p99 {latency['p99']:.2f}, max {latency['max']:.2f} ms",
+        f"  late     p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} µs;  "
+        f"work p50 {work['p50']:.0f}, p99 {work['p99']:.0f}, max {work['max']:.0f} µs",
+        *([f"  machine  too busy: {busy}"] if busy else []),
+        "",
+        f"  thirdhand replay {_shown(report['recording'])}",
+        f"  thirdhand view {_shown(report['rrd'] or report['recording'])}",
+        f"  thirdhand report {_shown(report['recording'])}",
+        *([f"  The recording is not complete: {report['missing']}."] if report["missing"] else []),
+        "",
+        "The robot handed the board over, fetched the glass and held it over the board."
+        if report["success"]
+        else "The task failed: see the events marked MISSED.",
+    ]
+    return "\n".join(lines)
+
+
+def _shown(path: str) -> str:
+    with contextlib.suppress(ValueError):
+        return str(Path(path).relative_to(Path.cwd()))
+    return path
+
+
+def _output(module: str, *arguments: str) -> str:
+    command = python("-m", module, *arguments)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False)
+    if done.returncode != 0:
+        raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
+    for line in done.stderr.splitlines():
+        say(line)
+    return done.stdout

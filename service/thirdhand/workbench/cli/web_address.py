@@ -1,0 +1,60 @@
+"""The address of a page that a command serves, from its option, and the serving until Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterator
+
+from thirdhand.cli.usage import UsageError
+from thirdhand.workbench.trackers.web_server import Address, WebServer
+
+END_TIMEOUT_S = 5.0  # a page's server ends within this time
+
+
+def web_address(option: str, given: str) -> Address:
+    """Host and port of `PORT` or `HOST:PORT`. Raises UsageError with the name of the option."""
+    host, _, port = given.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"{option} {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0")
+    return Address(host.strip("[]") or "127.0.0.1", int(port))
+
+
+@contextlib.contextmanager
+def page_served(server: WebServer, option: str, listen: Address) -> Iterator[Address]:
+    """The address of a page that another thread serves while the context lasts. Raises UsageError
+    if it is not available.
+    """
+    listening: queue.SimpleQueue[Address | UsageError] = queue.SimpleQueue()
+
+    def serve() -> None:
+        try:
+            serve_page(server, option, listen, listening.put)
+        except UsageError as error:
+            listening.put(error)
+
+    thread = threading.Thread(target=serve, name="page", daemon=True)
+    thread.start()
+    try:
+        found = listening.get()
+        if isinstance(found, UsageError):
+            raise found
+        yield found
+    finally:
+        server.end()
+        thread.join(END_TIMEOUT_S)
+
+
+def serve_page(server: WebServer, option: str, listen: Address, listening: Callable[[Address], object]) -> None:
+    """Serve until SIGTERM, Ctrl-C or the server's `end`; call `listening` with the address taken.
+
+    Raises UsageError if it is not available.
+    """
+    try:
+        asyncio.run(server.serve(listen, listening))
+    except OSError as error:
+        why = os.strerror(error.errno) if error.errno else error
+        raise UsageError(f"{option} {listen}: {why}; another port, or 0 for any, needed") from None

@@ -1,0 +1,1 @@
+"""A first cell for an arm: from its URDF to settings, posture, rates and a picture."""

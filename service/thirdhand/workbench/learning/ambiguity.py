@@ -1,0 +1,99 @@
+"""Contradictions between takes: samples with the same hands, as far as the tracker can tell, and
+different tools.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from thirdhand.core.frame import Vector
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.records import HeldOut
+
+COMPARED = 100  # samples of a take that are compared with those of all takes
+ROWS = 256  # samples that are compared with all others at once, which bounds the memory
+ALIKE_M = 0.02  # hands up to this distance are the same if predictions cannot tell their tools apart either
+SAME_M = 0.003  # hands up to this distance are the same with any tracker, as nobody holds still any better
+NOISES = 7.0  # two measurements of the same hands are nearer than 7 standard deviations in 99.9 % of all cases
+WINDOW_S = 0.1  # hands move along a parabola in windows of this length
+LEAST_SAMPLES = 7  # samples of a window
+
+
+class Contradictions(NamedTuple):
+    """The share of samples that contradict another one, and the worst pair."""
+
+    share: float
+    pair: str  # names the two samples
+    hands_m: float  # distance of the pair's hands
+    tools: float  # distance of the pair's tools
+
+
+def same_hands_m(demonstrations: Iterable[Demonstration]) -> float:
+    """The distance of hands (6) [m] below which the tracker cannot tell them apart:
+    NOISES times its noise, from SAME_M to ALIKE_M.
+    """
+    return float(np.clip(NOISES * tracker_noise_m(demonstrations), SAME_M, ALIKE_M))
+
+
+def tracker_noise_m(demonstrations: Iterable[Demonstration]) -> float:
+    """The standard deviation [m] of the hands' positions on each axis, or 0 without samples.
+
+    It is the residual of a parabola in the median of short windows, few of which contain a jerk.
+    """
+    variances = [np.zeros(0)]
+    for one in demonstrations:
+        hands, count = one.hands, max(LEAST_SAMPLES, round(WINDOW_S / one.period_s))
+        parts = hands[: len(hands) // count * count].reshape(-1, count, 6)
+        parabolas, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 3))
+        left = parts - parabolas @ (parabolas.T @ parts)
+        variances.append((left**2).sum(axis=(1, 2)) / (6 * (count - 3)))
+    found = np.concatenate(variances)
+    return float(np.sqrt(np.median(found))) if len(found) else 0.0
+
+
+def contradictions(
+    held_out: Sequence[HeldOut],
+    tools: Sequence[Vector],
+    missed: Sequence[Vector],
+    distances: Callable[[Vector, Vector], Vector],
+    *,
+    different: float,
+    near_m: float,
+) -> Contradictions:
+    """The contradictions between takes: tools (T, O) at the same hands whose distance is more than
+    `different`.
+
+    Hands are the same up to `near_m`, or up to ALIKE_M where the prediction from other takes misses
+    the tool (T,) by more than half of `different`. `distances` (M, N) are those between tools
+    (M, O) and (N, O).
+    """
+    at = [np.linspace(0, len(one.known) - 1, min(COMPARED, len(one.known))).round().astype(int) for one in held_out]
+    known, shown, off = (
+        np.concatenate([values[rows] for values, rows in zip(column, at, strict=True)])
+        for column in ([one.known for one in held_out], tools, missed)
+    )
+    owner = [f"{one.take.name} (sample {i})" for one, rows in zip(held_out, at, strict=True) for i in rows]
+    squares = (known**2).sum(axis=1)
+    worst, pair, count = -1.0, (0, 0), 0
+    for first in range(0, len(known), ROWS):
+        rows = slice(first, first + ROWS)
+        hands = squares[rows, None] + squares - 2 * known[rows] @ known.T
+        same = (hands < near_m**2) | ((hands < ALIKE_M**2) & (off[rows] > different / 2)[:, None])
+        found = distances(shown[rows], shown) * same
+        count += int((found.max(axis=1) > different).sum())
+        if found.max() > worst:
+            worst, (row, column) = float(found.max()), divmod(int(found.argmax()), len(known))
+            pair = first + row, column
+    i, j = pair
+    return Contradictions(
+        count / len(known), f"{owner[i]} and {owner[j]}", float(np.linalg.norm(known[i] - known[j])), worst
+    )
+
+
+def lengths(points: Vector, others: Vector) -> Vector:
+    """The distances (M, N) between points (M, D) and (N, D)."""
+    squares = (points**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2 * points @ others.T
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))

@@ -1,0 +1,295 @@
+"""Division of demonstrations into the stages of their task, each from a via-point to the next.
+
+The stages k(t) are those of least cost (Viterbi 1967):
+
+    Σ_t c(k(t), t) dt / CORRELATED_S + Σ of the costs of changes
+    c(k, t) = Σ_i min(d_i² / OFF_M², FARTHEST) / 2 - DIRECTED tanh(u_i / DIRECTION_SPEED_MPS)
+
+with i = left hand, right hand and tool, d_i its distance from its segment, and u_i its speed along
+it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thirdhand.contract.requests import ViaPoint
+from thirdhand.core.frame import Records, Vector
+from thirdhand.core.intake.hand_estimator import stillness_of
+from thirdhand.core.skill import TURNS
+from thirdhand.core.skill.memory import along as filtered
+from thirdhand.core.skill.memory import turn_lag_s
+from thirdhand.core.skill.stages import (
+    LEFT,
+    MOST_STAGES,
+    NONE,
+    RIGHT,
+)
+from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
+from thirdhand.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.recognition import all_followed, covered
+from thirdhand.skills.skill_file import SkillError
+
+SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
+SAME_M = 0.05  # positions of a hand that are this near to each other in all demonstrations are the same
+OFF_M = 0.06  # unit of the distances d_i
+FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
+DIRECTED = 2.0  # gain of moving along the segment
+CORRELATED_S = 0.2  # samples within this time count as one
+NEXT = 2.0  # cost of a change to the next stage
+ANOTHER = 12.0  # cost of any other change
+LATER = 3.0  # cost of each stage that is left out at the beginning
+NEAR = 0.15  # shares that differ by less are near to each other
+FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
+LEAST_WEIGHT = 1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
+FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
+
+
+def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
+    """The task of demonstrations, and why there is none although they name via-points."""
+    named = [tuple(point.name for point in one.places) for one in demonstrations]
+    if not any(named):
+        return None, ""
+    if len(set(map(frozenset, named))) > 1:
+        return None, (
+            "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
+        )
+    names = Counter(named).most_common(1)[0][0]
+    if not 2 <= len(names) <= MOST_STAGES + 1:
+        return None, f"{len(names)} named via-points: 2 to {MOST_STAGES + 1} are learned between"
+    at = np.array([[[*p.left, *p.right] for p in ordered(one.places, names)] for one in demonstrations])
+    corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
+    return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)])), ""
+
+
+def _corners(at: Vector) -> Indices:
+    """The index (N,) of a hand's position at each via-point, for positions (D, N, 3) [m] in D
+    demonstrations.
+    """
+    out: list[int] = []
+    for i in range(at.shape[1]):
+        alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
+        out.append(alike[0] if alike else max(out, default=-1) + 1)
+    return np.array(out, np.int64)
+
+
+def ordered(points: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoint]:
+    """The via-points in the order of these names."""
+    by_name = {point.name: point for point in points}
+    return (by_name[name] for name in names)
+
+
+def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
+    """Warnings about via-points that the tool never came near in some demonstrations.
+
+    Raises SkillError if it came near in none.
+    """
+    warned = []
+    for named, follow in zip(task.names, task.follow.tolist(), strict=True):
+        off = [float(off_via_point(one, next(ordered(one.places, (named,))), follow).min()) for one in demonstrations]
+        if min(off) > FAR_M:
+            raise SkillError(
+                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
+                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
+                "where it was in these demonstrations?"
+            )
+        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M]
+        if missed:
+            warned.append(f"via-point {named!r}: the tool never came near it in {', '.join(missed)}")
+    return warned
+
+
+def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) -> Vector:
+    """The tool's distances (T,) [m] from a via-point, or from it moved with the hand that the tool
+    follows, whichever is smaller.
+    """
+    off = demonstration.tool[:, :3] - point.tool
+    out: Vector = np.linalg.norm(off, axis=1)
+    if follow == NONE:
+        return out
+    hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (point.left, point.right)[follow]
+    return np.asarray(np.minimum(out, np.linalg.norm(off - hand, axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """A demonstration (T samples), divided into the stages of its task."""
+
+    demonstration: Demonstration
+    at: NamedViaPoints
+    stages: Records  # (K,) at the via-points of the demonstration
+    moving: Vector  # (T, 3, 6) position, velocity and acceleration of the hands
+    stillness: Vector  # (T, 2) of each hand, 0 to 1
+    labels: Indices  # (T,) numbers of the stages
+
+    @staticmethod
+    def of(task: Task, demonstration: Demonstration) -> Divided:
+        """The stages of a demonstration."""
+        period_s = demonstration.period_s
+        window = round(SMOOTHED_S / period_s)
+        hands, smooth_tool = (
+            demonstration.by_pieces(lambda x: _smoothed(x, window), x)
+            for x in (demonstration.hands, demonstration.tool[:, :3])
+        )
+        velocities, tool_velocities = (
+            demonstration.by_pieces(lambda x: np.gradient(x, period_s, axis=0), x) for x in (hands, smooth_tool)
+        )
+        moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
+        at = NamedViaPoints.of(demonstration.places)
+        stages = _stages(task, at)
+        labels = _divided(stages, moving, (smooth_tool, tool_velocities), period_s)
+        return Divided(demonstration, at, stages, moving, stillness_of(velocities, period_s), labels)
+
+    @property
+    def tool(self) -> Vector:
+        """The tool's position (T, 3) [m]."""
+        return self.demonstration.tool[:, :3]
+
+    @property
+    def period_s(self) -> float:
+        """The mean time [s] between samples."""
+        return self.demonstration.period_s
+
+    def in_task(self, task: Task) -> Divided:
+        """The same stages of a task in which other hands lead, or the tool follows
+        others, or turns with them."""
+        return replace(self, stages=_stages(task, self.at))
+
+    def turns(self, late_s: float) -> Vector:
+        """The entries (T, 18) of the hands' rotation matrices, filtered so that they are `late_s`
+        late; (T, 0) if the tool does not turn with the hands.
+        """
+        if not self.stages["turned"].any():
+            return np.empty((len(self.labels), 0))
+        return filtered(self.demonstration.turns, self.period_s, turn_lag_s(late_s), TURNS)[:, -1]
+
+    def late(self, late_s: float) -> Encoded:
+        """The shares of the stages, for a teacher whose tool is late by `late_s`."""
+        steps, labels, stages, tool = round(late_s / self.period_s), self.labels, self.stages, self.tool
+        hands, rested = (
+            self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
+        )
+        hands = np.hstack([hands, self.turns(late_s)])
+        found = covered(hands, rested, labels, stages)
+        along, off = found[:, :2], found[:, 2:]
+        begins, way = stages["tool"][labels], stages["tool_way"][labels]
+        square = (way**2).sum(axis=1)
+        goes = square > SAME_M**2
+        share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
+        wanted = np.column_stack([share.clip(0.0, 1.0), np.zeros_like(tool)])
+        one = Encoded(**vars(self), hands=hands, along=along, off=off, wanted=wanted)
+        wanted[:, 1:] = tool - one.tools(np.arange(len(tool)), wanted)
+        return one
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded(Divided):
+    """A divided demonstration in shares of its stages."""
+
+    hands: Vector  # (T, 6) [m] positions of the hands, delayed as the tool is; (T, 24) with their turns
+    along: Vector  # (T, 2) shares of the stage that the hands have covered
+    off: Vector  # (T, 2) [m] distances of the hands from their segments
+    wanted: Vector  # (T, OUTPUTS) share of the stage that the tool has covered, and its offset (3,) [m]
+
+    def tools(self, rows: Indices, outputs: Vector) -> Vector:
+        """Tool positions (M, 3) [m] for outputs (M, OUTPUTS) of the primitive at rows (M,)."""
+        labels, share = self.labels[rows], outputs[:, 0]
+        out = self.stages["tool"][labels] + share[:, None] * self.stages["tool_way"][labels] + outputs[:, 1:]
+        all_followed(self.hands[rows], share.clip(0.0, 1.0), labels, self.stages, out)
+        return np.asarray(out)
+
+    def near(self, corner: tuple[float, float], stages: Sequence[int]) -> NDArray[np.bool_]:
+        """Return whether the hands' shares are near these in one of these stages (T,)."""
+        return np.asarray(np.isin(self.labels, stages) & (np.abs(self.along - corner).max(axis=1) < NEAR))
+
+    def rows(self, count: int) -> Indices:
+        """About `count` rows, evenly along the path of hands and tool, and a little along time."""
+        steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
+        kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
+        return np.asarray(np.unique(kept), np.int64)
+
+
+def _stages(task: Task, at: NamedViaPoints) -> Records:
+    return task.stages(at, np.full((len(task.names) - 1, 2), OFF_M))
+
+
+def encode(task: Task, shown: Sequence[Divided], late_s: Sequence[float]) -> tuple[Task, list[Encoded]]:
+    """The demonstrations encoded for teachers who are late by `late_s` in each, and the task; if
+    the tool turns with the hands there, with the levers that the demonstrations lead to.
+    """
+    out = [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+    if task.levers is None:
+        return task, out
+    task = task._replace(levers=np.array([_lever(out, i, side) for i, side in enumerate(task.follow.tolist())]))
+    return task, [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+
+
+def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
+    """The mean position (3,) [m] of the tool in the frame of a hand at the via-point of this
+    number; zeros if the tool follows no hand there:
+
+        l = Σ_t w_t R_tᵀ (x_t - h_t) / Σ_t w_t
+
+    with the tool x and the hand's position h and rotation matrix R, delayed as the tool is. With
+    the tool's share s, w = sⁿ in the stage that ends at the via-point and (1 - s)ⁿ in the one that
+    begins there.
+    """
+    if side == NONE:
+        return np.zeros(3)
+    total, weight = np.zeros(3), 0.0
+    for one in shown:
+        share = one.wanted[:, 0]
+        near = np.where(one.labels == number, 1.0 - share, np.where(one.labels == number - 1, share, 0.0))
+        weights = near**WITH_HAND_POWER + LEAST_WEIGHT
+        turned = one.hands[:, 6 + 9 * side :][:, :9].reshape(-1, 3, 3)
+        total += np.einsum("t,tji,tj->i", weights, turned, one.tool - one.hands[:, 3 * side : 3 * side + 3])
+        weight += float(weights.sum())
+    return np.asarray(total / weight)
+
+
+def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
+    """The stages (T,) of least cost, for the motion (T, 3, 6) of the hands and the positions and
+    velocities (T, 3) of the tool.
+    """
+    count, cost = len(stages), np.zeros((len(moving), len(stages)))
+    ways = [(stages["begins"][:, i], stages["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
+    ways.append((stages["tool"], stages["tool_way"], *tool, 0))
+    for begins, way, points, velocities, first in ways:
+        at, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
+        square = (way**2).sum(axis=1)
+        moves = square > SAME_M**2
+        along = (((at - begins) * way).sum(axis=2) / np.where(moves, square, 1.0)).clip(0.0, 1.0) * moves
+        off = ((at - begins - along[:, :, None] * way) ** 2).sum(axis=2)
+        goes = np.where(moves, velocity @ way.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
+        goes -= 0.7 * ~moves * np.linalg.norm(velocity, axis=1)[:, None]
+        cost += np.minimum(off / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / DIRECTION_SPEED_MPS)
+    cost *= period_s / CORRELATED_S
+    change = np.where(np.eye(count, k=1) > 0, NEXT, ANOTHER) * (1.0 - np.eye(count))
+    total, back = cost[0] + LATER * np.arange(count), []
+    for row in cost[1:]:
+        through = total[:, None] + change
+        back.append(through.argmin(axis=0))
+        total = through.min(axis=0) + row
+    labels = [int(total.argmin())]
+    for before in reversed(back):
+        labels.append(int(before[labels[-1]]))
+    return np.array(labels[::-1], np.int64)
+
+
+def _delayed(values: Vector, samples: int) -> Vector:
+    """The values (T, D) delayed by a number of samples; before the first one they are constant."""
+    return values[np.maximum(np.arange(len(values)) - samples, 0)]
+
+
+def _smoothed(hands: Vector, samples: int) -> Vector:
+    window = np.hanning(samples + 2)[1:-1] if samples else np.ones(1)
+    before = len(window) // 2
+    padded = [np.pad(column, (before, len(window) - 1 - before), mode="edge") for column in hands.T]
+    return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)

@@ -1,0 +1,177 @@
+"""Judgement of a skill before it is used: its figures, from held-out takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.criteria.cross_validation import rms
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.model import LEVELS, Regions
+from thirdhand.core.skill.skill import is_reachable
+from thirdhand.settings.config import Reach
+from thirdhand.workbench.learning.ambiguity import COMPARED, contradictions, lengths
+from thirdhand.workbench.learning.baselines import baselines, constant_errors
+from thirdhand.workbench.learning.records import (
+    Figures,
+    Fitted,
+    HeldOut,
+    Pose,
+    Row,
+    TimedErrors,
+    persons_of,
+)
+from thirdhand.workbench.learning.regions import (
+    calibrated,
+    calibrated_without,
+    timed_errors,
+    unknown_std,
+)
+from thirdhand.workbench.learning.takes import Division, conductor_of
+from thirdhand.workbench.learning.verdicts import Subject, verdicts
+
+CONTRADICTION_M = 0.10  # tools this far from each other contradict each other at the same hands
+
+
+class Judgement(NamedTuple):
+    """The figures of a skill, the regions of its covariance, and the shares (L,) of the samples
+    inside the regions of LEVELS, each take's calibrated without it.
+    """
+
+    figures: Figures
+    regions: Regions
+    inside: Vector
+
+
+def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, accepted_by: str = "") -> Judgement:
+    """The judgement of a model and pose that were learned from takes; `accepted_by` is the person
+    who accepts its residual risks.
+
+    With the errors e of held-out takes and d those of the mean position of the other persons' tool,
+    the explained share of the variance is 1 - Σ |e|² / Σ |d|².
+    """
+    takes, held_out, gate, delay = division.takes, fitted.held_out, fitted.gate, fitted.delay
+    persons = persons_of(takes)
+    timed = [one.timed or timed_errors(one) for one in held_out]
+    checked = calibrated_without(timed, persons)
+    others = {**fitted.baselines, **baselines(takes)}
+    rows = tuple(
+        _row(
+            one.take.name,
+            one.errors,
+            one.gate_m > gate.threshold,
+            checked[i : i + 1],
+            {name: errors[i] for name, errors in others.items()},
+        )
+        for i, one in enumerate(held_out)
+    )
+    overall = _row(
+        "all",
+        np.concatenate([one.errors for one in held_out]),
+        np.concatenate([one.gate_m for one in held_out]) > gate.threshold,
+        checked,
+        {name: np.concatenate(errors) for name, errors in others.items()},
+    )
+    contradicting = contradictions(
+        held_out,
+        [take.position for take in takes],
+        [np.linalg.norm(one.errors, axis=1) for one in held_out],
+        lengths,
+        different=CONTRADICTION_M,
+        near_m=division.near_m,
+    )
+    figures = Figures(
+        demonstrations=rows,
+        all=overall,
+        held_std=float(np.std([row.held for row in rows])),
+        gate_mm=1000 * gate.threshold,
+        swapped=100 * gate.caught.swapped,
+        beside=100 * gate.caught.beside,
+        one_beside=100 * gate.caught.one_beside,
+        ambiguous=100 * contradicting.share,
+        beyond_reach=100 * _share_beyond(held_out, reach),
+        explained=_explained(held_out, constant_errors(takes)),
+        orientation_error_deg=pose.turn_error_deg,
+        gripper_right=pose.gripper_right,
+        tried_mm={name: 1000 * error_m for name, error_m in fitted.tried_m.items()},
+        taken=fitted.taken if fitted.tried_m else "",
+        weight=fitted.weights.taken if fitted.weights else "",
+        weights_mm={name: 1000 * error_m for name, error_m in fitted.weights.tried_m.items()} if fitted.weights else {},
+        by_person=len(np.unique(persons)) < len(takes),
+        delay_s=delay.mean_s if delay else None,
+        delay_std_s=delay.std_s if delay else 0.0,
+        alone=True if conductor_of(division, fitted) is not None else msgspec.UNSET,
+    )
+    subject = Subject(
+        figures,
+        gate,
+        sorted({take.demonstration.frame for take in takes}),
+        f"{contradicting.pair} have the hands {1000 * contradicting.hands_m:.0f} mm from each other and the tools "
+        f"{1000 * contradicting.tools:.0f} mm",
+        float(np.median([row.error_mm for row in rows])),
+        1000 * math.sqrt(3.0) * unknown_std(takes),
+    )
+    found = [*verdicts(subject), *pose.verdicts]
+    warnings, residual, unsafe = (
+        tuple(one.text for one in found if one.severity == kind) for kind in ("warning", "residual", "unsafe")
+    )
+    figures = msgspec.structs.replace(
+        figures,
+        warnings=(*division.remarks, *fitted.remarks, *warnings),
+        residual=residual,
+        accepted_by=accepted_by if residual else "",
+        unsafe=unsafe,
+    )
+    inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
+    return Judgement(figures, calibrated(timed, persons), inside)
+
+
+def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:
+    """The share of the tool's positions that are out of the arm's reach."""
+    some = (one.take.position[:: max(1, len(one.errors) // COMPARED)] for one in held_out)
+    return float(np.mean([not is_reachable(at, reach) for positions in some for at in positions]))
+
+
+def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float | None:
+    """The share [%] of the tool's variance that is explained, given the errors (T, 3) [m] of a
+    constant prediction of each take; None if there are none.
+    """
+    if not constant:
+        return None
+    missed, varies = (
+        float(sum((errors**2).sum() for errors in each)) for each in ([one.errors for one in held_out], constant)
+    )
+    return 100 * (1 - missed / varies) if varies > 0.0 else None
+
+
+def _row(
+    name: str,
+    errors: Vector,
+    is_held: NDArray[np.bool_],
+    checked: Sequence[tuple[TimedErrors, Regions]],
+    others: Mapping[str, Vector],
+) -> Row:
+    """The figures of errors (T, 3) [m], of one take or of all."""
+    inside = 100 * np.mean([timed.inside(regions) for timed, regions in checked], axis=0)
+    expected_m = np.concatenate([timed.expected_m(regions) for timed, regions in checked])
+    is_wrong = np.concatenate([timed.is_wrong for timed, _ in checked])
+    is_unsure = np.concatenate([timed.probabilities(regions) > (regions.alarm or 1.0) for timed, regions in checked])
+    return Row(
+        name=name,
+        error_mm=1000 * rms(errors),
+        worst_mm=1000 * float(np.linalg.norm(errors, axis=1).max()),
+        moment_mm=1000 * rms(np.concatenate([timed.errors for timed, _ in checked])),
+        predicted_mm=1000 * rms(expected_m[:, None]),
+        within_50=float(inside[LEVELS.index(0.5)]),
+        within_95=float(inside[LEVELS.index(0.95)]),
+        held=100 * float(is_held.mean()),
+        wrong=100 * float(is_wrong.mean()),
+        told=100 * float(is_unsure[is_wrong].mean()) if is_wrong.any() else None,
+        falsely_told=100 * float(is_unsure[~is_wrong].mean()) if not is_wrong.all() else 0.0,
+        other_mm={name: 1000 * rms(missed) for name, missed in others.items()},
+    )

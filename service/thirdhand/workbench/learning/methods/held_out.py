@@ -1,0 +1,75 @@
+"""Held-out takes and the gate of methods whose model is one primitive over the hands' inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from kmp import KMP
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.hands_kmp import TURN_INPUTS
+from thirdhand.core.skill.model import standard_deviations
+from thirdhand.skills.skill_file import HIGHEST_GATE_M
+from thirdhand.workbench.learning.gate import (
+    Gate,
+    every_few,
+    gate_between,
+    nonsense,
+)
+from thirdhand.workbench.learning.records import (
+    HeldOut,
+    Progress,
+    Take,
+    persons_of,
+)
+
+Fit = Callable[[int | None], KMP]  # the primitive without a person's takes, or of all
+ROWS = 500  # inputs that are predicted at once, which bounds the memory
+
+
+def held_out_takes(takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, progress: Progress) -> list[HeldOut]:
+    """The takes, with inputs (T, I), as predicted by the primitive without their person; by that of
+    all takes if there is one person only.
+    """
+    persons = persons_of(takes)
+    numbers = np.unique(persons)
+    out: dict[int, HeldOut] = {}
+    for person in numbers.tolist():  # one primitive at a time: each holds its factors
+        primitive = fit(person if len(numbers) > 1 else None)
+        for h in np.flatnonzero(persons == person).tolist():
+            progress(f"holding out demonstration {h + 1} of {len(takes)}")
+            take, predicted = takes[h], primitive.predict(inputs[h])
+            deviations = standard_deviations(predicted.covariance)
+            errors = take.position - predicted.mean
+            out[h] = HeldOut(take, errors, predicted.covariance, deviations, inputs[h], inputs[h])
+    return [out[h] for h in range(len(takes))]
+
+
+def gate_of(primitive: KMP, held_out: Sequence[HeldOut], order: int, ceiling_m: float) -> Gate:
+    """The gate on the primitive's standard deviation; its inputs hold `order` rows of memory."""
+    some = np.concatenate([every_few(one.inputs) for one in held_out])
+    beyond = (swapped(some, order)[:, 6:], some[:, 6:], some[:, 6:])  # the inputs beyond the positions
+    wrong = [
+        _deviations(primitive, np.hstack([hands, rest.repeat(len(hands) // len(some), axis=0)]))
+        for hands, rest in zip(nonsense(some[:, :6]), beyond, strict=True)
+    ]
+    return gate_between(np.concatenate([one.gate_m for one in held_out]), wrong, ceiling=min(ceiling_m, HIGHEST_GATE_M))
+
+
+def swapped(inputs: Vector, order: int) -> Vector:
+    """Inputs (T, I) with the memory, of `order` rows, and the turns of left and right hand swapped;
+    the hands' positions stay.
+    """
+    out, turns = inputs.copy(), 6 * (1 + order)
+    end = turns + (inputs.shape[1] - turns) // TURN_INPUTS * TURN_INPUTS  # a clock has no side
+    for columns, width in ((slice(6, turns), 3), (slice(turns, end), 9)):
+        both = inputs[:, columns].reshape(len(inputs), -1, 2, width)
+        out[:, columns] = both[:, :, ::-1].reshape(len(inputs), -1)
+    return out
+
+
+def _deviations(primitive: KMP, inputs: Vector) -> Vector:
+    """The standard deviations (M,) [m] of predictions at inputs (M, I), in blocks."""
+    blocks = np.split(inputs, range(ROWS, len(inputs), ROWS))
+    return np.concatenate([standard_deviations(primitive.predict(block).covariance) for block in blocks])

@@ -1,0 +1,284 @@
+"""Learning from the hands: the tool as a function of their positions or of richer inputs.
+
+The simplest kind of inputs is chosen that predicts held-out persons as well as any. A memory also
+contains the tool's delay, so hands and tool are not shifted against each other. If the kernel's ell
+is given, the inputs are the positions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.criteria.cross_validation import preferred
+from kmp.criteria.direct import DirectSelection
+from thirdhand.contract.records import SIDES
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill import ORDER
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.memory import features
+from thirdhand.core.skill.task_clock import TaskClock
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.learning.choice import selection_of
+from thirdhand.workbench.learning.division import task_of
+from thirdhand.workbench.learning.gate import CEILING_M
+from thirdhand.workbench.learning.methods.clock import (
+    Tempo,
+    clock_of,
+    paired,
+    remark_on,
+)
+from thirdhand.workbench.learning.methods.held_out import Fit, gate_of, held_out_takes
+from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
+from thirdhand.workbench.learning.records import (
+    Fitted,
+    Options,
+    Progress,
+    Take,
+    Taught,
+    persons_of,
+)
+from thirdhand.workbench.learning.regions import local_errors, refitted_errors
+
+AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good
+RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
+LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
+LEAST_PERSONS = 3  # hyper-parameters are chosen anew without each block of takes from this number of persons on
+
+
+class Inputs(NamedTuple):
+    """A kind of inputs: the positions of the hands, rows of their memory, and their orientation; of
+    both hands, or of one that stands for both; and the clock of the task.
+    """
+
+    name: str
+    order: int = 0  # rows of memory
+    turned: bool = False  # true if the orientation is an input
+    alone: int | None = None  # the side of the only hand
+    clock: TaskClock | None = None
+
+    @property
+    def is_rich(self) -> bool:
+        """True if there are other inputs than positions."""
+        return bool(self.order or self.turned or self.is_timed)
+
+    @property
+    def is_timed(self) -> bool:
+        """True if the clock is an input."""
+        return self.clock is not None and self.clock.weight > 0.0
+
+    def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
+        """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
+        hands, turns = demonstration.hands, demonstration.turns if self.turned else None
+        if self.alone is not None:
+            hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
+            turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
+        found = features(hands, demonstration.period_s, self.order, turns)
+        if self.clock is None or not self.is_timed:
+            return found
+        assert tempo is not None
+        return np.column_stack([found, self.clock.weight * tempo.seconds(self.clock, self.alone)])
+
+
+POSITIONS = Inputs("positions")
+KINDS = (  # from simple to rich
+    POSITIONS,
+    Inputs("velocities", order=1),
+    Inputs("orientations", turned=True),
+    Inputs("memory", order=ORDER),
+)
+CLOCKS = {True: ", and a clock that waits for resting hands", False: ", and a clock"}  # names; the first is simpler
+WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
+CLOCK_ERROR_SHARE = 0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
+
+
+@dataclass(frozen=True)
+class HandInputs:
+    """The method with its options."""
+
+    options: Options
+    why_not_staged: str  # empty if no demonstration names via-points
+
+    @classmethod
+    def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self:
+        """The method; it applies to all demonstrations."""
+        return cls(options, "" if options.ell is not None else task_of(demonstrations)[1])
+
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
+        """The model of the chosen kind of inputs, and its predictions of held-out takes.
+
+        If a skill is refined, the weight of the new takes is chosen with the kind.
+        """
+        takes, earlier = taught.new, taught.earlier
+        remarks = [self.why_not_staged] if self.why_not_staged else []
+        points, ell = self.options.points, self.options.ell
+        tempos = [Tempo.of(take.demonstration) for take in taught.all]
+        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
+        kind = found.kind
+        if kind.order and kind.clock is None:
+            kind = kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
+        elif kind.clock is not None:
+            remarks.append(
+                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where demonstrations begin "
+                f"starts it anew, and one of more than {kind.clock.rest_s:.1f} s after the task"
+            )
+        if kind.alone is not None:
+            remarks.append(
+                f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
+                "makes no difference, and may be absent"
+            )
+        inputs = [
+            take.hands if ell is not None else kind.of(take.demonstration, tempo)
+            for take, tempo in zip(taught.all, tempos, strict=True)
+        ]
+        inputs, before = inputs[: len(takes)], inputs[len(takes) :]
+        weight, weights = chosen(found.by_weight_m)
+        if math.isinf(weight):
+            earlier, before = [], []
+        progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
+        fit = refit(kind, [*takes, *earlier], [*inputs, *before], points, ell, earlier=len(earlier), weight=weight)
+        progress(f"learning from all {len(takes) + len(earlier)}")
+        primitive = fit(None)
+        held_out = held_out_takes(takes, inputs, fit, progress)
+        gate = gate_of(primitive, held_out, kind.order, CEILING_M)
+        errors = None
+        if len({take.person for take in takes}) >= LEAST_PERSONS:
+            progress("calibrating the covariance")
+
+            def refitted(kept: list[int]) -> HandsKMP:
+                some, known = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
+                others = refit(kind, some, known, points, ell, earlier=len(earlier), weight=weight)
+                return HandsKMP(others(None), kind.turned, kind.clock)
+
+            timed, errors = local_errors(refitted_errors(takes, inputs, refitted), inputs, takes, primitive)
+            held_out = [one._replace(timed=found) for one, found in zip(held_out, timed, strict=True)]
+        return Fitted(
+            HandsKMP(primitive, kind.turned, kind.clock, errors),
+            held_out,
+            gate,
+            conductor=kind.alone,
+            taken=kind.name,
+            tried_m=found.tried_m,
+            remarks=remarks,
+            weights=weights if taught.earlier else None,
+        )
+
+
+def _weighted(
+    kind: Inputs, taught: Taught, tempos: Sequence[Tempo], weight: float, points: int, blocks: NDArray[np.intp]
+) -> DirectSelection:
+    """The selection of a mean of this kind of inputs with this weight of new takes, where the takes
+    of a block (H,) are held out at once.
+    """
+    earlier = taught.earlier if math.isfinite(weight) else []
+    takes = [*taught.new, *earlier]
+    pairs = [(kind.of(take.demonstration, tempo), take.position) for take, tempo in zip(takes, tempos, strict=False)]
+    return selection_of(pairs, points, persons=blocks[: len(takes)], rich=True, earlier=len(earlier), factor=weight)
+
+
+def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
+    """The kinds of inputs that these demonstrations have, from simple to rich."""
+    turns = np.concatenate([one.turns for one in demonstrations])
+    is_turned = bool(np.ptp(turns, axis=0).max() > math.sin(LEAST_TURN_RAD))
+    kinds = [kind for kind in KINDS if is_turned or not kind.turned]
+    if demonstrations[0].conducts != "both":
+        return kinds
+    return [
+        kind._replace(name=f"{kind.name}{hand}", alone=alone)
+        for kind in kinds
+        for alone, hand in ((0, " of the left hand"), (1, " of the right hand"), (None, ""))
+    ]
+
+
+def refit(
+    kind: Inputs,
+    takes: Sequence[Take],
+    inputs: Sequence[Vector],
+    points: int,
+    ell: float | None,
+    *,
+    earlier: int = 0,
+    weight: float = 1.0,
+) -> Fit:
+    """The function that fits primitives to takes with inputs (T, I), with the same hyper-parameters
+    whichever person is held out; ell [1/m²] is chosen with them unless it is given.
+
+    The last `earlier` takes are of a skill that is refined; a new one has this weight against them.
+    """
+    is_rich = kind.is_rich
+    pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
+    count, persons = RICH_TIMES * points if is_rich else points, persons_of(takes)
+    choice = selection_of(
+        pairs, count, persons=persons, isotropic=is_rich, rich=is_rich, earlier=earlier, factor=weight
+    )
+    parameters = choice.parameters(ell, may_be_linear=True)
+    residuals = choice.residuals(parameters.ell, parameters.noise, parameters.ridge)
+    return lambda without: choice.primitive(parameters, residuals, without=without)
+
+
+class Chosen(NamedTuple):
+    """A kind of inputs, the error [m] of each kind, and that of this one with each weight."""
+
+    kind: Inputs
+    tried_m: Mapping[str, float]
+    by_weight_m: Mapping[float, float]
+
+
+def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Progress) -> Chosen:
+    """The simplest kind of inputs that is as good as any, each with its best weight.
+
+    A clock is tried with positions, and with the best kinds without it. For it, the blocks of
+    `paired` are held out; if a skill is refined, the new takes show the pace that counts, and are
+    held out one by one.
+    """
+    persons = persons_of(taught.all)
+    blocks = persons if taught.earlier else paired(persons)
+
+    def error_m(kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
+        return _weighted(kind, taught, tempos, weight, points, held_out).best_mean(may_be_linear=True)[0]
+
+    def by_weight_m(kind: Inputs) -> dict[float, float]:
+        weights = WEIGHTS if taught.earlier else WEIGHTS[:1]
+        return {weight: error_m(kind, weight, persons) for weight in weights}
+
+    kinds, errors_m = candidates([take.demonstration for take in taught.all]), dict[str, dict[float, float]]()
+    for kind in kinds:
+        progress(f"trying {kind.name}")
+        errors_m[kind.name] = by_weight_m(kind)
+    tried_m = {name: min(found.values()) for name, found in errors_m.items()}
+    simplest = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
+    if not blocks.any():
+        return Chosen(simplest, tried_m, errors_m[simplest.name])
+    best = min(kinds, key=lambda kind: tried_m[kind.name])
+    first = next(kind for kind in kinds if kind.alone == simplest.alone)
+    bases, timed = sorted({first, simplest, best}, key=kinds.index), list[Inputs]()
+    weights = {kind: min(found := errors_m[kind.name], key=found.__getitem__) for kind in bases}
+    limit_m = clock_limit_m(min(error_m(kind, weights[kind], blocks) for kind in bases))
+    for kind in bases:
+        for waits, name in CLOCKS.items():
+            progress(f"trying {kind.name}{name}")
+            clock = clock_of(tempos, kind.alone, waits=waits)
+            weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
+            with_clock_m = [error_m(one, weights[kind], blocks) for one in weighted]
+            weighed = preferred(weighted, with_clock_m, AS_GOOD * min(with_clock_m))
+            tried_m[weighed.name] = error_m(weighed, weights[kind], persons)
+            timed += [weighed] * (min(with_clock_m) < limit_m)
+    if not timed:
+        return Chosen(simplest, tried_m, errors_m[simplest.name])
+    kind = _simplest(timed, [tried_m[kind.name] for kind in timed])
+    return Chosen(kind, tried_m, by_weight_m(kind))
+
+
+def clock_limit_m(least_m: float) -> float:
+    """The error [m] that a clock must go below, if the least one without a clock is this."""
+    return min(CLOCK_ERROR_SHARE * least_m, least_m - AS_GOOD_M)
+
+
+def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
+    """The first of the kinds whose error is as good as the least of theirs."""
+    return preferred(kinds, errors_m, max(AS_GOOD * min(errors_m), min(errors_m) + AS_GOOD_M))

@@ -1,0 +1,651 @@
+"""Learning of a task with named via-points: a KMP from the share of a stage that each hand has
+covered to the share that the tool covers, with the teacher's delay and the errors of held-out
+demonstrations.
+
+A stage lies between two via-points. The skill estimates the present stage by the belief b (K,) over
+the K stages. This is the forward filter of a hidden Markov model with transition rates A and
+likelihoods l, see `thirdhand.core.skill.stages.recognise`:
+
+    b(t) ~ l(t) ∘ (I + dt A)ᵀ b(t - dt)
+
+Held-out predictions use the belief that the filter has along the take, and the delayed hands.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
+from kmp.criteria.cross_validation import held_out_residuals, preferred, rms
+from thirdhand.contract.records import SIDES
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill import ORDER
+from thirdhand.core.skill.memory import along
+from thirdhand.core.skill.staged import (
+    NO_ERRORS,
+    Placed,
+    StagedKMP,
+    Unknown,
+)
+from thirdhand.core.skill.stages import (
+    LEFT,
+    MOST_STAGES,
+    NONE,
+    OUTPUTS,
+    RIGHT,
+    STAYS,
+)
+from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
+from thirdhand.core.skill.task_clock import TaskClock
+from thirdhand.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.recognition import covered, recognised
+from thirdhand.workbench.learning.choice import shared_counts
+from thirdhand.workbench.learning.division import (
+    NEAR,
+    Divided,
+    Encoded,
+    encode,
+    ordered,
+    task_of,
+    via_points_never_reached,
+)
+from thirdhand.workbench.learning.gate import (
+    CEILING_M,
+    FLOOR_M,
+    every_few,
+    gate_between,
+    nonsense,
+)
+from thirdhand.workbench.learning.methods.clock import (
+    Tempo,
+    begins_of,
+    paired,
+    remark_on,
+    stage_clock_of,
+)
+from thirdhand.workbench.learning.methods.held_out import held_out_takes
+from thirdhand.workbench.learning.methods.inputs import (
+    AS_GOOD,
+    AS_GOOD_M,
+    CLOCKS,
+    LEAST_TURN_RAD,
+    POSITIONS,
+    clock_limit_m,
+    refit,
+)
+from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
+from thirdhand.workbench.learning.records import (
+    Delay,
+    Fitted,
+    HeldOut,
+    Options,
+    Progress,
+    Take,
+    Taught,
+    Weights,
+    persons_of,
+)
+from thirdhand.workbench.learning.regions import LEAST_BLOCKS, blocks_of, unknown_std
+
+SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
+LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
+ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
+SAMPLES_TRIED = 200  # delays and inputs are compared with about this number of samples of a demonstration
+LEAST_OFF_M = 0.03  # lower limit of the hands' distance from a segment, root mean square; few takes may show less
+LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
+CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
+SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the path to a corner that was demonstrated
+UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
+KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the longest clock at which the tool's share is known
+CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
+KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
+HOLD_SHARE = 0.005  # share of the time that the gate may hold: the tool follows hands that come from elsewhere
+OWN_DELAY_SHARE = 0.75  # the new takes get a delay of their own if it reduces their error to this share
+DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
+WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
+PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the segment, no offset
+
+
+class Hyperparameters(NamedTuple):
+    """The hyper-parameters of a task's KMP."""
+
+    ell: float  # of the kernel, whose inputs are shares
+    noise: float  # variance of a sample / variance of the kernel
+    weight: float = 1.0  # of a new take, see `weights`
+
+
+ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
+
+
+class Samples(NamedTuple):
+    """The N samples that are learned from: their rows in each demonstration, inputs (N, 2 + K) or
+    with a clock (N, 2 + K + 1), outputs (N, OUTPUTS), and `owner` (N,), the numbers of their
+    demonstrations. The first `new` demonstrations are held out and judged.
+    """
+
+    encoded: Sequence[Encoded]
+    rows: Sequence[Indices]
+    inputs: Vector
+    outputs: Vector
+    owner: Indices
+    new: int
+    clock: TaskClock | None = None
+
+    @classmethod
+    def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
+        """The samples of demonstrations, of which the first `new` are new, without a clock."""
+        count = len(encoded[0].stages)
+        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
+        each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
+        shares, labels, outputs = (
+            np.concatenate([values[rows] for values, rows in zip(column, each, strict=True)])
+            for column in zip(*((one.along, one.labels, one.wanted) for one in encoded), strict=True)
+        )
+        owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
+        return cls(encoded, each, inputs_of(shares, labels, count), outputs, owner, new)
+
+    def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
+        """The samples with a clock as the last input."""
+        times = [
+            tempo.in_stages(clock.rows(begins_of(one.stages)), one.labels)[rows]
+            for tempo, one, rows in zip(tempos, self.encoded, self.rows, strict=True)
+        ]
+        inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
+        return self._replace(inputs=inputs, clock=clock)
+
+    def best(self, weight: float) -> Hyperparameters:
+        """The hyper-parameters of this weight with the least error of held-out demonstrations."""
+        errors_m = {
+            Hyperparameters(ell, noise, weight): rms(errors)
+            for ell in ELLS
+            for noise, errors in zip(NOISES, self.held_out(ell, NOISES, weight), strict=True)
+        }
+        return min(errors_m, key=errors_m.__getitem__)
+
+    def held_out(self, ell: float, noises: Sequence[float], weight: float, block_of: Indices | None = None) -> Vector:
+        """The tool's errors (J, N, 3) [m] at the N samples of new demonstrations, with these noises
+        (J,) and this weight. Each of the H demonstrations is held out, or its whole block in
+        `block_of` (H,).
+        """
+        squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
+        is_new, held_out = self.owner < self.new, self.owner if block_of is None else block_of[self.owner]
+        roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None]
+        # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
+        kernel, targets = np.exp(-ell * squares) / (roots * roots.T), (self.outputs - PRIOR) / roots
+        missed = roots * held_out_residuals(kernel, np.array(noises), held_out, lambda _: targets)
+        found = (self.outputs - missed)[:, is_new]
+        errors = np.empty((*found.shape[:2], 3))
+        for h, (one, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
+            mine = self.owner[is_new] == h
+            errors[:, mine] = [one.tool[rows] - one.tools(rows, outputs) for outputs in found[:, mine]]
+        return errors
+
+    def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
+        """The KMP of all demonstrations except those in `without`, adapted to where the tool is
+        known to be.
+        """
+        kept = ~np.isin(self.owner, without)
+        weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
+        covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
+        primitive = KMP.fit(
+            self.inputs[kept],
+            Gaussians(self.outputs[kept], covariance),
+            kernel=GaussianKernel(parameters.ell),
+            lambda_mean=1.0,
+            prior_mean=PRIOR,
+            representation="dense",
+        )
+        at, shares = self._known([one for i, one in enumerate(self.encoded) if i not in without])
+        if self.clock is not None:
+            at, shares = self._timed(at, shares, self.clock)
+        wanted = np.column_stack([shares, np.zeros((len(at), OUTPUTS - 1))])
+        known = Gaussians(wanted, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(at), 1, 1)))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ViaPointMissed)
+            return primitive.adapt(at, known, tolerance=0.0)
+
+    def _timed(self, at: Vector, shares: Vector, clock: TaskClock) -> tuple[Vector, Vector]:
+        """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
+
+        If the clock runs while the hands rest, the tool may still be moving when the hands are at
+        the end of a stage. So it is known there only when the clock ends, and at the start of a
+        stage only when the clock starts. All other shares are known at any time.
+        """
+        stages = self.encoded[0].stages[at[:, 2:].argmax(axis=1)]
+        moves = (stages["square"] > STAYS) | (stages["leads"] != NONE)[:, None]
+        ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
+        found = [
+            (row, share, time)
+            for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
+            for time in KNOWN_TIMES
+            if clock.waits or not (is_end or is_begin) or time == float(is_end)
+        ]
+        rows, kept, times = (np.array(column) for column in zip(*found, strict=True))
+        return np.column_stack([rows, clock.weight * clock.longest_s * times]), kept
+
+    @staticmethod
+    def _known(shown: Sequence[Encoded]) -> tuple[Vector, Vector]:
+        """Inputs (V, 2 + K) at which the tool's share (V,) is known.
+
+        The share is 1 at the end of a stage and 0 at its start. At a corner it is 0 or 1 if the
+        tool usually was at that end, and 0 if no demonstration has the corner.
+        """
+        squares, leads = shown[0].stages["square"], shown[0].stages["leads"]
+        both = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
+        known: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
+        begins = np.where((squares > STAYS) | (leads != NONE)[:, None], 0.0, 1.0)
+        known += [(*begins[k], k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
+        for corner in CORNERS:
+            is_unseen = _seen(shown, corner, both)[0] < LEAST_SEEN_S
+            for k in both:
+                lasts_s, shares = _seen(shown, corner, [k])
+                usual = 0.0 if is_unseen else float(np.median(shares)) if lasts_s >= LEAST_SEEN_S else 0.5
+                if usual < NEAR:
+                    waits = UNSEEN_SHARES if is_unseen else SEEN_SHARES
+                    known += [(share * corner[0], share * corner[1], k, 0.0) for share in waits]
+                elif usual > 1.0 - NEAR:
+                    known.append((*corner, k, 1.0))
+        found = np.array(known)
+        return inputs_of(found[:, :2], found[:, 2].astype(np.int64), len(squares)), found[:, 3]
+
+
+def _seen(shown: Sequence[Encoded], corner: tuple[float, float], stages: Sequence[int]) -> tuple[float, Vector]:
+    """The time [s] that hands were near a corner of these stages, and the tool's shares then."""
+    rows = [one.near(corner, stages) for one in shown]
+    lasts_s = sum(float(its.sum()) * one.period_s for one, its in zip(shown, rows, strict=True))
+    return lasts_s, np.concatenate([one.wanted[its, 0] for one, its in zip(shown, rows, strict=True)])
+
+
+def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
+    """The inputs (T, 2 + K) for shares (T, 2) of both hands in the stages (T,) of K."""
+    return np.hstack([shares, STAGE_DISTANCE * np.eye(count)[labels]])
+
+
+def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
+    """Tasks in which the share of one hand alone counts, by name; none if one hand conducts anyway.
+    A hand qualifies if it was ahead of the other one in the demonstrations, so that they show
+    whether the tool waits, or if it is the only hand that the tool follows.
+    """
+    if any(one.demonstration.conducts != "both" for one in shown):
+        return {}
+    both = np.flatnonzero((shown[0].stages["square"] > STAYS).all(axis=1)).tolist()
+    followed = set(task.follow.tolist()) - {NONE}
+    sides = [
+        side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], both)[0] >= LEAST_SEEN_S
+    ]
+    return {f"positions, shares of the {SIDES[side]} hand alone": task._replace(leads=side) for side in sides}
+
+
+def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[str, Task]:
+    """Tasks in which the tool turns with hands that turn in the demonstrations, by name: with the
+    hands that it follows, or with one hand that it then follows everywhere.
+    """
+    turns = np.concatenate([one.turns for one in demonstrations]).reshape(-1, 2, 9)
+    sides = np.flatnonzero(np.ptp(turns, axis=0).max(axis=1) > math.sin(LEAST_TURN_RAD)).tolist()
+    levers = np.zeros((len(task.names), 3))
+    out: dict[str, Task] = {}
+    if np.isin(task.follow, sides).any():
+        out["orientation of the followed hand"] = task._replace(levers=levers)
+    for side in sides:
+        if (task.follow != side).any():
+            everywhere = np.full_like(task.follow, side)
+            out[f"orientation of the {SIDES[side]} hand"] = task._replace(follow=everywhere, levers=levers)
+    return out
+
+
+class _Prediction(NamedTuple):
+    """A take's mean prediction, learned without its block: the delayed hands (T, 6) [m], or (T, 24)
+    with their turns, the belief (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of the
+    primitives of orientation and gripper.
+    """
+
+    hands: Vector
+    belief: Vector
+    errors: Vector
+    inputs: Vector
+    tempos: Vector  # (T, 3) as in `Placed.mean`
+
+    @classmethod
+    def of(
+        cls, one: Encoded, placed: Placed, delay_s: float, tempo: Tempo | None, clock: TaskClock | None, step: int
+    ) -> Self:
+        """The prediction at one of every `step` samples."""
+        belief = np.zeros((len(one.tool), MOST_STAGES))
+        recognised(one.moving, one.period_s, placed.stages, belief)
+        hands = one.moving[:, 0]
+        if delay_s > 0.0:
+            hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
+        times = np.zeros(len(hands))
+        if clock is not None and tempo is not None:
+            times = tempo.in_stages(clock.rows(begins_of(placed.stages)), belief.argmax(axis=1))
+        hands = np.hstack([hands, one.turns(delay_s)])[::step]
+        belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
+        errors = one.tool[::step] - placed.mean(hands, belief, tempos)
+        found = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.stages)
+        beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
+        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
+        return cls(hands, belief, errors, np.hstack(inputs), tempos)
+
+    def retained(self, count: int) -> Vector:
+        """Errors (M, 6) at up to `count` samples: shares (2,), stage, and error (3,) [m]."""
+        rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
+        stages = self.belief[rows].argmax(axis=1)
+        return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
+
+
+class Candidate(NamedTuple):
+    """A task and a teacher's delay that are tried, with the encoded demonstrations, the samples,
+    the hands' distances (K, 2) [m] from their segments, and hyper-parameters.
+
+    The delay is that of the new demonstrations, see `Samples`.
+    """
+
+    task: Task
+    delay_s: float
+    encoded: Sequence[Encoded]
+    samples: Samples
+    off: Vector
+    parameters: Hyperparameters
+    tempos: Sequence[Tempo] = ()  # needed with a clock
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        new: Sequence[Divided],
+        delay_s: float,
+        earlier: Sequence[Divided] = (),
+        before_s: float = 0.0,
+        weight: float = 1.0,
+    ) -> Self:
+        """The candidate of a task with this delay. Earlier demonstrations have a delay of their
+        own, `before_s`, and the new ones this weight against them.
+        """
+        task, encoded = encode(task, [*new, *earlier], [delay_s] * len(new) + [before_s] * len(earlier))
+        samples = Samples.of(encoded, len(new))
+        return cls(task, delay_s, encoded, samples, _off_m(encoded), samples.best(weight))
+
+    def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
+        """The candidate with a clock as the last input, and the best parameters with it."""
+        samples = self.samples.clocked(tempos, clock)
+        return self._replace(samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos)
+
+    def without(self, block: Sequence[int], primitive: KMP, step: int = 1) -> dict[int, _Prediction]:
+        """The predictions of a block's demonstrations at one of every `step` samples, by a
+        primitive that was learned without them.
+        """
+        clock, found = self.samples.clock, dict[int, _Prediction]()
+        for h in block:
+            placed = Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS, clock)
+            tempo = None if clock is None else self.tempos[h]
+            found[h] = _Prediction.of(self.encoded[h], placed, self.delay_s, tempo, clock, step)
+        return found
+
+    def squares(self, blocks: Sequence[Sequence[int]]) -> Vector:
+        """The mean squared errors (H,) [m²] of the held-out demonstrations, at some samples."""
+        step = 1 + max(len(one.labels) for one in self.encoded) // SAMPLES_TRIED
+        found: dict[int, _Prediction] = {}
+        for block in blocks:
+            found |= self.without(block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step)
+        return np.array([rms(found[h].errors) ** 2 for h in range(self.samples.new)])
+
+
+def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence[int]:
+    """The demonstrations that are left out to predict a block: the block, or none if it is the only
+    one.
+    """
+    return block if len(blocks) > 1 else ()
+
+
+def is_clear(gains: Vector) -> bool:
+    """True if the mean of gains (B,) in blocks is above one standard error of it."""
+    return len(gains) < LEAST_BLOCKS or bool(gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains)))
+
+
+def with_delay(
+    task: Task,
+    shown: Sequence[Divided],
+    blocks: Sequence[Sequence[int]],
+    usual_s: float | None = None,
+    given_s: float | None = None,
+) -> tuple[Candidate, Delay, float]:
+    """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
+    in all of them; that delay, with the standard deviation of the best delays of the single
+    demonstrations; and the error [m]. There is none unless it reduces the mean squared error by
+    more than one standard error over the blocks. If `usual_s` is given, it is the delay unless
+    another one predicts much better: a teacher's delay varies between takes, and there may be only
+    a few. A delay that is `given_s` is taken as it is.
+    """
+    delays_s = DELAYS_S if given_s is None else (given_s,)
+    candidates = [Candidate.of(task, shown, late_s) for late_s in delays_s]
+    squares = np.array([one.squares(blocks) for one in candidates])
+    best, each_s = int(squares.sum(axis=1).argmin()), np.array(delays_s)[squares.argmin(axis=0)]
+    if usual_s is not None:
+        usual = delays_s.index(usual_s)
+        if squares[best].sum() > OWN_DELAY_SHARE**2 * squares[usual].sum():
+            best = usual
+    elif not is_clear(np.array([(squares[0] - squares[best])[block].mean() for block in blocks])):
+        best = 0
+    return candidates[best], Delay(delays_s[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
+
+
+@dataclass(frozen=True)
+class Staged:
+    """The method with its options, for a task."""
+
+    options: Options
+    task: Task
+
+    @classmethod
+    def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self | None:
+        """The method, if all demonstrations name the same via-points and no option rules it out."""
+        if options.components is not None or options.ell is not None:
+            return None
+        task, _ = task_of(demonstrations)
+        return None if task is None else cls(options, task)
+
+    def fit(self, taught: Taught, progress: Progress) -> Fitted:
+        """The model of the task, its gate on the hands' distance from their segments, and its
+        predictions of held-out takes.
+
+        Raises SkillError if the tool never came near a via-point.
+        """
+        takes, demonstrations = taught.new, [take.demonstration for take in taught.all]
+        names = [take.name for take in taught.all]
+        remarks = via_points_never_reached(self.task, demonstrations, names)
+        progress(f"learning between the via-points {', '.join(self.task.names)}")
+        blocks = blocks_of(persons_of(takes))
+        best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
+        task, encoded, off = best.task, best.encoded, best.off
+        if best.samples.clock is not None:
+            remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each stage")
+        tempos, shown = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
+        untimed = stage_clock_of(
+            tempos, [one.stages for one in shown], [one.labels for one in shown], waits=False
+        )._replace(weight=0.0)
+        predictions: dict[int, _Prediction] = {}
+        for block in blocks:
+            progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
+            primitive = best.samples.fitted(best.parameters, _left_out(blocks, block))
+            predictions |= best.without(block, primitive)
+        errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
+        unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
+        known = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
+        progress(f"learning from all {len(takes)}")
+        model = StagedKMP(
+            best.samples.fitted(best.parameters),
+            task,
+            self._nominal(takes),
+            off,
+            np.concatenate(errors),
+            delay.mean_s,
+            clock=best.samples.clock or untimed,
+            unknown=unknown,
+        )
+        held_out: dict[int, HeldOut] = {}
+        wrong: dict[int, list[Vector]] = {}
+        for block in blocks:
+            others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
+            for h in block:
+                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, best.samples.clock, known)
+                held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
+                wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
+        in_order = [held_out[h] for h in range(len(takes))]
+        kinds = [np.concatenate(kind) for kind in zip(*(wrong[h] for h in range(len(takes))), strict=True)]
+        reached = np.concatenate([one.gate_m for one in in_order])
+        gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
+        baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
+        return Fitted(
+            model,
+            in_order,
+            gate,
+            delay,
+            taken=taken,
+            tried_m=tried_m,
+            baselines=baselines,
+            remarks=remarks,
+            weights=weights,
+        )
+
+    def _chosen(
+        self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
+    ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
+        """The candidate that predicts held-out new takes best, its delay, the errors [m] of all
+        candidates, its name, and the weights.
+        """
+        new, earlier = (
+            [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
+        )
+        demonstrations, given_s = [take.demonstration for take in taught.new], self.options.delay_s
+        progress(f"choosing the delay over {len(new)} demonstrations")
+        everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # to judge what all persons share
+        usual_s = with_delay(self.task, everybody, all_blocks, given_s=given_s)[1].mean_s if earlier else None
+        best, delay, error_m = with_delay(self.task, new, blocks, usual_s, given_s)
+
+        def tried(task: Task) -> Candidate:
+            return Candidate.of(task, everybody, delay.mean_s)
+
+        if earlier:
+            error_m = math.sqrt(tried(self.task).squares(all_blocks).mean())
+        taken, tried_m = POSITIONS.name, {POSITIONS.name: error_m}
+        for is_simpler in (True, False):
+            shown = tried(best.task).encoded if earlier else best.encoded
+            tasks = leading_tasks(best.task, shown) if is_simpler else turning_tasks(best.task, demonstrations)
+            errors_m = {taken: tried_m[taken]}
+            for name, task in tasks.items():
+                progress(f"trying {name}")
+                errors_m[name] = math.sqrt(tried(task).squares(all_blocks).mean())
+            least_m = min(errors_m.values())
+            limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
+            taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
+            if taken in tasks:
+                best, delay, least_m = with_delay(tasks[taken], new, blocks, usual_s, given_s)
+                errors_m[taken] = errors_m[taken] if earlier else least_m
+            tried_m |= errors_m
+        clocked = _with_clocks(best, taught, progress)
+        errors_m = {taken + name: math.sqrt(one.squares(blocks).mean()) for name, one in clocked.items()}
+        without_m = math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
+        if errors_m and min(errors_m.values()) < clock_limit_m(without_m):
+            best = clocked[preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))]
+            taken = next(name for name, one in zip(errors_m, clocked.values(), strict=True) if one is best)
+        if not earlier or taken in errors_m:  # else these are errors of the new takes alone
+            tried_m |= errors_m
+        if len(tried_m) == 1:
+            tried_m = {}
+        if not earlier:
+            return best, delay, tried_m, taken, None
+        progress(f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones")
+        before_s = with_delay(best.task, earlier, blocks_of(persons_of(taught.earlier)), given_s=given_s)[1].mean_s
+        weighted = {
+            weight: Candidate.of(
+                best.task, new, delay.mean_s, earlier if math.isfinite(weight) else (), before_s, weight
+            )
+            for weight in WEIGHTS
+        }
+        if (clock := best.samples.clock) is not None:
+            tempos = [Tempo.of(take.demonstration) for take in taught.all]
+            weighted = {weight: one.clocked(tempos[: len(one.encoded)], clock) for weight, one in weighted.items()}
+        weight, weights = chosen({one: math.sqrt(it.squares(blocks).mean()) for one, it in weighted.items()})
+        return weighted[weight], delay, tried_m, taken, weights
+
+    def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
+        """The mean via-points of the takes."""
+        places = (list(ordered(take.demonstration.places, self.task.names)) for take in takes)
+        return NamedViaPoints(self.task.names, np.mean([NamedViaPoints.of(one).at for one in places], axis=0))
+
+    def _without_places(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
+        """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
+        progress("learning without the via-points, for comparison")
+        inputs = [take.hands for take in takes]
+        fit = refit(POSITIONS, takes, inputs, self.options.points, None)
+        return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
+
+
+def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
+    """The candidate with those clocks that may predict clearly better, by the clock's name.
+
+    This comparison ignores where the tool is known to be, and holds out the blocks of `paired`. If
+    a skill is refined, the pace of the new takes counts, and they are held out person by person.
+    """
+    persons = persons_of(taught.new)
+    block_of = persons if taught.earlier else paired(persons)
+    if not block_of.any():
+        return {}
+
+    def error_m(samples: Samples) -> float:
+        return min(map(rms, samples.held_out(best.parameters.ell, NOISES, 1.0, block_of)))
+
+    tempos = [Tempo.of(take.demonstration) for take in taught.new]
+    limit_m, out = clock_limit_m(error_m(best.samples)), dict[str, Candidate]()
+    stages, labels = [one.stages for one in best.encoded], [one.labels for one in best.encoded]
+    for waits, name in CLOCKS.items():
+        progress(f"trying {POSITIONS.name}{name}")
+        clock = stage_clock_of(tempos, stages, labels, waits=waits)
+        tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
+        errors_m = [error_m(best.samples.clocked(tempos, one)) for one in tried]
+        if min(errors_m) < limit_m:
+            out[name] = best.clocked(tempos, preferred(tried, errors_m, AS_GOOD * min(errors_m)))
+    return out
+
+
+def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
+    """The covariances (N, 3, 3) [m²] of the tool at each via-point over the demonstrations. Where
+    it follows a hand, they are those of its offset from that hand; where it also turns with the
+    hand, zeros.
+    """
+    at = np.array([one.at.at[[one.at.names.index(name) for name in task.names]] for one in encoded])
+    for n, side in enumerate(task.follow.tolist()):
+        if side != NONE:
+            at[:, n, 6:] -= at[:, n, 6:] if task.levers is not None else at[:, n, 3 * side : 3 * side + 3]
+    off = at[:, :, 6:] - at[:, :, 6:].mean(axis=0)
+    return np.asarray(np.einsum("dni,dnj->nij", off, off) / max(len(encoded) - 1, 1))
+
+
+def _off_m(encoded: Sequence[Encoded]) -> Vector:
+    """The distances (K, 2) [m] of the hands from their segments in each stage, root mean square. A
+    stage that no demonstration has gets those of all stages.
+    """
+    labels, off = np.concatenate([one.labels for one in encoded]), np.concatenate([one.off for one in encoded])
+    by_stage = [off[labels == k] if (labels == k).any() else off for k in range(len(encoded[0].stages))]
+    return np.array([np.maximum(np.sqrt((one**2).mean(axis=0)), LEAST_OFF_M) for one in by_stage])
+
+
+def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
+    """The record of a take with the covariance from other blocks' errors, in `placed`."""
+    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.tempos, strict=True)
+    return HeldOut(
+        take,
+        found.errors,
+        np.array([placed.covariance(*row) for row in rows]),
+        placed.gates_m(hands),
+        found.inputs,
+        known=np.hstack([hands, TURN_WEIGHT_M * found.hands[:, 6:], found.inputs[:, 2:]]),
+        belief=found.belief[:, : len(one.stages)],
+    )

@@ -1,0 +1,172 @@
+"""Learning of the tool's orientation and of the gripper.
+
+Each is a primitive over the inputs of the position's primitive. An orientation is represented by
+zeta (3,), half the rotation vector from the mean orientation. An orientation that hardly changes
+stays constant. Takes that contradict each other are reported, and refused if they do so often.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kmp import GaussianKernel
+from kmp.criteria.cross_validation import rms
+from kmp.criteria.direct import DirectSelection, Parameters
+from kmp.orientation import continuous, log
+from thirdhand.core.frame import Vector
+from thirdhand.core.geometry import angles
+from thirdhand.core.skill.pose import (
+    CLOSED,
+    UNKNOWN,
+    LearnedGripper,
+    LearnedOrientation,
+    decided,
+)
+from thirdhand.skills.flat import UNDECIDED, even
+from thirdhand.workbench.learning.ambiguity import contradictions
+from thirdhand.workbench.learning.choice import selection_of
+from thirdhand.workbench.learning.records import (
+    HeldOut,
+    Pose,
+    Verdict,
+    persons_of,
+)
+
+CONSTANT_RAD = math.radians(5.0)  # an orientation that stays this near to its mean counts as constant
+DIFFERENT_RAD = math.radians(30.0)  # orientations this far from each other contradict each other at the same hands
+NOTED_SHARE, UNSAFE_SHARE = 0.01, 0.10  # limits of the share of samples that contradict others
+NOTED_DEG, UNSAFE_DEG = 15.0, 60.0  # limits of the held-out error
+SIGN_SAMPLES = 100  # samples of a take by which its quaternions' sign is chosen
+MOST_TURN_DEG = 480.0  # a tool that turns farther comes too near to the opposite of the mean orientation
+SINGLE_TAKE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # hyper-parameters if there is one person, and nothing to choose by
+GRIPPER_WRONG_SHARE = 0.15  # a gripper that is wrong in a larger share of held-out samples is noted
+
+
+def learned_pose(held_out: Sequence[HeldOut], *, points: int, gripper_ell: float, near_m: float) -> Pose:
+    """The orientation and the gripper of held-out takes, over their inputs (T, I), from about
+    `points` samples; `near_m` as in `contradictions`.
+
+    Raises ValueError if primitives cannot be fitted.
+    """
+    unit = [one.take.tool[:, 3:] / np.linalg.norm(one.take.tool[:, 3:], axis=1)[:, None] for one in held_out]
+    mean, signed = _signed(mean_orientation(np.concatenate([one.take.tool[:, 3:] for one in held_out])), unit)
+    turn, turn_error_deg, missed = _learned_turn(mean, held_out, signed, points)
+    verdicts: list[Verdict] = []
+    if turn is not None:
+        found = contradictions(
+            held_out,
+            unit,
+            missed,
+            lambda tools, others: angles(tools[:, None], others),
+            different=DIFFERENT_RAD,
+            near_m=near_m,
+        )
+        if found.share > NOTED_SHARE:
+            text = (
+                f"the tool's orientation contradicts itself in {100 * found.share:.0f} % of the samples, up to "
+                f"{100 * UNSAFE_SHARE:.0f} % accepted: {found.pair} have the hands {1000 * found.hands_m:.0f} mm from "
+                f"each other and the tools turned by {math.degrees(found.tools):.0f}°"
+            )
+            verdicts.append(Verdict("unsafe" if found.share > UNSAFE_SHARE else "warning", text))
+    if turn_error_deg is not None and turn_error_deg > NOTED_DEG:
+        text = f"the tool's orientation in held-out demonstrations is missed by {turn_error_deg:.0f}° rms"
+        if turn_error_deg > UNSAFE_DEG:
+            turned_deg = max(math.degrees(turned_rad(q)) for q in unit)
+            text += (
+                f", up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one of them; let it "
+                f"turn by less than {MOST_TURN_DEG:.0f}°, the same way in each"
+            )
+        verdicts.append(Verdict("unsafe" if turn_error_deg > UNSAFE_DEG else "warning", text))
+    gripper, right, remarks = _learned_gripper(held_out, points=points, ell=gripper_ell)
+    verdicts += (Verdict("warning", text) for text in remarks)
+    return Pose(mean, turn, gripper, turn_error_deg, right, verdicts)
+
+
+def turned_rad(quaternions: Vector) -> float:
+    """The largest angle [rad] of the orientations (T, 4) from the first one, also beyond pi."""
+    smooth = continuous(quaternions)
+    return float(2.0 * np.arccos(np.clip(smooth @ smooth[0], -1.0, 1.0)).max())
+
+
+def mean_orientation(quaternions: ArrayLike) -> Vector:
+    """The mean (4,) of quaternions x y z w (M, 4) of any signs: the leading eigenvector of Σ q qᵀ
+    (Markley et al. 2007).
+    """
+    q = np.asarray(quaternions, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    mean = np.linalg.eigh(q.T @ q)[1][:, -1]
+    return np.asarray(mean * (1 if mean[3] >= 0 else -1))
+
+
+def _learned_turn(
+    mean: Vector, held_out: Sequence[HeldOut], unit: Sequence[Vector], points: int
+) -> tuple[LearnedOrientation | None, float | None, list[Vector]]:
+    """The primitive of orientations (T, 4), None if they are constant; its held-out error [deg];
+    and the held-out error (T,) [rad] of each take.
+    """
+    if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
+        return None, None, []
+    persons = persons_of([one.take for one in held_out])
+    zetas = [log(q, mean) for q in unit]
+    pairs = [(one.inputs, zeta) for one, zeta in zip(held_out, zetas, strict=True)]
+    choice = selection_of(pairs, points, persons=persons, isotropic=True)
+    several = len(np.unique(persons)) > 1
+    parameters = choice.parameters() if several else SINGLE_TAKE
+    residuals = choice.residuals(parameters.ell, parameters.noise)
+    error_deg = math.degrees(2.0 * rms(residuals)) if several else None
+    missed = []
+    for one, zeta in zip(held_out, zetas, strict=True):
+        others = choice.primitive(parameters, residuals, without=one.take.person if several else None)
+        missed.append(2.0 * np.linalg.norm(zeta - others.mean(one.inputs), axis=1))
+    return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
+
+
+def _signed(mean: Vector, unit: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
+    """The mean orientation (4,), and the orientations (T, 4) with signs that are constant in time.
+
+    Beyond half a turn from the mean, the nearer sign is the wrong one. Then each take has the sign
+    with which it is nearest to the first take, and the mean is that of the signed quaternions.
+    """
+    smooth = [continuous(q) for q in unit]
+    near = [q if (q @ mean).sum() >= 0.0 else -q for q in smooth]
+    if all((q @ mean > 0.0).all() for q in near):
+        return mean, near
+    along = [q[np.linspace(0, len(q) - 1, SIGN_SAMPLES).round().astype(int)] for q in smooth]
+    signed = [q if (at * along[0]).sum() >= 0.0 else -q for q, at in zip(smooth, along, strict=True)]
+    total = np.concatenate(signed).sum(axis=0)
+    size = float(np.linalg.norm(total))
+    return (total / size, signed) if size > 0.0 else (mean, near)
+
+
+def _learned_gripper(
+    held_out: Sequence[HeldOut], *, points: int, ell: float
+) -> tuple[LearnedGripper | None, float | None, list[str]]:
+    """The gripper, the share of held-out samples [%] in which it is right, and warnings."""
+    known = [(one.inputs, one.take.closure[:, None]) for one in held_out if one.take.closure is not None]
+    if not known:
+        return None, None, []
+    unknown = [one.take.name for one in held_out if one.take.closure is None]
+    remarks = [f"{', '.join(unknown)} without gripper: it is learned from the others"] * bool(unknown)
+    choice = selection_of(known, points)
+    right, prior = None, np.array([UNDECIDED])
+    if len(known) > 1:
+        right = 100.0 * float(np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(known))]).mean())
+        if right < 100.0 * (1.0 - GRIPPER_WRONG_SHARE):
+            remarks.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it via-points")
+    primitive = even(choice.inputs, choice.outputs, GaussianKernel(ell), prior)
+    return LearnedGripper(primitive), right, remarks
+
+
+def _is_right(choice: DirectSelection, take: int, prior: Vector, ell: float) -> NDArray[np.bool_]:
+    """Return whether the gripper that the other takes lead to is right at a take's points (N,)."""
+    mine = choice.group == take
+    others = even(choice.inputs[~mine], choice.outputs[~mine], GaussianKernel(ell), prior)
+    gripper, found = UNKNOWN, []
+    for closure in others.mean(choice.inputs[mine])[:, 0].tolist():
+        gripper = decided(gripper, closure)
+        found.append(gripper == CLOSED)
+    return np.asarray(np.array(found) == (choice.outputs[mine, 0] > UNDECIDED))

@@ -1,0 +1,224 @@
+"""Calibration of a model's covariance and of its regions, by takes that the model was not learned
+from.
+
+Judged is the tool at the same moment, including its lag. With e the errors, C the model's
+covariances and v the recent velocities of its predictions, the timing's standard deviation is
+
+    τ = argmin mean(log det C_τ) + 3 log mean(eᵀ C_τ^-1 e),   C_τ = C + τ² v vᵀ
+
+in which each take counts equally. The squared radius of a level p is
+
+    ρ_p = Q_p(d²) min(max(Q_p(d² / Q_p(d² of the other blocks)), 1), 100),   d² = eᵀ C_τ^-1 e
+
+with the quantile Q_p in which each take counts equally, as the samples of a take depend on each
+other. The second factor widens a region until it holds on blocks of takes that it was found without
+(conformal prediction across folds; Barber et al. 2021). The published covariance is scaled by
+ρ_0.95 / χ²_0.95.
+
+The error probability, that the tool is farther than UNSURE_M from its prediction, follows from the
+quantiles of |e|² / tr C of the published covariances C. The skill is unsure where it is above the
+alarm: the smallest probability that is exceeded at FALSE_ALARM_SHARE of the moments at which the
+tool is nearer; or a larger one that is still exceeded at ALARM_SHARE of the other moments.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp import KMP, ViaPointMissed
+from thirdhand.contract.requests import TOLERANCE_M
+from thirdhand.core.frame import Vector
+from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.model import (
+    LEVELS,
+    NORMAL,
+    REGION_95,
+    Regions,
+)
+from thirdhand.core.skill.step import recent
+from thirdhand.core.skill.support import LocalErrors
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import SkillError
+from thirdhand.skills.via_points import check_agreement
+from thirdhand.workbench.learning.records import (
+    HeldOut,
+    Take,
+    TimedErrors,
+    persons_of,
+)
+
+LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
+BLOCKS = 6  # takes that follow each other, often of one person or hour, are held out in so many blocks at most
+SAMPLES = 150  # samples of a take that are judged, at most
+# Candidates for the timing's standard deviation. A larger one explains few large errors by making
+# all motion uncertain.
+TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
+WIDEST = 100.0  # a region's squared radius is widened at most by this factor
+LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as this one
+LEAST_RADIUS = 1e-9  # a squared radius is at least this large
+FALSE_ALARM_SHARE, ALARM_SHARE = 0.12, 0.95  # shares of the right and of the wrong moments at which the skill is unsure
+LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
+ALARMS = (0.005, 0.5)  # what is that improbable is no alarm, and what is more probable than not is one
+LOCAL_ERRORS_RETAINED = 300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
+LEAST_RETAINED = 4  # errors of a demonstration
+
+
+def blocks_of(persons: NDArray[np.intp], most: int = BLOCKS) -> list[list[int]]:
+    """The numbers of the takes that are held out at once, by the takes' persons (H,), in at most
+    `most` blocks, or BLOCKS.
+    """
+    numbers = np.unique(persons)
+    blocks = np.array_split(numbers, max(1, min(BLOCKS, most, len(numbers))))
+    return [np.flatnonzero(np.isin(persons, block)).tolist() for block in blocks if len(block)]
+
+
+def timed_errors(one: HeldOut) -> TimedErrors:
+    """The errors of a held-out take at the same moment."""
+    return _timed(one.take, one.take.position - one.errors, one.covariance[_rows(len(one.errors))])
+
+
+def refitted_errors(
+    takes: Sequence[Take], inputs: Sequence[Vector], fitted: Callable[[list[int]], HandsKMP]
+) -> list[TimedErrors]:
+    """The errors at the same moment of takes with these inputs (T, I), by models that are `fitted`
+    to all blocks of takes but their own.
+
+    Hyper-parameters are chosen without the held-out block, too. A model passes through the
+    via-points of the demonstration, as it will in use.
+    """
+    out: dict[int, TimedErrors] = {}
+    for block in blocks_of(persons_of(takes)):
+        model = fitted([i for i in range(len(takes)) if i not in block])
+        for i in block:
+            primitive = _through_places(model, takes[i].demonstration).primitive
+            covariance = primitive.predict(inputs[i][_rows(len(inputs[i]))]).covariance
+            out[i] = _timed(takes[i], primitive.mean(inputs[i]), covariance)
+    return [out[i] for i in range(len(takes))]
+
+
+def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regions:
+    """The regions that the errors of takes by these persons (H,) lead to; those of a normal
+    distribution if there are fewer than LEAST_BLOCKS blocks.
+    """
+    blocks = blocks_of(persons)
+    if len(blocks) < LEAST_BLOCKS:
+        return NORMAL
+    std_s = min(TIMINGS_S, key=lambda candidate_s: _cost(errors, candidate_s))
+    squares = [one.squares(std_s) for one in errors]
+    radii = np.maximum.accumulate([_radius(squares, blocks, level) for level in LEVELS])
+    scale = float(radii[LEVELS.index(0.95)]) / REGION_95
+    regions = Regions(scale, std_s, tuple((radii / scale).tolist()))
+    relative = [(one.errors**2).sum(axis=1) / np.trace(one.published(regions), axis1=1, axis2=2) for one in errors]
+    ratios = np.maximum.accumulate([max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS])
+    regions = regions._replace(ratios=tuple(ratios.tolist()))
+    return regions._replace(alarm=_alarm(errors, regions))
+
+
+def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
+    """The error probability above which a skill with these errors is unsure."""
+    found, wrong = [one.probabilities(regions) for one in errors], [one.is_wrong for one in errors]
+    right = [values[~is_wrong] for values, is_wrong in zip(found, wrong, strict=True) if not is_wrong.all()]
+    alarm = _quantile(right, 1.0 - FALSE_ALARM_SHARE) if right else ALARMS[0]
+    among = np.concatenate(found)[np.concatenate(wrong)]
+    if len(among) >= LEAST_WRONG:
+        alarm = max(alarm, float(np.quantile(among, 1.0 - ALARM_SHARE)))
+    return min(max(alarm, ALARMS[0]), ALARMS[1])
+
+
+def local_errors(
+    timed: Sequence[TimedErrors], inputs: Sequence[Vector], takes: Sequence[Take], primitive: KMP
+) -> tuple[list[TimedErrors], LocalErrors]:
+    """The errors of takes with inputs (T, I), each with covariances by the errors of the other
+    blocks; and those that a model with this primitive keeps.
+    """
+    each, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
+    at = [values[_rows(len(values))] for values in inputs]
+    kept = [np.unique(np.linspace(0, len(values) - 1, min(each, len(values))).round().astype(int)) for values in at]
+    unknown_std_m = unknown_std(takes)
+
+    def of(numbers: Sequence[int]) -> LocalErrors:
+        some, errors = (
+            np.concatenate([values[i][kept[i]] for i in numbers]) for values in (at, [one.errors for one in timed])
+        )
+        return LocalErrors.of(primitive, some, errors, unknown_std_m)
+
+    out = list(timed)
+    for block in blocks_of(persons):
+        others = of([i for i in range(len(takes)) if i not in block])
+        for i in block:
+            out[i] = timed[i]._replace(covariance=others.covariances(at[i]))
+    return out, of(range(len(takes)))
+
+
+def unknown_std(takes: Sequence[Take]) -> float:
+    """The standard deviation [m] of the tool's positions on each axis, root mean square."""
+    return float(np.sqrt(np.concatenate([take.position for take in takes]).var(axis=0).mean()))
+
+
+def calibrated_without(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> list[tuple[TimedErrors, Regions]]:
+    """The errors of each take, and the regions that the other blocks lead to."""
+    out: dict[int, tuple[TimedErrors, Regions]] = {}
+    for block in blocks_of(persons):
+        kept = [i for i in range(len(errors)) if i not in block]
+        regions = calibrated([errors[i] for i in kept], persons[kept])
+        out |= {i: (errors[i], regions) for i in block}
+    return [out[i] for i in range(len(errors))]
+
+
+def _rows(count: int) -> NDArray[np.intp]:
+    return np.linspace(0, count - 1, min(SAMPLES, count)).round().astype(np.intp)
+
+
+def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
+    """The errors of a mean (T, 3) [m], with covariances (S, 3, 3) [m²] at the judged samples."""
+    rows, trail, velocity = _rows(len(mean)), mean[0].copy(), np.empty_like(mean)
+    begins = take.demonstration.begins if len(mean) == len(take.demonstration.tool) else ()
+    for i, position in enumerate(mean):
+        if i in begins:
+            trail[:] = position
+        velocity[i] = recent(position, take.demonstration.period_s, trail)
+    return TimedErrors((take.position - mean)[rows], covariance, velocity[rows])
+
+
+def _through_places(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:
+    """The model adapted to the demonstration's via-points, unless they contradict each other."""
+    if not demonstration.places:
+        return model
+    try:
+        check_agreement(demonstration.places)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ViaPointMissed)  # the errors contain it
+            weight = 1.0 / len(model.primitive.base.inputs)
+            return model.through(demonstration.places, tolerance=TOLERANCE_M, weight=weight)
+    except (SkillError, ValueError):
+        return model
+
+
+def _cost(errors: Sequence[TimedErrors], std_s: float) -> float:
+    """The negative log likelihood of the errors at the best scale, but for constants."""
+    each = [(np.linalg.slogdet(one.with_timing(std_s))[1].mean(), one.squares(std_s).mean()) for one in errors]
+    size, square = np.mean(each, axis=0)
+    return float(size + 3.0 * np.log(max(square, LEAST_SQUARE)))
+
+
+def _radius(squares: Sequence[Vector], blocks: Sequence[Sequence[int]], level: float) -> float:
+    """The squared radius of a level's region for squared distances (T,) of each take."""
+    relative: list[Vector] = [np.empty(0)] * len(squares)
+    for block in blocks:
+        others = _quantile([one for i, one in enumerate(squares) if i not in block], level)
+        for i in block:
+            relative[i] = squares[i] / max(others, LEAST_SQUARE)
+    widened = min(max(_quantile(relative, level), 1.0), WIDEST)
+    return max(_quantile(squares, level) * widened, LEAST_RADIUS)
+
+
+def _quantile(groups: Sequence[Vector], level: float) -> float:
+    """The quantile of values (T,) in groups that count equally."""
+    values = np.concatenate(groups)
+    order = np.argsort(values)
+    share = np.cumsum(np.concatenate([np.full(len(one), 1.0 / len(one)) for one in groups])[order])
+    return float(np.interp(level, share / share[-1], values[order]))

@@ -1,0 +1,239 @@
+"""Verdicts on a skill: a table of rules with predicates, severities, texts and remedies.
+
+Unsafe is what the service cannot make safe: a tool out of reach, or one that the hands do not
+determine. A residual risk remains after all that the service does, as a gate that cannot tell hands
+in a wrong position from those of the task: somebody may accept it (ISO 12100). A skill that holds
+often is a nuisance and no danger, so this is a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from thirdhand.contract.messages import BASE
+from thirdhand.workbench.learning.baselines import SAME_TIME
+from thirdhand.workbench.learning.choice import NOISE_M
+from thirdhand.workbench.learning.gate import Gate
+from thirdhand.workbench.learning.records import (
+    Figures,
+    Row,
+    Severity,
+    Verdict,
+)
+
+ADVISED = 5  # demonstrations
+OUTLIER_TIMES, OUTLIER_MM = 2.5, 25.0  # an outlier's error is above this multiple of the median, and above this error
+NOTED_MM, RESIDUAL_MM = 50.0, 100.0  # limits of the held-out error
+EXPLAINED = 50.0  # [%] of the tool's variance: if the hands explain less, the mean position predicts nearly as well
+AMBIGUOUS, AMBIGUOUS_RESIDUAL, AMBIGUOUS_UNSAFE = 1.0, 10.0, 20.0  # [%] limits of the samples that contradict others
+BEYOND_UNSAFE = 20.0  # [%] limit of the tool's path that is out of reach
+HELD = 5.0  # [%] limit of the time that the gate holds in demonstrations
+CAUGHT, CAUGHT_RESIDUAL = 95.0, 50.0  # [%] limits of the wrong samples that the gate must hold
+COVERAGE = {"50": (30.0, 80.0), "95": (88.0, 100.0)}  # [%] ranges of the samples inside the regions of 50 and 95 %
+
+
+WRONG, LEAST_TOLD = 0.5, 80.0  # [%] from this share of wrong samples on, the skill must be unsure at this share of them
+
+
+class Subject(NamedTuple):
+    """A skill's figures with what else is judged, and the part of it that a rule looks at."""
+
+    figures: Figures
+    gate: Gate
+    frames: Sequence[str]  # all frames of the demonstrations, sorted
+    contradiction: str  # the worst pair of samples, in words
+    median_mm: float  # of the demonstrations' errors
+    scatter_mm: float  # of the tool around its mean position, root mean square
+    part: str = ""  # name of a demonstration, baseline, kind of wrong samples or region
+    value: float = 0.0  # figure of the part
+
+    @property
+    def all(self) -> Row:
+        """The figures of all demonstrations."""
+        return self.figures.all
+
+    def parts(self, of: str) -> Mapping[str, float]:
+        """The names and figures of the parts of a kind; of the kind "" there is one."""
+        found = self.figures
+        if of == "demonstrations":
+            return {row.name: row.error_mm for row in found.demonstrations}
+        if of == "baselines":
+            return found.all.other_mm
+        if of == "regions":
+            return {"50": found.all.within_50, "95": found.all.within_95}
+        if of == "wrong samples" and found.alone is True:
+            return {"the hand 30 cm beside": found.beside}
+        return {"hands swapped": found.swapped, "hands 30 cm beside": found.beside} if of else {"": 0.0}
+
+
+MORE = "; more demonstrations along the same paths, or named via-points (record --places), help"
+
+
+class Rule(NamedTuple):
+    """A rule: the predicate of broken parts, the text with the fields of Subject as `s`, the
+    severity of a broken part, the remedy, and the kind of parts that the rule looks at.
+    """
+
+    is_broken: Callable[[Subject], bool]
+    text: str
+    severity: Callable[[Subject], Severity] = lambda s: "warning"
+    remedy: str = MORE
+    of: str = ""
+
+
+def _is_better(s: Subject) -> bool:
+    """Return whether a baseline's error is smaller than the skill's, in whole millimetres."""
+    return round(s.value) < round(s.all.error_mm)
+
+
+def _is_timetable(s: Subject) -> bool:
+    """Return whether elapsed time predicts the tool better than the hands, and best of all."""
+    return (
+        _is_better(s)
+        and s.part == SAME_TIME
+        and s.value <= min([*s.all.other_mm.values(), *s.figures.tried_mm.values()])
+    )
+
+
+def _is_unexplained(s: Subject) -> bool:
+    """Return whether the hands explain too little of the tool's motion."""
+    explained = s.figures.explained
+    return s.all.error_mm > NOTED_MM and explained is not None and explained < EXPLAINED
+
+
+def _of_contradictions(s: Subject) -> Severity:
+    """The severity of samples that contradict others, by their share."""
+    if s.figures.ambiguous > AMBIGUOUS_UNSAFE:
+        return "unsafe"
+    return "residual" if s.figures.ambiguous > AMBIGUOUS_RESIDUAL else "warning"
+
+
+RULES = (
+    Rule(
+        lambda s: len(s.frames) > 1,
+        "the demonstrations are in different frames: {frames}; one needed",
+        severity=lambda s: "unsafe",
+        remedy=": record them again in one frame, or learn from those of one frame",
+    ),
+    Rule(
+        lambda s: len(s.frames) == 1 and s.frames[0] not in ("", BASE),
+        f"the demonstrations are in frame {{frames}}: it is taken to be {BASE!r}, the arm's base plate",
+        remedy=". If it is not, name the cell that maps this frame (--config)",
+    ),
+    Rule(
+        lambda s: len(s.figures.demonstrations) < 3,
+        f"{{count}} demonstration(s) are too few to estimate the skill's errors; {ADVISED} or more advised",
+        severity=lambda s: "unsafe" if len(s.figures.demonstrations) > 1 and s.all.error_mm > NOTED_MM else "warning",
+        remedy=", as they miss each other by {s.all.error_mm:.0f} mm: record more",
+    ),
+    Rule(
+        lambda s: s.gate.floored or s.all.error_mm < 1000 * NOISE_M,
+        "the demonstrations have less noise than any tracker: were they computed? The gate allows for a tracker's "
+        "noise, and is {s.figures.gate_mm:.1f} mm",
+        remedy=". If they were recorded, nothing is wrong; learn what is to be served from recordings of the tracker",
+    ),
+    Rule(
+        _is_unexplained,
+        "the hands explain too little of the tool's motion: {s.figures.explained:.0f} % of its variance in held-out "
+        f"demonstrations, at least {EXPLAINED:.0f} % needed; the error is {{s.all.error_mm:.0f}} mm",
+        severity=lambda s: "unsafe",
+        remedy=": name the via-points of the task (record --places, learn --places), let the hands lead the tool in "
+        "each demonstration, or record more that are alike",
+    ),
+    Rule(
+        lambda s: s.all.error_mm > NOTED_MM and not _is_unexplained(s),
+        f"held-out demonstrations are missed by {{s.all.error_mm:.0f}} mm, up to {RESIDUAL_MM:.0f} mm accepted",
+        severity=lambda s: "residual" if s.all.error_mm > RESIDUAL_MM else "warning",
+    ),
+    Rule(
+        lambda s: _is_better(s) and not _is_timetable(s),
+        "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not {s.all.error_mm:.0f}",
+        remedy=". The hands say less about the tool than it seems, or the demonstrations are too few: name the "
+        "via-points of the task (record --places), or record more",
+        of="baselines",
+    ),
+    Rule(
+        _is_timetable,
+        "the task is a timetable: the elapsed time predicts the tool with an error of {s.value:.0f} mm, the hands "
+        "with {s.all.error_mm:.0f} mm",
+        remedy=". Keep to the pace of the demonstrations, or let the hands lead the tool in each of them",
+        of="baselines",
+    ),
+    Rule(
+        lambda s: len(s.figures.demonstrations) > 2 and s.value > max(OUTLIER_TIMES * s.median_mm, OUTLIER_MM),
+        "{s.part} differs from the others: its error is {s.value:.0f} mm, the median {s.median_mm:.0f} mm",
+        remedy=": look at it (record NAME --show), and leave it out or record it again if it is wrong",
+        of="demonstrations",
+    ),
+    Rule(
+        lambda s: s.figures.ambiguous > AMBIGUOUS,
+        f"{{s.figures.ambiguous:.0f}} % of the samples contradict others, up to {AMBIGUOUS_RESIDUAL:.0f} % accepted: "
+        "{s.contradiction}",
+        severity=_of_contradictions,
+        remedy=". Leave out the demonstration that differs, or name the via-points between which the hands come by the "
+        "same position twice (record --places, learn --places)",
+    ),
+    Rule(
+        lambda s: s.figures.beyond_reach > 0,
+        f"{{s.figures.beyond_reach:.1f}} % of the tool's path is out of the arm's reach, up to {BEYOND_UNSAFE:.0f} % "
+        "accepted: is it in metres, in frame base?",
+        severity=lambda s: "unsafe" if s.figures.beyond_reach > BEYOND_UNSAFE else "warning",
+        remedy=" If it is, demonstrate nearer to the arm, move the arm, or name the cell of a longer one (--config)",
+    ),
+    Rule(
+        lambda s: s.all.held > HELD,
+        "the gate holds {s.all.held:.0f} % of what was demonstrated, and cannot be higher: {cause}",
+    ),
+    Rule(
+        lambda s: s.gate.capped,
+        "hands are followed up to the largest deviation that is allowed, {s.figures.gate_mm:.0f} mm: the "
+        "demonstrations differ too much for a smaller one",
+        severity=lambda s: "residual",
+    ),
+    Rule(
+        lambda s: s.all.predicted_mm > s.scatter_mm > 0.0,
+        "the skill expects an error of {s.all.predicted_mm:.0f} mm, more than the tool moves about its mean position, "
+        "{s.scatter_mm:.0f} mm",
+        severity=lambda s: "residual",
+        remedy=": a demonstration may be wrong, look at those with the largest errors (record NAME --show)",
+    ),
+    Rule(
+        lambda s: s.value < CAUGHT_RESIDUAL,
+        f"the gate holds {{s.value:.1f}} % of {{s.part}}, {CAUGHT_RESIDUAL:.0f} % wanted: the arm follows hands "
+        "there, as those of the demonstrations go as far",
+        severity=lambda s: "residual",
+        of="wrong samples",
+    ),
+    Rule(
+        lambda s: CAUGHT_RESIDUAL <= s.value < CAUGHT,
+        f"the gate holds {{s.value:.1f}} % of {{s.part}}, {CAUGHT:.0f} % wanted",
+        of="wrong samples",
+    ),
+    Rule(
+        lambda s: not COVERAGE[s.part][0] <= s.value <= COVERAGE[s.part][1],
+        "the {s.part} % regions hold {s.value:.0f} % of held-out samples",
+        of="regions",
+    ),
+    Rule(
+        lambda s: s.all.wrong > WRONG and s.all.told is not None and s.all.told < LEAST_TOLD,
+        "{s.all.wrong:.1f} % of held-out samples are missed by more than 10 cm, and the skill is unsure at "
+        f"{{s.all.told:.0f}} % of these, {LEAST_TOLD:.0f} % wanted",
+    ),
+)
+
+
+def verdicts(subject: Subject) -> Iterator[Verdict]:
+    """The verdicts of all rules, in their order."""
+    words = {
+        "count": len(subject.figures.demonstrations),
+        "frames": ", ".join(map(repr, subject.frames)),
+        "cause": "it is at its upper limit" if subject.gate.capped else "wrong hands would pass",
+    }
+    for rule in RULES:
+        for part, value in subject.parts(rule.of).items():
+            s = subject._replace(part=part, value=value)
+            if rule.is_broken(s):
+                severity = rule.severity(s)
+                text = (rule.text + rule.remedy).format(s=s, **words)
+                yield Verdict(severity, text)

@@ -1,0 +1,229 @@
+"""A recording as columns: decisions and durations of its ticks, requests, skills and statuses."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.lib.recfunctions import repack_fields
+from numpy.typing import NDArray
+
+from thirdhand.contract import cdr
+from thirdhand.contract.incidents import ORDERS
+from thirdhand.contract.printable import printable, printable_values
+from thirdhand.contract.requests import Source
+from thirdhand.core.frame import (
+    TIMING,
+    Record,
+    Records,
+    Vector,
+    frame_layout,
+)
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.recording import DECISIONS, Recording
+from thirdhand.recordings.steps import Gap, Step
+from thirdhand.skills.skill_file import SkillError, decoded
+
+KEPT = (
+    *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
+    *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
+    "stale_ticks",
+    *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability", "closure"),
+)
+MOTION = (
+    "setpoint",
+    "setpoint_velocity",
+    "setpoint_acceleration",
+    "tool",
+    "joints",
+    "joint_velocities",
+    "joint_accelerations",
+)
+BLOCK = 4096  # ticks whose whole frames are held in memory
+
+
+class Order(NamedTuple):
+    """A request of the operator, or a failure of the service, at a tick: its kind and its text."""
+
+    tick: int
+    kind: str
+    text: str
+
+
+class InForce(NamedTuple):
+    """A skill, and the first tick at which it was in force."""
+
+    tick: int
+    skill: Skill
+
+
+class Said(msgspec.Struct, frozen=True):
+    """Mode, reason and inputs that a status reported at its tick."""
+
+    tick: int
+    mode: str
+    reason: str
+    because: str = ""
+    remedy: str = ""
+    sources: dict[str, Source] = {}
+    streams: dict[str, Source] = {}
+
+
+@dataclass
+class Columns:
+    """A recording, tick by tick.
+
+    `frames` (T,) has the fields `KEPT`, `timing` (M,) those of a Timing. Frames that the recording
+    leaves out are interpolated.
+    """
+
+    recording: Recording
+    frames: Records = field(default_factory=lambda: np.empty(0, TIMING))
+    timing: Records = field(default_factory=lambda: np.empty(0, TIMING))
+    ticks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # of all ticks with a decision
+    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # their system clock's times
+    gaps: list[str] = field(default_factory=list)
+    breaks: list[int] = field(default_factory=list)  # rows of `frames` before which some are missing
+    orders: list[Order] = field(default_factory=list)
+    skills: list[InForce] = field(default_factory=list)
+    statuses: list[Said] = field(default_factory=list)
+    samples: Counter[str] = field(default_factory=Counter)  # events by kind
+    remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
+
+    @property
+    def start_ns(self) -> int:
+        """The system clock's time of the first tick; 0 without one."""
+        return int(self.times_ns[0]) if len(self.times_ns) else 0
+
+    @property
+    def period_s(self) -> float:
+        """Duration of a tick [s]."""
+        return self.recording.settings.period_s
+
+    def seconds(self, tick: int) -> float:
+        """Time of a tick since the first recorded one [s]."""
+        return (tick - int(self.frames["tick"][0])) * self.period_s if len(self.frames) else 0.0
+
+    @property
+    def stale_ticks(self) -> Records:
+        """Age from which each hand is stale (T, 2); `stale_ms` where it was not recorded."""
+        settings = self.recording.settings
+        found: Records = np.maximum(self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000))
+        return found
+
+    @property
+    def times(self) -> Vector:
+        """Time of each tick (T,) since the first [s]."""
+        since: Vector = (self.frames["tick"] - self.frames["tick"][:1]) * self.period_s
+        return since
+
+
+def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
+    """The columns of a recording. Raises RecordingError if it cannot be read."""
+    found, last, gaps = Columns(recording), None, list[Gap]()
+    layout = frame_layout(len(recording.settings.joints.names))
+    blocks: list[Records] = []
+    block: list[Record] = []
+    timing: list[Record] = []
+    ticks: list[int] = []  # of all frames, recorded or left out
+    times_ns: list[int] = []
+
+    def kept() -> Records:
+        return repack_fields(np.array(block, layout)[list(KEPT)])
+
+    _take_skill(found, recording.skill, 0)
+    for step in recording.steps():
+        if step.lost or step.damage:
+            gaps.append(Gap(last, step.tick, step.lost, step.damage))
+        last = step.tick
+        if step.frame is None and step.checksum is None:
+            continue
+        _take_events(found, step)
+        if step.lost or step.damage:
+            found.breaks.append(len(ticks))
+        ticks.append(step.tick)
+        times_ns.append(step.time_ns)
+        if step.frame is not None:
+            block.append(step.frame)
+        if step.timing is not None:
+            timing.append(step.timing)
+        if len(block) == BLOCK:
+            blocks.append(kept())
+            block.clear()
+        if len(ticks) % BLOCK == 0:
+            progress(len(ticks))
+    found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
+    found.ticks, found.times_ns = np.array(ticks, np.int64), np.array(times_ns, np.int64)
+    _fill(found, found.ticks)
+    for _, text, _ in recording.notes("status"):
+        with contextlib.suppress(msgspec.MsgspecError):  # of another version
+            found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
+    found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
+    if found.skills and len(found.frames):
+        found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
+    return found
+
+
+def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
+    """Give `frames` a row for each of the ticks, whose frames may be left out of the recording.
+
+    Such a row has the newest frame's decisions, as frames that change a decision are recorded. The
+    arm's motion is interpolated up to the next frame, and other numbers if that decides the same.
+    """
+    frames, parts = found.frames, np.zeros(len(ticks), np.int64)
+    if len(frames) == len(ticks) or not len(frames):
+        return
+    parts[found.breaks] = 1
+    parts = np.cumsum(parts)
+    part_of = parts[np.searchsorted(ticks, frames["tick"])]
+    row = np.searchsorted(frames["tick"], ticks, side="right") - 1
+    known = (row >= 0) & (part_of[row] == parts)  # after damage, those before the next frame are unknown
+    found.breaks = (np.flatnonzero(np.diff(parts[known])) + 1).tolist()
+    ticks, row = ticks[known], row[known]
+    after = np.minimum(row + 1, len(frames) - 1)
+    begin, end = frames["tick"][row], frames["tick"][after]
+    motion = np.where(part_of[row] == part_of[after], (ticks - begin) / np.maximum(end - begin, 1), 0.0)
+    alike = np.all([frames[name][row] == frames[name][after] for name in DECISIONS], axis=0)
+    found.frames = frames[row]
+    for name in KEPT:
+        if frames.dtype[name].base.kind == "f":
+            values, to = frames[name][row], frames[name][after]
+            share = motion if name in MOTION else motion * alike
+            found.frames[name] += share.reshape(-1, *(1,) * (values.ndim - 1)) * (to - values)
+    found.frames["tick"] = ticks
+
+
+def _take_events(found: Columns, step: Step) -> None:
+    """Count the events of a step; keep its requests and skills."""
+    if step.skill:
+        _take_skill(found, step.skill, step.tick)
+    for kind, payload in step.events:
+        found.samples[kind] += 1
+        if kind == "skill":
+            _take_skill(found, payload, step.tick)
+        elif kind in ORDERS or kind == "fault":
+            found.orders.append(Order(step.tick, kind, printable(cdr.decode_string(payload))))
+
+
+def _take_skill(found: Columns, file: bytes, tick: int) -> None:
+    try:
+        skill = decoded(file, origin=found.recording.path.name)
+    except SkillError as error:
+        found.remarks.append(f"a skill cannot be read, so its via-points are not listed: {error}")
+        return
+    if not found.skills or skill.digest != found.skills[-1].skill.digest:
+        found.skills.append(InForce(tick, skill))
+
+
+def runs(values: NDArray[Any]) -> list[tuple[int, int]]:
+    """Begin and end (exclusive) of each run of equal successive values."""
+    if not len(values):
+        return []
+    edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
+    return list(itertools.pairwise(edges))

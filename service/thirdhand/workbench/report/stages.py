@@ -1,0 +1,49 @@
+"""The most probable stages of the task during a session."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from thirdhand.core.skill.stages import MOST_STAGES
+from thirdhand.workbench.report.columns import Columns, runs
+
+LEAST_S = 0.3  # a shorter stage is taken for hesitation, and merged with the one before
+
+
+class Stage(NamedTuple):
+    """A stage from one via-point to the next: start since the first tick and duration [s], and the
+    median of its probability.
+    """
+
+    start_s: float
+    lasts_s: float
+    begins: str
+    ends: str
+    probable: float
+
+    @property
+    def name(self) -> str:
+        """The via-points at which the stage begins and ends."""
+        return f"{self.begins} to {self.ends}"
+
+
+def stages(columns: Columns) -> list[Stage]:
+    """The stages, in order; none if the skill has no via-points."""
+    frames, times, found = columns.frames, columns.times, list[Stage]()
+    numbers = np.where(frames["stage_belief"] > 0, frames["stage"], -1)
+    in_force = np.searchsorted([one.tick for one in columns.skills], frames["tick"], side="right") - 1
+    for begin, end in runs(in_force * (MOST_STAGES + 1) + numbers):
+        names = columns.skills[in_force[begin]].skill.model.names if in_force[begin] >= 0 else ()
+        if not 0 <= numbers[begin] < len(names) - 1:
+            continue
+        begins, ends = names[numbers[begin]], names[numbers[begin] + 1]
+        lasts_s = (end - begin) * columns.period_s
+        before = found[-1] if found else None
+        if before is not None and ((begins, ends) == (before.begins, before.ends) or lasts_s < LEAST_S):
+            found[-1] = before._replace(lasts_s=float(times[end - 1]) + columns.period_s - before.start_s)
+        else:
+            probable = float(np.median(frames["stage_belief"][begin:end]))
+            found.append(Stage(float(times[begin]), lasts_s, begins, ends, probable))
+    return found

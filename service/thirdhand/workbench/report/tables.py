@@ -1,0 +1,350 @@
+"""A report as tables, for the terminal, the page and CSV files."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from thirdhand.contract.incidents import what_happened, what_to_do, word
+from thirdhand.contract.printable import printable
+from thirdhand.contract.records import Mode
+from thirdhand.workbench.report.report import (
+    Figure,
+    Joint,
+    Overview,
+    Percentiles,
+    Report,
+    Span,
+    differing_settings,
+)
+
+NONE = "-"
+IN_A_ROW = {  # figures of a recording among many, with the heads of their columns
+    "faults": "faults",
+    "missing or damaged": "missing",
+    "latency, median": "latency [ms]",
+    "tool to target, median": "off [mm]",
+    "closest approach": "near [mm]",
+}
+NOTHING_MISSING = "Nothing is missing in it."
+
+
+class Table(NamedTuple):
+    """A table: its name in files, its title, the heads of its columns with units in brackets, and
+    rows of texts. Columns from `numbers` on hold numbers; with 0, those with a unit do.
+    """
+
+    name: str
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numbers: int = 1
+
+    def is_number(self, column: int) -> bool:
+        """True if a column holds numbers."""
+        return column >= self.numbers if self.numbers else self.heads[column].endswith("]")
+
+
+def tables(report: Report) -> Iterator[Table]:
+    """The tables of one report; empty ones are left out."""
+    return (table for table in _tables(report) if table.rows)
+
+
+def _tables(report: Report) -> Iterator[Table]:
+    yield Table("missing", "Missing in the recording", ("what",), tuple((line,) for line in report.lacks))
+    spans = tuple((_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans)
+    yield Table("modes", "Modes of the arm", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0)
+    yield Table(
+        "faults",
+        "Faults",
+        ("at [s]", "reason", "what happened, what preceded it, and what to do"),
+        tuple(_fault(fault) for fault in report.faults),
+        numbers=0,
+    )
+    yield Table(
+        "stages",
+        "Stages of the task",
+        ("from [s]", "for [s]", "stage", "probability [%]"),
+        tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.stages),
+        numbers=0,
+    )
+    yield Table(
+        "places",
+        "Taught via-points",
+        (
+            "via-point",
+            "taught at [s]",
+            "hands, nearest [cm]",
+            "visits",
+            "tool, nearest [mm]",
+            "at the end of each visit [mm]",
+        ),
+        tuple(
+            (
+                place.name,
+                _s(place.start_s),
+                NONE if math.isinf(place.hands_m) else f"{100 * place.hands_m:.1f}",
+                str(len(place.visits)),
+                _mm(place.best_m),
+                ", ".join(_mm(visit.settled_m) for visit in place.visits) or NONE,
+            )
+            for place in report.places
+        ),
+    )
+    yield Table(
+        "times",
+        "Timing and accuracy",
+        ("what", "median", "99 %", "largest", "unit", "values"),
+        tuple(
+            (name, *(f"{value:.{digits}f}" for value in found[:3]), unit, str(found.samples))
+            for name, found, unit, digits in _times(report)
+            if found is not None
+        ),
+    )
+    if report.approach is not None:
+        near = report.approach
+        yield Table(
+            "approach",
+            "Closest approach of the arm to a hand",
+            ("distance [cm]", "at [s]", "mode then", "allowed speed toward it [m/s]"),
+            ((f"{100 * near.distance_m:.1f}", _s(near.at_s), near.doing, f"{near.allowed_m_s:.2f}"),),
+            numbers=0,
+        )
+    yield Table(
+        "limits",
+        "Active limits",
+        ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
+        tuple(
+            (one.name, _s(one.lasts_s), str(one.times), _s(one.first_s), what_happened(one.name))
+            for one in report.limits
+        ),
+        numbers=0,
+    )
+    followed_s = max(report.seconds(Mode.FOLLOW), report.columns.period_s)
+    yield Table(
+        "binding",
+        "What limited the tool while it followed",
+        ("limit", "for [s]", "share [%]", "times", "first at [s]"),
+        tuple(
+            (one.name, _s(one.lasts_s), f"{100 * one.lasts_s / followed_s:.1f}", str(one.times), _s(one.first_s))
+            for one in report.binding
+        ),
+    )
+    yield Table(
+        "tool_limits",
+        "What the arm can do where the tool was",
+        ("direction", "speed [m/s]", "limited by", "acceleration [m/s²]", "limited by"),
+        tuple(
+            (
+                where,
+                f"{one.speed:.2f}",
+                one.speed_joint or "[tool] max_speed",
+                f"{one.acceleration:.1f}",
+                one.acceleration_joint or "[tool] max_acceleration",
+            )
+            for where, one in report.tool_limits.items()
+        ),
+        numbers=0,
+    )
+    yield Table(
+        "joints",
+        "Use of the joints' limits",
+        ("joint", "from a limit [rad]", "speed [% of limit]", "acceleration [% of limit]"),
+        tuple(
+            (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
+        ),
+    )
+    yield Table(
+        "rejections",
+        "Rejected samples",
+        ("cause", "count [samples]", "first at [s]", "what to do"),
+        tuple((one.cause, str(one.samples), _s(one.first_s), what_to_do(one.cause)) for one in report.rejections),
+        numbers=0,
+    )
+
+
+NO_LIMIT_RAD = 1000.0  # limits of a continuous joint that are farther away do not matter
+
+
+def _margin(joint: Joint) -> str:
+    """Least distance of a joint from its limits, in rad, or in m if it is prismatic."""
+    if joint.kind == "continuous" and joint.margin_rad > NO_LIMIT_RAD:
+        return "no limit"
+    return f"{joint.margin_rad:.2f}" + (" m" if joint.kind == "prismatic" else "")
+
+
+def _fault(fault: Span) -> tuple[str, str, str]:
+    told = (fault.why, *fault.before, fault.ended, f"what to do: {fault.remedy}")
+    return _s(fault.start_s), word(fault.reason), "\n".join(told)
+
+
+def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]:
+    yield "hand stamped to command published", report.latency_ms, "ms", 2
+    yield "tick later than its deadline", report.lateness_us, "µs", 0
+    yield "work of a tick", report.work_us, "µs", 0
+    yield "tool from its target, initial approach", report.initial_mm, "mm", 1
+    yield "tool from its target, following", report.lag_mm, "mm", 1
+
+
+def verdict(report: Report) -> str:
+    """The report in one sentence: share of following, number of stops, and the worst."""
+    if not report.spans:
+        return "There is nothing to report: the recording holds no tick."
+    following = [span for span in report.spans if span.mode is Mode.FOLLOW]
+    first_s, last_s = (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
+    holds = [span for span in report.spans if span.mode is Mode.HOLD]
+    waited = [span for span in holds if span.start_s < first_s]
+    ended = [span for span in holds if span.start_s >= last_s]
+    if report.spans[-1].mode is Mode.FAULT:
+        ended = []  # a fault is no end of a session
+    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)]
+    faults = len(report.faults)
+    counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
+    if stops:
+        worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
+        most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
+    else:
+        most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+        if initial := report.initial_mm:
+            way = f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
+            most = f"{most}, after an {way}" if report.lag_mm else f"an {way} and did not reach the target"
+    lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
+    since = f", from {first_s:.1f} s on" if waited else ""
+    since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
+    end = f" It ended with {ended[0].doing}, {report.lasts_s - ended[0].start_s:.1f} s before the end." if ended else ""
+    followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
+    return f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was {most}.{end}"
+
+
+def _times_of(count: int, what: str) -> str:
+    return f"{count or 'no'} {what}{'s' * (count != 1)}"
+
+
+def summary(report: Report) -> list[str]:
+    """The first lines of a report, beginning with the verdict."""
+    lacks = len(report.lacks)
+    hands = ", ".join(f"{side} {rate:.0f} a second" for side, rate in report.hands_hz.items())
+    return [
+        verdict(report),
+        f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
+        f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}." if lacks else NOTHING_MISSING,
+        f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
+        *([f"{report.offer[0].upper()}{report.offer[1:]}."] if report.offer else []),
+    ]
+
+
+def comparison(reports: Sequence[Report]) -> Iterator[Table]:
+    """Figures of two reports side by side, and settings that differ; of more, a row for each."""
+    if len(reports) != 2:
+        yield from overviews([report.overview() for report in reports])
+        return
+    one, other = reports
+    names = names_of([one.path, other.path])
+    yield side_by_side(names, one.overview().figures, other.overview().figures)
+    settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(one, other))
+    if settings:
+        yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+
+
+def side_by_side(names: Sequence[str], one: Mapping[str, Figure], other: Mapping[str, Figure]) -> Table:
+    """Figures of two recordings and their differences, without those that are 0 in both."""
+    rows = []
+    for name, known in {**other, **one}.items():
+        values = [figures[name].value if name in figures else None for figures in (one, other)]
+        if any(values):
+            row = (_with_unit(known), *(_value(known, value) for value in values))
+            rows.append((*row, _difference(known, *values)))
+    return Table("comparison", "Side by side", ("figure", *names, "difference"), tuple(rows))
+
+
+def overviews(recordings: Sequence[Overview]) -> Iterator[Table]:
+    """A row for each of many recordings, and totals by cell and week."""
+    rows = []
+    names = names_of([one.path for one in recordings])
+    for name, one in zip(names, recordings, strict=True):
+        lasts_s = one.value("duration")
+        followed = _share(one.value("follow"), lasts_s)
+        held = f"{sum(one.holds_s.values()):.1f}"
+        figures = [one.figures[shown] for shown in IN_A_ROW]
+        others = [_value(figure, figure.value) for figure in figures]
+        rows.append((name, f"{lasts_s:.1f}", followed, held, *others))
+    heads = ("recording", "for [s]", "follow [%]", "hold [s]", *IN_A_ROW.values())
+    yield Table("recordings", "Recordings", heads, tuple(rows))
+    yield _totals(recordings)
+
+
+def _totals(recordings: Sequence[Overview]) -> Table:
+    """Time recorded and followed, faults, and holds by reason, for each cell and week."""
+    groups: dict[tuple[str, str], list[Overview]] = {}
+    for one in recordings:
+        groups.setdefault((one.cell, one.week), []).append(one)
+    rows = []
+    for (cell, week), those in sorted(groups.items()):
+        lasts_s = sum(one.value("duration") for one in those)
+        followed_s = sum(one.value("follow") for one in those)
+        faults = sum(one.value("faults") for one in those)
+        held_s: Counter[str] = Counter()
+        for one in those:
+            held_s.update(one.holds_s)
+        holds = ", ".join(f"{reason} {seconds:.1f} s" for reason, seconds in held_s.most_common())
+        share = _share(followed_s, lasts_s)
+        rows.append((cell, week, str(len(those)), f"{lasts_s / 3600:.2f}", share, f"{faults:.0f}", holds or NONE))
+    heads = ("cell", "week", "recordings [1]", "recorded [h]", "followed [%]", "faults [1]", "holds")
+    return Table("totals", "Totals by cell and week", heads, tuple(rows), numbers=0)
+
+
+def every_figure(recordings: Sequence[Overview]) -> Table:
+    """A row for each recording with all its figures."""
+    known = {name: figure for one in recordings for name, figure in one.figures.items()}
+    rows = []
+    for one in recordings:
+        values = (_value(known[name], one.figures[name].value if name in one.figures else None) for name in known)
+        rows.append((str(one.path), one.cell, one.week, one.begins, *values))
+    heads = ("recording", "cell", "week", "begins", *map(_with_unit, known.values()))
+    return Table("figures", "All figures", heads, tuple(rows), numbers=4)
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """A unique name for each recording: that of its file, with a number if it is not the first."""
+    seen: dict[str, int] = {}
+    names = []
+    for path in paths:
+        stem = printable(path.stem)
+        seen[stem] = seen.get(stem, 0) + 1
+        names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
+    return names
+
+
+def _difference(figure: Figure, one: float | None, other: float | None) -> str:
+    if one is None or other is None:
+        return NONE
+    text = f"{other - one:+.{figure.digits}f}"
+    return "same" if float(text) == 0.0 else text
+
+
+def _with_unit(figure: Figure) -> str:
+    return f"{figure.name} [{figure.unit}]" if figure.unit else figure.name
+
+
+def _value(figure: Figure, value: float | None) -> str:
+    return NONE if value is None else f"{value:.{figure.digits}f}"
+
+
+def _share(part_s: float, whole_s: float) -> str:
+    return f"{100 * part_s / whole_s:.1f}" if whole_s else NONE
+
+
+def _short(value: object) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _s(seconds: float) -> str:
+    return f"{seconds:.2f}"
+
+
+def _mm(metres: float | None) -> str:
+    return NONE if metres is None else f"{1000 * metres:.1f}"

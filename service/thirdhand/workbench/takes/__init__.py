@@ -1,0 +1,1 @@
+"""Takes: demonstrations as they are captured, and recordings of other systems."""

@@ -1,0 +1,402 @@
+"""Reading and writing of demonstrations, with all poses in frame `base` and at common stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from thirdhand.contract import cdr
+from thirdhand.contract.channels import (
+    JOINTS,
+    POSE,
+    STRING,
+    TAKE_KEYS,
+    topic,
+)
+from thirdhand.contract.messages import (
+    BASE,
+    GRIPPER,
+    JointState,
+    PoseStamped,
+    WireError,
+)
+from thirdhand.contract.requests import Hands, encode_json
+from thirdhand.core.frame import Vector
+from thirdhand.core.geometry import rotation
+from thirdhand.core.intake.far_away import too_far
+from thirdhand.core.intake.stage import UNIT_M, base_from
+from thirdhand.core.tuning import TUNING
+from thirdhand.recordings.mcap_file import (
+    McapFile,
+    RecordingError,
+    ends_early,
+    existing,
+)
+from thirdhand.recordings.mcap_reader import Messages, full_name
+from thirdhand.settings.config import HandSettings, Settings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.workbench.takes.hands_and_tool import chosen
+from thirdhand.workbench.takes.pose_streams import (
+    GRIPPER_STATE,
+    PLACES_TOPIC,
+    PoseRecording,
+    PoseTopic,
+)
+from thirdhand.workbench.takes.track import Track
+from thirdhand.workbench.takes.track_check import (
+    LEAST_PIECE_S,
+    Checked,
+    checked,
+    sound,
+)
+from thirdhand.workbench.takes.track_clocks import by_one_clock
+
+_STREAMS = tuple(TAKE_KEYS.values())
+MIN_USABLE_SHARE = 0.5  # takes with a smaller usable share are refused
+MIN_SEEN_SHARE = 0.1  # a hand that is seen for a smaller share of the time does not lead the tool
+MAX_NAMED_STRETCHES = 10  # a message names at most this many bad stretches
+UNSEEN_INTERVALS = 5.0  # a tool with a low rate is out of sight after this many of its usual intervals
+
+
+def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
+    """Write a demonstration in frame `base`.
+
+    Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
+    finite, and for stamps that are not integers from 0 on.
+    """
+    stamps_ns, left, right, tool = np.asarray(demonstration.stamps_ns), *demonstration[1:4]
+    if stamps_ns.dtype.kind not in "iu" or np.any(stamps_ns < 0):
+        lowest = f" from {stamps_ns.min():g} on" if stamps_ns.size else ""
+        raise ValueError(
+            f"stamps_ns: {stamps_ns.dtype}{lowest} given, integers [ns] from 0 on needed: "
+            "np.round(1e9 * seconds).astype(np.int64)"
+        )
+    poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
+    gripper, count = demonstration.gripper, len(stamps_ns)
+    given: list[tuple[str, Vector, tuple[int, ...]]]
+    given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    if demonstration.conducts != "both":
+        given = [one for one in given if one[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])]
+    given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
+    for name, stream, shape in given:
+        if stream.shape != shape or not np.isfinite(stream).all():
+            raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
+    with McapFile(Path(path), joints=0, attached=False) as file:
+        about = {"hands": demonstration.conducts, "person": demonstration.person}
+        if about := {name: word for name, word in about.items() if word not in ("both", "")}:
+            file.writer.add_metadata("thirdhand", about)
+        streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
+        for i, (stamp, *rows) in enumerate(
+            zip(stamps_ns.tolist(), *(stream.tolist() for _, stream in streams), strict=True)
+        ):
+            for (name, _), row in zip(streams, rows, strict=True):
+                data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
+                file.put(topic(cell, name), POSE.type, data, stamp, i)
+            if gripper is not None:
+                data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
+                file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
+        if demonstration.places:
+            text = encode_json(demonstration.places).decode()
+            file.put(topic(cell, PLACES_TOPIC), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+
+
+def read_demonstration(
+    path: str | Path,
+    *,
+    topics: Mapping[str, PoseTopic] | None = None,
+    settings: Settings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Demonstration:
+    """The demonstration in a recording: hands and tool in frame `base` at the tool's stamps, over
+    the time that all three cover.
+
+    Reads MCAP files and bags of this and other systems. `topics` has the topics of `left`, `right`
+    and `tool`; those not given are found by the ends of their names, in any cell, or by words in
+    their names. Hands are transformed to `base` as in the daemon, by `settings` or else those in
+    the file, and interpolated linearly at the tool's stamps. If the stamps come from different
+    clocks, the times of recording are used instead.
+
+    Raises RecordingError, also for a damaged file, because the missing part may lie within a
+    motion. A file that was cut ends early. `say` is called with remarks on what was found, assumed
+    or left out.
+    """
+    recorded = PoseRecording(path)
+    if settings is None and recorded.settings is None and recorded.is_ours:
+        raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
+    settings = settings or recorded.settings or Settings()
+    if any(not fault.cut for fault in recorded.faults):
+        readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        faults = "; ".join(map(str, recorded.faults))
+        raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
+    found = chosen(recorded, topics or {}, settings)
+    for fault in recorded.faults:
+        read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
+        say(f"{path}: {fault}; {read} were read")
+    one_clock = by_one_clock(found.tracks)
+    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
+    tracks = [_near(recorded, *both, settings) for both in zip(tracks, one_clock.tracks, strict=True)]
+    remarks = [*found.guessed, *_invalid_in(tracks), *mapped]
+    if remarks:
+        say(f"{path}: {'; '.join(remarks)}")
+    if one_clock.remark:
+        say(f"{path}: {one_clock.remark}")
+    tracks = [_in_order(path, track) for track in tracks]
+    seen = CommonPart.of(path, tracks, found.conducts, settings)
+    for line in seen.remarks:
+        say(f"{path}: {line}")
+    left, right, tool = (_resampled(seen.stamps_ns, track.stamps_ns, track.poses) for track in seen.tracks)
+    closure = recorded.closures(seen.stamps_ns, logged=one_clock.logged, part=one_clock.part)
+    for line in recorded.unused:
+        say(f"{path}: {line}")
+    seen.stamps_ns.setflags(write=False)
+    return Demonstration(
+        seen.stamps_ns, left, right, tool, BASE, recorded.places, closure, seen.conducts, recorded.person, seen.begins
+    )
+
+
+class CommonPart(NamedTuple):
+    """The part of a take in which hands and tool are all seen.
+
+    It has the tracks of left hand, right hand and tool with their trusted samples, the hands that
+    lead the tool, the tool's stamps [ns], the indices of the first stamps after stretches that are
+    left out, and remarks.
+    """
+
+    tracks: list[Track]
+    conducts: Hands
+    stamps_ns: NDArray[np.int64]
+    begins: tuple[int, ...]
+    remarks: list[str]
+
+    @staticmethod
+    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> CommonPart:
+        """The common part of the tracks of left hand, right hand and tool.
+
+        Raises RecordingError if too little is left.
+        """
+        unseen_s = settings.hands.unseen_ms / 1000
+        tool_s = max(unseen_s, UNSEEN_INTERVALS * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
+        hands = checked(tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s)
+        (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
+        remarks: list[str] = []
+        if conducts == "both":
+            shares = [one.seen_share for one in hands]
+            if min(shares) < MIN_SEEN_SHARE <= max(shares):
+                side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
+                hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
+                remarks.append(f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the time")
+        rows = [*hands, tool]
+        start_ns, end_ns = max(one.start_ns for one in rows), min(one.end_ns for one in rows)
+        if start_ns >= end_ns:
+            raise RecordingError(
+                f"{path}: hands and tool have fewer than two stamps of the tool in common: "
+                "were they stamped by different clocks?"
+            )
+        named = [one for row in rows for one in row.stretches if one.begin_ns < end_ns and one.end_ns > start_ns]
+        remarks += [one.remark for one in rows if one.remark]
+        stamps, begins = _left_in(tool.track.stamps_ns, rows)
+        kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
+        origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
+        named.sort(key=lambda one: one.begin_ns)
+        bad = "; ".join(one.text(origin_ns) for one in named[:MAX_NAMED_STRETCHES])
+        bad += f"; and {len(named) - MAX_NAMED_STRETCHES} more" * (len(named) > MAX_NAMED_STRETCHES)
+        if kept_s < MIN_USABLE_SHARE * span_s:
+            raise RecordingError(
+                f"{path}: {kept_s:.1f} of {span_s:.1f} s are usable, {MIN_USABLE_SHARE:.0%} needed"
+                f"{f': {bad}' if bad else ''}. Record it again, or cut it with thirdhand record --trim"
+            )
+        if bad:
+            remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
+        both = [hands[0].track, hands[-1].track, tool.track]
+        return CommonPart(both, conducts, stamps, tuple(begins), remarks)
+
+
+def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
+    """The tool's stamps [ns] at which all tracks are seen, without pieces that are too short, and
+    the indices of the first stamps after the stretches that are left out.
+    """
+    start_ns = max((int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows)
+    end_ns = min((int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows)
+    stamps = stamps[(stamps >= start_ns) & (stamps <= end_ns)]
+    holes = [hole for row in rows for hole in row.stretches]
+    for hole in holes:
+        stamps = stamps[(stamps <= hole.begin_ns) | (stamps >= hole.end_ns)]
+    cuts = sorted({int(np.searchsorted(stamps, hole.end_ns)) for hole in holes} - {0, len(stamps)})
+    pieces = [
+        piece
+        for piece in np.split(stamps, cuts)
+        if not cuts or (len(piece) and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
+    ]
+    begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
+    return np.concatenate(pieces) if pieces else stamps[:0], begins
+
+
+def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settings) -> Track:
+    """The track with NaN for poses that are too far away; `before` is the track as published.
+
+    Raises RecordingError if all poses are too far away.
+    """
+    with np.errstate(all="ignore"):
+        is_far = np.linalg.norm(track.poses[:, :3], axis=1) > TUNING.intake.max_hand_distance_m
+    if len(is_far) and is_far.all():
+        why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings)
+        if recorded.is_captured:
+            rule = "the unit in the file is used, and [hands] unit is ignored"
+            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that the file names"
+        raise RecordingError(
+            f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far away; the first is {why}"
+        )
+    poses = track.poses.copy()
+    poses[is_far] = np.nan
+    return track._replace(poses=poses)
+
+
+def _invalid_in(tracks: Sequence[Track]) -> list[str]:
+    """A remark on the number of poses of the tracks that are NaN; empty if none is."""
+    most_m = TUNING.intake.max_hand_distance_m
+    none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
+    count = sum(len(track.poses) for track in tracks)
+    return [f"{none} of {count} poses are invalid or farther than {most_m:g} m, and are left out"] if none else []
+
+
+def _in_order(path: str | Path, track: Track) -> Track:
+    """The track sorted by its stamps, without repeated stamps. Raises RecordingError."""
+    stamps, first = np.unique(track.stamps_ns, return_index=True)
+    if len(stamps) < 2:
+        raise RecordingError(
+            f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+        )
+    return Track(track.name, track.source, stamps, track.logged_ns[first], track.poses[first], track.frame)
+
+
+def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
+    """True if the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # the daemon has the same rule
+    return frame not in ("", BASE) or (name != TAKE_KEYS["tool"] and frame in tracker_frames)
+
+
+def in_metres(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) [m] in the tracker's frame, right-handed, given those in its axes and
+    unit.
+    """
+    if hands.axes == "left-handed":
+        positions = positions * (1.0, 1.0, -1.0)
+    return np.asarray(UNIT_M[hands.unit] * positions)
+
+
+def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
+    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
+    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    return np.asarray(in_metres(positions, hands) @ axes.T + origin)
+
+
+def far_away(name: str, frame: str, position: Sequence[float], settings: Settings) -> str:
+    """Message and remedy for a stream's position, as published, that is too far away."""
+    hands, section = settings.hands_in(frame), settings.tracker_section(frame)
+    if is_by_tracker(name, frame, hands):
+        rule = f"{section} unit is {hands.unit!r}"
+        return f"{too_far(position, hands.unit, rule)}: set {section} unit in the cell's settings (--config)"
+    rule = f"{name} in frame {BASE!r} is always in metres, and [hands] unit is ignored"
+    also = ", or with the tracker's frame of [hands] frame, in which positions are in [hands] unit"
+    return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
+
+
+def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
+    """Message and remedy for a stream in an unknown frame; empty for known frames."""
+    if frame in ("", BASE, hands.frame):
+        return ""
+    known = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
+    return (
+        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) with this [hands] frame "
+        f"and its pose, [hands] base_from_tracker, or with a table [trackers.{frame}]"
+    )
+
+
+def in_base(path: str | Path, tracks: Sequence[Track], settings: Settings) -> tuple[list[Track], list[str]]:
+    """Tracks of left hand, right hand and tool in frame `base`, and a remark on which of them were
+    transformed.
+
+    As in the daemon, hands are transformed unless they are in `base` and the tracker has a frame of
+    its own. The tool is transformed only if it names the tracker's frame. Raises RecordingError for
+    other frames.
+    """
+    for track in tracks:
+        if problem := unknown_frame(track.name, track.frame, settings.hands_in(track.frame)):
+            raise RecordingError(f"{path}: {problem}")
+    out, mapped, sections = list(tracks), [], dict[str, None]()
+    for i, track in enumerate(tracks):
+        hands = settings.hands_in(track.frame)
+        is_left_handed = hands.axes == "left-handed"
+        is_changed = is_left_handed or not np.array_equal(base_from(hands), np.eye(3, 4))
+        if is_by_tracker(track.name, track.frame, hands) and is_changed:
+            turn = Rotation.from_matrix(rotation(hands.base_from_tracker[3:]))
+            poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
+            if some.any():
+                poses[some, :3] = from_tracker(track.poses[some, :3], hands)
+                given = track.poses[some, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
+                poses[some, 3:] = (turn * Rotation.from_quat(given)).as_quat()
+            out[i] = track._replace(poses=poses, frame=BASE)
+            mapped.append(track.name)
+            sections[settings.tracker_section(track.frame)] = None
+    remark = f"{', '.join(mapped)} transformed to frame {BASE} by {' and '.join(sections)} unit and base_from_tracker"
+    return out, [remark] if mapped else []
+
+
+def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (T, 7) at `stamps` by linear interpolation of those at `at` (N,); quaternions are
+    interpolated the short way and normalised.
+    """
+    if np.isin(stamps, at).all():
+        out = poses[np.searchsorted(at, stamps)]
+    else:
+        signs = np.cumprod(np.where(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0, -1.0, 1.0), axis=0)
+        smooth = np.concatenate([poses[:, :3], poses[:, 3:] * np.concatenate([[1.0], signs])[:, None]], axis=1)
+        times, knots = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        out = np.stack([np.interp(times, knots, column) for column in smooth.T], axis=1)
+        out[:, 3:] /= np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
+    out.setflags(write=False)
+    return out
+
+
+def hand_samples(
+    path: str | Path, *, say: Callable[[str], None] = lambda line: None
+) -> list[tuple[int, str, PoseStamped]]:
+    """Log time [ns], side and pose of every hand sample, in order of time.
+
+    Reads demonstrations, recordings and other ROS 2 recordings. A file that was cut is read up to
+    its cut. Samples that are not readable are left out, and `say` is called with their number.
+    Raises RecordingError.
+    """
+    path = existing(path)
+    messages = Messages(path)
+    topics: dict[str, str] = {}  # by stream
+    seen: set[str] = set()
+    samples: list[tuple[int, str, PoseStamped]] = []
+    causes: list[str] = []
+    for schema, channel, message in messages:
+        seen.add(topic := channel.topic)
+        name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
+        if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
+            continue
+        if topics.setdefault(name, topic) != topic:
+            raise RecordingError(f"{path} has two streams of {name}: {topics[name]} and {topic}")
+        try:
+            samples.append((message.log_time, name.removeprefix("hands/"), cdr.decode_pose(message.data)))
+        except WireError as error:
+            causes.append(f"{topic}: {error}")
+    if messages.faults and not ends_early(path):
+        raise RecordingError(f"{path} is damaged: {messages.faults[0]}")
+    if not topics:
+        lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
+        raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")
+    if causes:
+        remark = f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: {causes[0]}"
+        if not samples:
+            raise RecordingError(remark)
+        say(remark)
+    return sorted(samples, key=lambda sample: sample[0])

@@ -1,0 +1,161 @@
+"""The choice of the streams of hands and tool among the topics of a recording."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, get_args
+
+from thirdhand.contract.channels import JOINTS, POSE, TAKE_KEYS
+from thirdhand.contract.requests import Hands
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.workbench.takes.pose_streams import (
+    JOINT_STATES,
+    POSE_ARRAY,
+    POSE_TYPES,
+    TRACK_NAMES,
+    PoseRecording,
+    PoseTopic,
+)
+from thirdhand.workbench.takes.track import Track
+
+HAND_WORDS = {"hand", "hands", "wrist", "palm", "glove"}
+TRACK_WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
+
+
+class HandsAndTool(NamedTuple):
+    """The tracks of left hand, right hand and tool, the hands that lead the tool, and remarks on
+    guesses. A hand that leads alone has both hands' places in `tracks`.
+    """
+
+    tracks: list[Track]
+    conducts: Hands
+    guessed: list[str]
+
+
+def chosen(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings) -> HandsAndTool:
+    """The tracks of hands and tool in a recording.
+
+    A topic is `given`, or found by the end of its name, or by a word in its name; the tool may also
+    be computed from joint states. If only one hand is found, it leads alone. Raises RecordingError.
+    """
+    guessed: list[str] = []
+    sources: dict[str, PoseTopic] = {}
+    conducts = recorded.conducts
+    for name in TRACK_NAMES[:2]:
+        if conducts not in ("both", name):
+            continue
+        source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
+        if source is None and (source := _by_words(recorded, name)):
+            guessed.append(f"{name} is {source}")
+        if source is not None:
+            sources[name] = source
+    if not sources:
+        raise _not_found(recorded, conducts.replace("both", "left"), [])
+    if len(set(sources.values())) < len(sources):
+        sources = _side_of_the_one(recorded, sources["left"])
+    if len(sources) == 1:
+        (conducts,) = (name for name in get_args(Hands) if name in sources)
+        other = TRACK_NAMES[1 - TRACK_NAMES.index(conducts)]
+        hint = "" if conducts == recorded.conducts else f": there is no other (--{other} TOPIC names one)"
+        guessed.append(f"the {conducts} hand leads alone{hint}")
+    hands = [recorded.track(TAKE_KEYS[name], source, settings) for name, source in sources.items()]
+    return HandsAndTool([hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed)
+
+
+def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, PoseTopic]:
+    """The stream that was found for both hands, under the side in its name. Raises
+    RecordingError.
+    """
+    sides = [side for side in TRACK_NAMES[:2] if _words(str(source)) & TRACK_WORDS[side]]
+    if len(sides) != 1:
+        raise RecordingError(
+            f"{recorded.path}: {source} is given as left and as right; another topic needed for one of them, or for a "
+            "task of one hand, the option of this hand only"
+        )
+    return {sides[0]: source}
+
+
+def _tool(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]) -> Track:
+    """The tool's track; a remark on a guess is appended to `guessed`. Raises RecordingError."""
+    source = _given(recorded, "tool", given["tool"]) if "tool" in given else _by_ending(recorded, "tool")
+    joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
+    joints = recorded.joint_topic(settings) if source is None else joints
+    if joints:
+        guessed.append(f"tool is computed from {joints} by the arm's URDF")
+        return recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
+    if source is None:
+        source = _by_words(recorded, "tool")
+        if source is None:
+            raise _not_found(recorded, "tool", [])
+        guessed.append(f"tool is {source}")
+    return recorded.track(TAKE_KEYS["tool"], source, settings)
+
+
+def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
+    """The stream that an option names. Raises RecordingError."""
+    topic = next((topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), "")
+    if topic and recorded.topics[topic] == JOINTS.type and name == "tool":
+        return PoseTopic(topic)
+    if not topic or recorded.topics[topic] not in POSE_TYPES:
+        problem = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
+        raise RecordingError(f"{recorded.path}: --{name} {wanted}: {problem}; {_poses_in(recorded)}")
+    parts = list(recorded.tracks(topic))
+    if wanted.part in parts:
+        return PoseTopic(topic, wanted.part)
+    if len(parts) == 1 and not wanted.part:
+        return PoseTopic(topic, parts[0])
+    which = "an index" if recorded.topics[topic] == POSE_ARRAY else "a child frame"
+    needed = f"{which} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
+    raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
+
+
+def _by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
+    """The stream of PoseStamped with the name of the service's own topic, in any cell. Raises
+    RecordingError.
+    """
+    found = [
+        topic
+        for topic, kind in recorded.topics.items()
+        if kind == POSE.type and f"/{topic}".endswith(f"/{TAKE_KEYS[name]}") and "" in recorded.tracks(topic)
+    ]
+    if len(found) > 1:
+        raise RecordingError(
+            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {found[0]} and {found[1]}; choose one by --{name}"
+        )
+    return PoseTopic(found[0]) if found else None
+
+
+def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:
+    """The stream with a word of TRACK_WORDS in its name; None if there is none. Raises
+    RecordingError if there are several.
+    """
+    others = {word for other in TRACK_NAMES[:2] if other != name for word in TRACK_WORDS[other]}
+    streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
+    words = {source: _words(str(source)) for source in streams}
+    fitting = [source for source in streams if words[source] & TRACK_WORDS[name] and not words[source] & others]
+    if len(fitting) > 1 and name != "tool":
+        fitting = [source for source in fitting if words[source] & HAND_WORDS] or fitting
+    if len(fitting) > 1:
+        raise _not_found(recorded, name, fitting)
+    return fitting[0] if fitting else None
+
+
+def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic]) -> RecordingError:
+    also = f" or {JOINT_STATES} of the arm's joints" if name == "tool" else ""
+    several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
+    return RecordingError(
+        f"{recorded.path} has no topic ending in {TAKE_KEYS[name]} with {POSE.type}{also}{several}; "
+        f"{_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
+    )
+
+
+def _words(text: str) -> set[str]:
+    """The words of a name: `/vrpn/LeftHand_1` has vrpn, left, hand, 1."""
+    return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)}
+
+
+def _poses_in(recorded: PoseRecording) -> str:
+    poses = ", ".join(f"{source} ({count})" for source, count in recorded.streams())
+    return f"its topics: {', '.join(sorted(recorded.topics)) or 'none'}; topics with poses: {poses or 'none'}"

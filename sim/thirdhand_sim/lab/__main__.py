@@ -1,0 +1,174 @@
+"""`python -m thirdhand_sim.lab NAME --output DIR`: makes an experiment, or all that are stale;
+`python -m thirdhand_sim.lab stale` lists these.
+"""
+
+from __future__ import annotations
+
+from thirdhand.process import one_blas_thread  # noqa: F401
+
+# isort: split
+import argparse
+import importlib
+import os
+import sys
+import time
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+from thirdhand.cli.usage import workers as workers_of
+from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand_sim.faulty_cell import FaultError
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.evidence import (
+    RESULTS,
+    commit,
+    origin,
+    result_of,
+    staleness,
+    tree,
+)
+from thirdhand_sim.lab.results import (
+    ExperimentError,
+    Options,
+    Results,
+    pyplot,
+)
+from thirdhand_sim.parts import PartError
+
+OF_OTHERS = "-of-others"  # ends the name of a result on recorded hands
+FAILURES = (ExplainedError, ExperimentError, FaultError, PartError, OSError)
+EXAMPLE = """example:
+  python -m thirdhand_sim.lab letters --output results
+  python -m thirdhand_sim.lab stale --output results
+  python -m thirdhand_sim.lab all --output results
+"""
+
+
+FOLDERS = {
+    "letters": "recorded letters besides the modelled ones: X.npz with demo00, demo01, ...",
+    "hands": "recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and right [m]",
+    "data": "recorded takes for `partners`, without which it measures the made tasks alone: robot_*.npz, "
+    "give_P*.npz and walk_*.npz with t [s], left, right and tool [m]",
+}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    recorded = {name: " (recorded hands)" * name.endswith(OF_OTHERS) for name in EXPERIMENTS}
+    names = "\n".join(f"  {name:<16} {one.about}{recorded[name]}" for name, one in EXPERIMENTS.items())
+    p = argparse.ArgumentParser(
+        prog="python -m thirdhand_sim.lab",
+        description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
+        f"recording each.\n\n{names}",
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    which = "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
+    p.add_argument("name", metavar="NAME", choices=[*EXPERIMENTS, "all", "stale"], help=which)
+    output = "folder of the results (for stale: recordings/experiments by default)"
+    p.add_argument("--output", metavar="DIR", type=Path, help=output)
+    for name, text in FOLDERS.items():
+        p.add_argument(f"--{name}", metavar="DIR", type=Path, help=text)
+    people = "the people of `people`: those on whom parameters are chosen, or the others (default: %(default)s)"
+    p.add_argument("--set", choices=["tuning", "test"], default="test", help=people)
+    workers = "processes, or the cluster at dask:ADDRESS, where that helps (default: %(default)s)"
+    p.add_argument("--workers", type=workers_of, default=str(min(2, os.cpu_count() or 1)), help=workers)
+    share = "of the full size, for a quick look: above 0, up to 1"
+    p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
+    arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
+    p.add_argument("--arm", default="wam", help=arm)
+    again = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
+    p.add_argument("--redraw", action="store_true", help=again)
+    p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
+    p.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    return p
+
+
+def jobs(name: str, options: Options) -> dict[str, Options]:
+    """The results that a name on the command line stands for, with the options that each uses."""
+    names = [name] if name in EXPERIMENTS else [*EXPERIMENTS]
+    if options.hands is None and name == "all":
+        names.remove("motion" + OF_OTHERS)
+    if options.hands is not None and name == "motion":
+        names = [name + OF_OTHERS]
+    tuning = {"people"} if options.group == "tuning" else set()
+    return {one: options if one.endswith(OF_OTHERS) or one in tuning else replace(options, hands=None) for one in names}
+
+
+def redraw(results: Results, experiment: ModuleType) -> None:
+    """Draws an experiment's figures of the numbers in its JSON again.
+
+    Raises ExperimentError if its figures show more than its numbers.
+    """
+    if not hasattr(experiment, "draw_numbers"):
+        raise ExperimentError(f"the figures of {results.name} show more than its numbers: run it without --redraw")
+    experiment.draw_numbers(results, results.measured())
+
+
+def make(results: Results, experiment: ModuleType, options: Options) -> None:
+    """Runs an experiment and writes its result. Raises one of FAILURES."""
+    known = (result_of(results.folder, results.name) or {}).get("options", {})
+    for one, value in known.items():
+        if isinstance(value, dict) and getattr(options, one) is None:
+            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{one} DIR again")
+    began, results.origin = time.monotonic(), origin(results.name, options)
+    results.say(EXPERIMENTS[results.name].about)
+    numbers = experiment.run(results, options)
+    if (now := commit()) != results.origin["commit"]:
+        results.origin["commit"] += f" to {now}"  # the tree was changed meanwhile
+    print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code: 0, 1 if an experiment failed, 2 on bad usage."""
+    p = parser()
+    args = p.parse_args(arguments)
+    if not 0 < args.share <= 1:
+        p.error(f"--share {args.share}: above 0, up to 1 accepted")
+    if args.name.endswith(OF_OTHERS) and args.hands is None and not args.redraw:
+        p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
+    if args.name != "stale" and args.output is None:
+        p.error("--output DIR is missing: the folder for the results")
+    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
+    wanted = jobs(args.name, options)
+    try:
+        if args.name == "stale":
+            return stale(args.output or RESULTS, wanted)
+        pyplot()  # reports now what is missing, not after an hour
+        return int(sum(made(name, one, args) for name, one in wanted.items()) > 0)
+    except FAILURES as error:
+        print(f"python -m thirdhand_sim.lab: {in_words(error)}", file=sys.stderr)
+        return 1
+
+
+def made(name: str, options: Options, args: argparse.Namespace) -> int:
+    """Makes one result, or draws it again, where that is due; returns the exit code."""
+    try:
+        only_stale = args.name == "all" and not args.anew and not args.redraw
+        if only_stale and not staleness(name, result_of(args.output, name), tree(), options):
+            print(f"{args.output / name}.json  belongs to this tree", flush=True)
+            return 0
+        results = Results(args.output, name, said=not args.quiet)
+        experiment = importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}")
+        redraw(results, experiment) if args.redraw else make(results, experiment, options)
+    except Exception as error:
+        said = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+        sys.stderr.write(f"python -m thirdhand_sim.lab: {name}: {said}")
+        return 1
+    return 0
+
+
+def stale(folder: Path, wanted: dict[str, Options]) -> int:
+    """Lists the results in a folder that do not belong to this tree; returns the exit code."""
+    found = {name: staleness(name, result_of(folder, name), tree(), options) for name, options in wanted.items()}
+    for name, why in found.items():
+        if why:
+            print(f"{name:<16} {why}")
+    print(f"{sum(map(bool, found.values()))} of {len(found)} results in {folder} are stale")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

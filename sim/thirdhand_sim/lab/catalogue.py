@@ -1,0 +1,164 @@
+"""The experiments: the module of each, what its numbers depend on, and its seeds, tuning and
+evaluation apart.
+
+An experiment is a module with `run(results, options) -> numbers`, and a row of `EXPERIMENTS`. The
+first sentence of the module is its help. The command writes the seeds into the result. No number of
+the service or of a rival may be chosen on what an experiment is evaluated on.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+from thirdhand_sim.made_tasks import TASK_KINDS
+from thirdhand_sim.people import GROUP_SEEDS
+from thirdhand_sim.scene import Scene
+
+DRAWING = 0  # seed of the scatter of dots in a figure, and of resampling for an interval
+
+
+class Stream(NamedTuple):
+    """Random things, each drawn from the stream's seed and its own number."""
+
+    kind: str
+    seed: int  # 0 where each is drawn from its number alone
+    numbers: range
+
+    def share(self, share: float, *, least: int = 1) -> range:
+        """The first numbers of the stream: a share of all, and at least `least`."""
+        return self.numbers[: max(least, round(len(self.numbers) * share))]
+
+    def overlaps(self, other: Stream) -> bool:
+        """True if something is drawn in both."""
+        return self[:2] == other[:2] and not set(self.numbers).isdisjoint(other.numbers)
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.seed}: {self.numbers[0]} to {self.numbers[-1]}"
+
+
+class Seeds(NamedTuple):
+    """Random streams of an experiment: to learn from, to choose constants on, to evaluate on.
+
+    `method` is the seed of the methods' own random choices.
+    """
+
+    evaluation: Mapping[str, Stream]
+    tuning: Mapping[str, Stream] = MappingProxyType({})
+    learned: Mapping[str, Stream] = MappingProxyType({})
+    method: int = 0
+
+    def named(self) -> dict[str, object]:
+        """The seeds as a result's JSON names them."""
+        parts = {"learned": self.learned, "tuning": self.tuning, "evaluation": self.evaluation}
+        return {"method": self.method} | {
+            part: {name: str(stream) for name, stream in streams.items()} for part, streams in parts.items() if streams
+        }
+
+
+class Experiment(NamedTuple):
+    """An experiment: its module below `thirdhand_sim.lab`, the digests that its numbers depend on,
+    its seeds, and the options of the command line that it uses.
+    """
+
+    module: str
+    depends_on: tuple[str, ...]
+    seeds: Seeds
+    options: tuple[str, ...] = ()
+
+    @property
+    def about(self) -> str:
+        """Its purpose: the first sentence of the module, read without importing it."""
+        path = Path(__file__).parent.joinpath(*self.module.split(".")).with_suffix(".py")
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        return " ".join(text.partition("\n\n")[0].split())
+
+
+def _scenes(count: int) -> dict[str, Stream]:
+    return {"scenes": Stream("random scene", 2026, range(count))}
+
+
+def _hands(seed: int) -> dict[str, Stream]:
+    """The hands of the nominal scene."""
+    return {"hands": Stream("hands", seed, range(1))}
+
+
+def _letters(seed: int) -> dict[str, Stream]:
+    """Demonstrations of written letters, five of each."""
+    return {"letters": Stream("written letter", seed, range(5))}
+
+
+# The constants of separation were chosen on these scenes.
+TUNED_SCENES = {"scenes": Stream("random scene", 2019, range(100))}
+SHIPPED = Stream("demonstration", 1, range(1, 6))
+_SHIPPED = {"demonstrations": SHIPPED}
+_IN_SPACE = {"letters": Stream("letter in space", 3, range(4))}
+# The ridge of ProMP was chosen on the letters of seed 0.
+_WRITTEN = Seeds(_letters(1), tuning=_letters(0))
+_TUNED_HANDS = {"people": Stream("moving hands", 0, range(3)), "stops": Stream("sudden stop", 0, range(24))}
+_TEACHERS = {**_SHIPPED, "teachers": Stream("moving hands", 0, range(100, 105))}
+
+ALL, CORE, KMP = ("core", "learning", "kmp"), ("core", "learning"), ("kmp",)
+_TEST, _TUNING, _LEARNED = (GROUP_SEEDS[group] for group in ("test", "tuning", "demonstrations"))
+_PEOPLE = Seeds(
+    {"people": Stream("person", _TEST, range(24)), "breaking": Stream("breaking scene", _TEST, range(40))},
+    tuning={"people": Stream("person", _TUNING, range(10)), "breaking": Stream("breaking scene", _TUNING, range(10))},
+    learned={"people": Stream("person", _LEARNED, range(6))},
+)
+_PARTNERS = Seeds(
+    {kind: Stream(f"made task {kind}", 1, range(18, 24)) for kind in TASK_KINDS},
+    tuning={kind: Stream(f"made task {kind}", 0, range(12)) for kind in TASK_KINDS},
+    learned={kind: Stream(f"made task {kind}", 1, range(12, 18)) for kind in TASK_KINDS},
+)
+_FOLLOWED = {
+    "people": Stream("moving hands", 0, range(200, 203)),
+    "stops": Stream("sudden stop", 0, range(200, 224)),
+    "small": Stream("small motion", 0, range(200, 202)),
+}
+_OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
+_FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
+_ORDERS = {"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))}
+_HELD_OUT = {"demonstrations": Stream("demonstration", 1, range(21, 26))}
+_SENSITIVITY = Seeds(  # one of each for each seed of a session
+    {},
+    tuning={
+        "people": Stream("moving hands", 0, range(300, 306)),
+        "stops": Stream("sudden stop", 0, range(300, 306)),
+        "disturbed": Stream("disturbed hands", 5, range(6)),
+        "hands": Stream("hands", 0, range(300, 306)),
+        "implausible": Stream("implausible samples", 8, range(6)),
+    },
+    learned=_SHIPPED,
+)
+
+EXPERIMENTS: Mapping[str, Experiment] = {
+    "hands": Experiment("hands", ALL, Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED)),
+    "statistics": Experiment("statistics", ALL, Seeds(_scenes(100), tuning=TUNED_SCENES, learned=_SHIPPED)),
+    "people": Experiment("people.comparison", ALL, _PEOPLE, ("group", "hands")),
+    "partners": Experiment("partners", ALL, _PARTNERS, ("data",)),
+    "motion": Experiment("motion", ALL, _OTHERS._replace(evaluation=_FOLLOWED | _hands(Scene().seed)), ("arm",)),
+    "motion-of-others": Experiment("motion", ALL, _OTHERS, ("arm", "hands")),
+    "separation": Experiment("separation", CORE, Seeds(_scenes(100), tuning=TUNED_SCENES)),
+    "faults": Experiment("load.faults", CORE, Seeds(_hands(Scene().seed)), ("arm",)),
+    "letters": Experiment("reproduction.letters", KMP, _WRITTEN, ("letters",)),
+    "promp": Experiment(
+        "reproduction.promp", KMP, Seeds(_letters(1) | _FUNCTIONS, tuning=_WRITTEN.tuning), ("letters",)
+    ),
+    "correlation": Experiment(
+        "reproduction.correlation", KMP, Seeds(_IN_SPACE | {"points": Stream("via-point", 0, range(2))})
+    ),
+    "runs": Experiment("reproduction.runs", KMP, Seeds(_IN_SPACE | {"searches": Stream("search", 0, range(10))})),
+    "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
+    "phase": Experiment("phase", CORE, Seeds(_hands(11), learned=_SHIPPED)),
+    "orientation": Experiment(
+        "orientation", ALL, Seeds(_hands(31) | _scenes(5), tuning=TUNED_SCENES, learned=_SHIPPED)
+    ),
+    "demonstrations": Experiment(
+        "demonstrations", ("learning", "kmp"), Seeds(_scenes(40) | _HELD_OUT, tuning=TUNED_SCENES, learned=_ORDERS)
+    ),
+    "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
+    "camera": Experiment("camera", (), Seeds({"hands": Stream("rendered hands", 0, range(12))})),
+}

@@ -1,0 +1,161 @@
+"""The origin of each experiment's result, and whether it still belongs to this tree.
+
+A result depends on up to three things, each named by a digest: `core`, the frames of the golden
+session; `learning`, the shipped skill, which is what `learn` makes of the shipped demonstrations;
+`kmp`, what the library computes for two small problems. A result whose digests are not the tree's
+is stale.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import os
+import subprocess
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from thirdhand.core.frame import encode
+from thirdhand.recordings.mcap_file import machine
+from thirdhand.recordings.recording import Recording
+from thirdhand.recordings.shipped import SHIPPED_SKILL, recordings
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.results import Array, ExperimentError, Options
+
+ROOT = Path(__file__).parents[3]
+RESULTS = ROOT / "recordings" / "experiments"
+CODE = ("kmp", "service", "sim", "pyproject.toml", "recordings/*.npz", "recordings/people", "recordings/golden.mcap")
+MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
+DECIMALS = 6  # kmp's outputs are rounded to these, on which CPUs agree
+
+
+USUAL = Options()
+
+
+@functools.cache
+def tree() -> dict[str, str]:
+    """The digests of this tree, by name."""
+    return {"core": core_digest(recordings() / "golden.mcap"), "learning": _skill_digest(), "kmp": kmp_digest()}
+
+
+def core_digest(golden: Path) -> str:
+    """The digest of a golden session's frames and messages. Raises RecordingError.
+
+    Where the file has a frame as a whole, its checksum covers the state too, which decides nothing
+    by itself: the frame is taken then.
+    """
+    recording, sums = Recording.open(golden), hashlib.blake2b(digest_size=16)
+    whole = {step.tick: encode(step.frame) for step in recording.steps(whole=False) if step.frame is not None}
+    for tick, number in recording.checksums.items():
+        sums.update(whole.get(tick) or number.to_bytes(4, "little"))
+    return sums.hexdigest()
+
+
+def _skill_digest() -> str:
+    """The checksum of the shipped skill's arrays, which its file keeps."""
+    with np.load(recordings() / SHIPPED_SKILL, allow_pickle=False) as arrays:
+        return str(arrays["checksum"])
+
+
+@functools.cache
+def kmp_digest() -> str:
+    """The digest of what kmp computes for two small problems, rounded to DECIMALS."""
+    sums = hashlib.blake2b(digest_size=16)
+    for output in kmp_outputs():
+        sums.update((np.round(output, DECIMALS) + 0.0).tobytes())  # -0.0 becomes 0.0
+    return sums.hexdigest()
+
+
+def kmp_outputs() -> Iterable[Array]:
+    """References, predictions, derivatives and adaptations, over one input and over two."""
+    for inputs in (1, 2):
+        u = np.linspace(0.0, 1.0, 40)[:, None]
+        lines = [np.hstack([u, u**2][:inputs]) + 0.01 * k for k in range(3)]
+        outputs = [np.hstack([np.sin(3 * u + 0.1 * k), 0.2 * k * np.cos(4 * u) + u]) for k in range(3)]
+        samples = np.hstack([np.concatenate(lines), np.concatenate(outputs)])
+        mixture = GaussianMixture.fit(samples, components=3, seed=0, regularization=1e-4)
+        at = lines[1][::2]
+        reference = mixture.regress(at)
+        primitive = KMP.fit(at, reference, kernel=GaussianKernel(6.0), lambda_mean=0.5, lambda_covariance=2.0)
+        through = Gaussians.of([[0.8, 0.2], [0.7, 0.8]], deviation=0.05)
+        adapted = primitive.adapt(lines[1][[10, 30]], through, tolerance=0.1)
+        yield from (mixture.means, reference.mean, reference.covariance)
+        for one in (primitive, adapted):
+            predicted, parts = one.predict(lines[2]), one.uncertainty(lines[2])
+            yield from (one.mean(lines[2]), predicted.mean, predicted.covariance, one.jacobian(lines[2][7]))
+            yield from (parts.variability, parts.distance)
+
+
+def commit() -> str:
+    """The commit of this tree, with a `+` if its code is changed; "unknown" without git."""
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        return _git("rev-parse", "--short=12", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *CODE))
+    return "unknown"
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(
+        ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def origin(name: str, options: Options) -> dict[str, Any]:
+    """The origin of a result that is made now, as its JSON names it."""
+    known, here = machine(), tree()
+    return {
+        "commit": commit(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": {**{part: known.get(part, "unknown") for part in MACHINE}, "cores": os.cpu_count()},
+        "seeds": EXPERIMENTS[name].seeds.named(),
+        "options": options_of(name, options),
+        "depends_on": {one: here[one] for one in EXPERIMENTS[name].depends_on},
+    }
+
+
+def options_of(name: str, options: Options) -> dict[str, Any]:
+    """The options that an experiment uses; folders by their number of files and a digest."""
+    given = {one: getattr(options, one) for one in ("share", *EXPERIMENTS[name].options)}
+    return {
+        "set" if one == "group" else one: _folder(value) if isinstance(value, Path) else value
+        for one, value in given.items()
+    }
+
+
+def _folder(folder: Path) -> dict[str, Any]:
+    """The recordings in a folder: how many, and a digest of their names and bytes."""
+    files, sums = sorted(folder.glob("*.npz")), hashlib.blake2b(digest_size=16)
+    for file in files:
+        sums.update(f"{file.name} {file.stat().st_size}\n".encode() + file.read_bytes())
+    return {"files": len(files), "digest": sums.hexdigest()}
+
+
+def staleness(name: str, result: Mapping[str, Any] | None, here: Mapping[str, str], options: Options = USUAL) -> str:
+    """The reason why a result is not that of these digests and options; empty if it is.
+
+    A folder that the options do not name may have been any.
+    """
+    if result is None:
+        return "there is no result"
+    if "depends_on" not in result:
+        return "measured with an unknown version"
+    for one, value in options_of(name, options).items():
+        if value is not None and value != (was := result["options"].get(one)):
+            return f"measured with {one} {was}, and {value} is wanted"
+    changed = [one for one in EXPERIMENTS[name].depends_on if result["depends_on"].get(one) != here[one]]
+    return f"{' and '.join(changed)} changed since {result['commit']}" if changed else ""
+
+
+def result_of(folder: Path, name: str) -> dict[str, Any] | None:
+    """The JSON of an experiment in a folder, if it is there. Raises ExperimentError."""
+    path = folder / f"{name}.json"
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
+    except ValueError as error:
+        raise ExperimentError(f"{path}: not the JSON of a result: {error}") from None

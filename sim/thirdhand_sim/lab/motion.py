@@ -1,0 +1,517 @@
+"""Error, lag, smoothness and stops of a tool that follows moving hands, beside rivals.
+
+Errors are distances of the tool from the skill's target for the true hands at the same instant, lag
+included.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.shipped import ARMS, cell_of, recordings
+from thirdhand.settings.config import Settings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand.skills.skill_file import decoded
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.report.tracking import derivative, lag_ms, rms
+from thirdhand_sim.lab import gains, spectra
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.open_loop import targets
+from thirdhand_sim.lab.people.moving_hands import (
+    PERIOD_S,
+    SMALL_KINDS,
+    STOP_S,
+    Moving,
+    modelled,
+    person,
+    reaches,
+    recorded,
+    small_motion,
+    stops,
+)
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    LEFT,
+    OTHER,
+    REFERENCE,
+    RIGHT,
+    TOOL,
+    Array,
+    Options,
+    Results,
+    brief,
+    pyplot,
+    rgb,
+)
+from thirdhand_sim.lab.rivals.followers import (
+    Followed,
+    Follower,
+    chase,
+    ours,
+    servo,
+    truth,
+    unsmoothed,
+)
+from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
+from thirdhand_sim.lab.workers import shared_out
+
+SEEDS = EXPERIMENTS["motion"].seeds
+PEOPLE, STOPS, SCENE, SMALL = (SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small"))
+SMALL_HZ = range(1, 13)
+SECONDS = 15.0
+SETTLED_MM = 5.0
+BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
+DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
+CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
+SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
+LABELS = {
+    "ours": "ours, by [tool] follow (ringed: the default)",
+    "chase": "One-Euro filter, then Ruckig after the target",
+    "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
+}
+TRUTH, SMOOTH = "truth", "minimum jerk"  # the follower and the group whose frequencies are shown
+FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
+WITH_JUMPS = "recorded, jumps in the truth"  # a group: recorded hands, where a follower should follow jumps
+HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
+TICKS_MM = (1, 2, 5, 10, 20)
+AS_PAPER = "experiments/as-paper.npz"
+SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, appended to a group's name
+TEACHERS = SEEDS.learned["teachers"].numbers  # people who are not followed
+TAUGHT_S, TAUGHT_EVERY = 20.0, 10  # ticks from one sample to the next
+LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # motion of their tool, per motion of a hand
+
+
+@dataclass(frozen=True)
+class Figures:
+    """One sequence with one follower.
+
+    Overshoot and settling are those of sudden stops, the rest of all others.
+    """
+
+    follower: str
+    group: str
+    name: str
+    person: str
+    error_rms_mm: float
+    error_p95_mm: float
+    lag_ms: float
+    acceleration_ratio: float  # root mean square, to the truth's
+    jerk_ratio: float
+    limited: float  # share of ticks with a limit met
+    top_speed: float  # [m/s] of the tool
+    overshoot_mm: float
+    settled_ms: float
+    joint_speeds: list[float]  # [rad/s] by frequency, as of `spectra`
+    tracker: str = ""  # its kind, of recorded hands
+    error_with_jumps_mm: float = math.nan  # rms error against the truth with the tracker's jumps
+
+
+def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
+    """A skill learned from modelled people whose tool moves with both hands."""
+    centre = shipped.mean(middle[None])[0]
+    demonstrations = []
+    for seed in TEACHERS:
+        hands = person(seed, middle, TAUGHT_S)[::TAUGHT_EVERY]
+        moved = hands - middle
+        tool = centre + LEFT_GAIN * moved[:, :3] + RIGHT_GAIN * moved[:, 3:]
+        stamps_ns = np.arange(len(hands)) * round(1e9 * PERIOD_S * TAUGHT_EVERY)
+        poses = [np.hstack([x, np.tile(shipped.orientation, (len(x), 1))]) for x in (hands[:, :3], hands[:, 3:], tool)]
+        demonstrations.append(Demonstration(stamps_ns, poses[0], poses[1], poses[2]))
+    return learn(demonstrations, name="of such hands", components=10)
+
+
+def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follower]:
+    """All followers; for a quick look one of each kind, and ours."""
+    found = {"ours": ours(skill, settings)}
+    first = None if share == 1 else 1
+    for dial in DIALS if share == 1 else ():
+        tool = msgspec.structs.replace(settings.tool, follow=dial)
+        found[f"ours, {dial}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
+    for least_hz, beta in CHASES[:first]:
+        found[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
+    for coefficient in SERVOS[:first]:
+        found[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
+    found["no smoothing"], found[TRUTH] = unsmoothed(skill, settings), truth(skill, settings)
+    return found
+
+
+def sequences(options: Options, middle: Array) -> list[Moving]:
+    """The modelled hands that are followed."""
+    share = options.share
+    people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
+    if share < 1:  # a quick look
+        people = [one for one in people if one.group in FLOOR_GROUPS]
+    numbers = STOPS.share(share, least=2)
+    return [
+        *people,
+        *reaches(seeds=[SCENE.seed]),
+        *stops(middle, numbers=numbers),
+        *stops(middle, numbers=numbers, rate_hz=30, noise=0.002, group="sudden stops, 30 Hz, 2 mm"),
+    ]
+
+
+_known: dict[str, Any] = {}
+
+
+def prepare(share: float, arm: str) -> None:
+    """Load the skills and their followers, once in a process."""
+    settings = cell_of(arm)
+    # A function of the hands' positions alone, so that only the followers differ.
+    skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
+    other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
+    for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
+        _known[which] = one, settings, followers(one, settings, share)
+
+
+def measure(task: tuple[str, str, Moving]) -> Figures:
+    """The figures of one sequence with one follower, by one of the skills."""
+    name, which, hands = task
+    skill, settings, by_name = _known[which]
+    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
+    found = figures(name, replace(hands, group=hands.group + which), target, seen)
+    if hands.jumping is None:
+        return found
+    begun = round(BEGUN_S / PERIOD_S)
+    off = seen.tool[begun:] - targets(skill, hands.jumping[begun:], settings)
+    return replace(found, error_with_jumps_mm=1000 * rms(off))
+
+
+def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
+    """Gains of small motion of a kind and a frequency [Hz], from target to setpoint and tool."""
+    name, kind, rate_hz, number = task
+    skill, settings, by_name = _known[SHIPPED]
+    hands = small_motion(skill.hands.mean(axis=0), kind, rate_hz, number)
+    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
+    assert seen.setpoint is not None
+    return [gains.gain(target, path, rate_hz) for path in (seen.setpoint, seen.tool)]
+
+
+def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
+    """Figures of a path against the truth's target (N, 3) [m], from BEGUN_S on."""
+    tool, begun = seen.tool, round(BEGUN_S / PERIOD_S)
+    overshoot = settled = math.nan
+    if not math.isnan(hands.stop_s):
+        begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
+        way = derivative(target, PERIOD_S, order=1)[begin]
+        past = (tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
+        overshoot = max(0.0, 1000 * float(past.max()))
+        late = np.flatnonzero(1000 * np.linalg.norm(tool[end:] - target[-1], axis=1) > SETTLED_MM)
+        settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
+    tool, target = tool[begun:], target[begun:]
+    off_mm = 1000 * np.linalg.norm(tool - target, axis=1)
+    wanted_acceleration, acceleration = (derivative(x, PERIOD_S, order=2) for x in (target, tool))
+    return Figures(
+        name,
+        hands.group,
+        hands.name,
+        hands.person,
+        error_rms_mm=float(np.sqrt(np.mean(off_mm**2))),
+        error_p95_mm=float(np.percentile(off_mm, 95)),
+        lag_ms=lag_ms(target, tool, PERIOD_S),
+        acceleration_ratio=rms(acceleration) / rms(wanted_acceleration),
+        jerk_ratio=rms(derivative(tool, PERIOD_S, order=3)) / rms(derivative(target, PERIOD_S, order=3)),
+        limited=seen.limited,
+        top_speed=seen.top_speed,
+        overshoot_mm=overshoot,
+        settled_ms=settled,
+        joint_speeds=spectra.speeds(seen.tool, seen.joints),
+        tracker=hands.tracker,
+    )
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """Follows all hands with all followers; returns the numbers for its JSON."""
+    prepare(options.share, options.arm)
+    skill, _, by_name = _known[SHIPPED]
+    if options.hands is not None:
+        return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
+    hands = sequences(options, skill.hands.mean(axis=0))
+    tasks = [(name, SHIPPED, one) for name in by_name for one in hands if name != TRUTH or one.group == SMOOTH]
+    by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
+    tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
+    found = _measured(tasks, options)
+    table = {name: _summary([one for one in found if one.follower == name]) for name in by_name if name != TRUTH}
+    for name, groups in table.items():
+        results.say(f"{name}: {brief(groups)}")
+    floors = {
+        group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
+        for group, rate_hz in FLOOR_GROUPS.items()
+    }
+    _record(results, hands[1], by_name["ours"](hands[1]))
+    numbers = {
+        "hands": "modelled",
+        "by_follower": table,
+        "by_person": _by_person(results, [one for one in found if math.isnan(one.overshoot_mm)]),
+        "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
+        "gain_by_frequency": _gains(results, options, dict(zip(("ours", "chase"), by_both, strict=True))),
+        "joint_speeds_in_the_scene": _joint_speeds(found, (TRUTH, *by_both, "no smoothing")),
+        "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
+        "by_arm": _by_arm(results, options, [one for one in hands if one.group in FLOOR_GROUPS]),
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
+    """Means over the sequences of each group; of stops the worst too."""
+    out: dict[str, dict[str, float]] = {}
+    for group in dict.fromkeys(one.group for one in rows):
+        of = [one for one in rows if one.group == group]
+        top = max(one.top_speed for one in of)
+        if math.isnan(of[0].overshoot_mm):
+            names = ("error_rms_mm", "error_p95_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
+            out[group] = {name: float(np.mean([getattr(one, name) for one in of])) for name in names}
+        else:
+            overshoot, settled = [one.overshoot_mm for one in of], [one.settled_ms for one in of]
+            out[group] = {
+                "overshoot_mean_mm": float(np.mean(overshoot)),
+                "overshoot_worst_mm": max(overshoot),
+                "settled_worst_ms": max(settled),
+            }
+        out[group]["top_speed"] = top
+    return out
+
+
+def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Figures]:
+    """The figures of all tasks, shared out over processes."""
+    begin = functools.partial(prepare, options.share, options.arm)
+    return list(shared_out(measure, tasks, options.workers, prepare=begin))
+
+
+def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
+    """The tasks of ours and of the chases on these hands."""
+    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
+    return [(name, SHIPPED, one) for name in names for one in hands]
+
+
+def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str, dict[str, dict[str, float]]]:
+    """The errors with each shipped arm by group, as of `_compared`."""
+    tasks, out = _beside_chases(hands), {}
+    for arm in ARMS:
+        prepare(options.share, arm)  # of this process, which measures if there is one worker
+        found = _measured(tasks, replace(options, arm=arm))
+        out[arm] = {group: _compared([one for one in found if one.group == group]) for group in FLOOR_GROUPS}
+        results.say(f"{arm}, rms [mm]: {brief(out[arm])}")
+    return out
+
+
+def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
+    """The gains of small motion by kind, follower and path, rms over the numbers of the stream."""
+    rates = list(SMALL_HZ if options.share == 1 else SMALL_HZ[1::4])
+    numbers = SMALL.share(options.share)
+    tasks = [
+        (name, kind, float(hz), number)
+        for kind in SMALL_KINDS
+        for name in names.values()
+        for hz in rates
+        for number in numbers
+    ]
+    begin = functools.partial(prepare, options.share, options.arm)
+    found = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin)))
+    found = found.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
+    means = np.sqrt(np.mean(found**2, axis=3))
+    out: dict[str, Any] = {"hz": rates}
+    for kind, of_kind in zip(SMALL_KINDS, means, strict=True):
+        out[kind] = {
+            who: dict(zip(gains.PATHS, of.T.tolist(), strict=True)) for who, of in zip(names, of_kind, strict=True)
+        }
+        results.say(f"gain of {kind}, by Hz: {brief(out[kind])}")
+    return out
+
+
+def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
+    """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
+    harder = [("ours", SHIPPED, one) for one in hands if one.group in HARDER_GROUPS]
+    hands = [one for one in hands if one.group in FLOOR_GROUPS]
+    found = _measured(_beside_chases(hands), options)
+    takes = Counter(one.person for one in hands if one.group == "clean")
+    found += [
+        replace(one, group=WITH_JUMPS, error_rms_mm=one.error_with_jumps_mm) for one in found if one.group == "recorded"
+    ]
+    people = _by_person(results, found)
+    kinds = {person: _usual_tracker(found, person) for person in takes}
+    together: dict[str, dict[str, float]] = {}
+    trackers: dict[str, dict[str, dict[str, float]]] = {}
+    for group in people:
+        of = [one for one in found if one.group == group]
+        together[group] = _compared(of)
+        results.say(f"{group}, all: {brief(together[group])}")
+        trackers[group] = {
+            kind: _compared([one for one in of if kinds[one.person] == kind]) for kind in sorted(set(kinds.values()))
+        }
+        results.say(f"{group}, by tracker: {brief(trackers[group])}")
+    bound = _bound(results, [one for one in hands if one.group == "recorded"], found)
+    worse, of_harder = {}, _measured(harder, options)
+    for group in HARDER_GROUPS:
+        error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
+        worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
+        results.say(f"{group}, all: {brief(worse[group])}")
+    numbers = {
+        "hands": "recorded",
+        "takes": dict(takes),
+        "trackers": kinds,
+        "by_person": people,
+        "by_tracker": trackers,
+        "all": together,
+        "best_linear_filter": bound,
+        "harder": worse,
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[str, dict[str, float]]:
+    """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
+    fitted to each recording; medians over recordings.
+    """
+    skill = _known[SHIPPED][0]
+    mine = {one.name: one for one in found if one.follower == "ours" and one.group == hands[0].group}
+    errors: dict[str, list[tuple[float, float]]] = {}
+    for one in hands:
+        floors = best_linear([one], skill, rate_hz=round(1 / float(np.median(np.diff(one.stamps)))))
+        pair = mine[one.name].error_rms_mm, error_at(floors, mine[one.name].jerk_ratio)
+        for kind in (one.tracker, "all"):
+            errors.setdefault(kind, []).append(pair)
+    out = {
+        kind: dict(zip(("ours", "bound"), np.median(pairs, axis=0).tolist(), strict=True))
+        for kind, pairs in errors.items()
+    }
+    results.say(f"recorded, beside the best linear filters: {brief(out)}")
+    return out
+
+
+def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
+    """The errors of each group and person, as of `_compared`."""
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for group in dict.fromkeys(one.group for one in rows):
+        of = [one for one in rows if one.group == group]
+        people = dict.fromkeys(one.person for one in of)
+        out[group] = {person: _compared([one for one in of if one.person == person]) for person in people}
+        results.say(f"{group}, rms [mm]: {brief(out[group])}")
+    return out
+
+
+def _compared(rows: list[Figures]) -> dict[str, float]:
+    """Errors [mm] over sequences, root mean square and median: ours, and those of the best chase
+    for each person. Our lag is a median too.
+    """
+    errors: dict[str, list[float]] = {"ours": [], "chase": []}
+    for name in dict.fromkeys(one.person for one in rows):
+        mine = [one for one in rows if one.person == name]
+        chases = sorted({one.follower for one in mine if one.follower.startswith("chase")})
+        best = min(chases, key=lambda follower: _pooled(mine, follower))
+        for who, follower in (("ours", "ours"), ("chase", best)):
+            errors[who] += [one.error_rms_mm for one in mine if one.follower == follower]
+    out = {who: float(np.sqrt(np.mean(np.square(each)))) for who, each in errors.items()}
+    medians = {f"{who}_median": float(np.median(each)) for who, each in errors.items()}
+    ratios = {
+        "ratio": out["ours"] / out["chase"],
+        "ratio_of_medians": medians["ours_median"] / medians["chase_median"],
+    }
+    lag_ms = float(np.median([one.lag_ms for one in rows if one.follower == "ours"]))
+    return {**out, **ratios, **medians, "lag_ms": lag_ms, "takes": len(errors["ours"])}
+
+
+def _usual_tracker(rows: list[Figures], name: str) -> str:
+    """The kind of tracker that recorded most sequences of a person."""
+    return Counter(one.tracker for one in rows if one.person == name).most_common(1)[0][0]
+
+
+def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """The joints' speeds by frequency and the share of ripple, for each follower."""
+    rows = {one.follower: one.joint_speeds for one in found if one.group == SMOOTH and one.follower in names}
+    kinds = {name.partition(",")[0]: rows[name] for name in names}
+    return {kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()}
+
+
+def _pooled(rows: list[Figures], follower: str) -> float:
+    return math.sqrt(np.mean([one.error_rms_mm**2 for one in rows if one.follower == follower]))
+
+
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers: error against jerk of every follower and of the best
+    linear filters; for recorded hands each person's error, ours against the chase's.
+    """
+    plt = pyplot()
+    figure, axes = plt.subplots(1, len(FLOOR_GROUPS), figsize=(10, 4.2), layout="constrained")
+    for panel, group in zip(axes, FLOOR_GROUPS, strict=True):
+        if "by_follower" in numbers:
+            _draw_followers(panel, numbers["by_follower"], group, numbers["best_linear_filter"][group])
+            seen = "as a camera sees them, 30 Hz"
+        else:
+            _draw_people(panel, numbers["by_person"][group])
+            seen = "as recorded"
+        panel.set_title("clean, 100 Hz" if group == "clean" else seen)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    results.figure(figure)
+    if "by_follower" in numbers:
+        spectra.draw(results, {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()})
+    if "gain_by_frequency" in numbers:  # results of an older layout have none
+        gains.draw(results, numbers["gain_by_frequency"])
+
+
+def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]) -> None:
+    styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
+    for family, (colour, marker) in styles.items():
+        rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
+        points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
+        label = LABELS.get(family, family)
+        panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
+        if family == "ours":
+            chosen = rows["ours"]
+            panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
+    x, y = ([row[name] for row in floor] for name in ("jerk_ratio", "error_rms_mm"))
+    panel.plot(x, y, "k--", lw=1, label="best linear filter, without limits and arm")
+    panel.set(xscale="log", xlabel="jerk, multiple of the truth's", ylabel="error, rms [mm]", ylim=(0, None))
+
+
+def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
+    names = sorted(rows, key=lambda name: rows[name]["chase"])
+    ours, chase = ([rows[name][who] for name in names] for who in ("ours", "chase"))
+    panel.hlines(range(len(names)), ours, chase, color="0.8", lw=2)
+    panel.plot(chase, range(len(names)), "s", color=ADAPTED, ms=5, label="the best One-Euro filter and Ruckig")
+    panel.plot(ours, range(len(names)), "o", color=TOOL, ms=6, label="ours")
+    panel.set(xscale="log", xlabel="error, rms [mm]")
+    panel.set_yticks(range(len(names)), names)
+    panel.set_xticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
+    panel.set_xticks([], minor=True)
+    panel.set_xlim(0.8 * min(ours), 1.2 * max(chase))
+
+
+def _record(results: Results, hands: Moving, seen: Followed) -> None:
+    """One sequence in Rerun: truth, raw samples and estimate of each hand, target, setpoint and
+    tool.
+    """
+    stream = results.recording()
+    assert seen.estimate is not None
+    times = np.arange(len(hands.truth)) * PERIOD_S
+    at = np.minimum(np.round(hands.stamps / PERIOD_S).astype(int), len(times) - 1)
+
+    def points(path: str, when: Any, positions: Any, colour: str, radius: float) -> None:
+        stream.log(path, rr.Points3D.from_fields(colors=[rgb(colour)], radii=[radius]), static=True)
+        index = [rr.TimeColumn("time", duration=when)]
+        stream.send_columns(path, index, rr.Points3D.columns(positions=positions))
+
+    for side, (name, colour) in enumerate((("left", LEFT), ("right", RIGHT))):
+        part = slice(3 * side, 3 * side + 3)
+        points(f"/{name}/truth", times, hands.truth[:, part], REFERENCE, 0.006)
+        points(f"/{name}/raw", times[at], hands.samples[:, part], OTHER, 0.004)
+        points(f"/{name}/estimate", times, seen.estimate[:, side], colour, 0.008)
+    for name, path, colour in (
+        ("target", seen.target, ADAPTED),
+        ("setpoint", seen.setpoint, REFERENCE),
+        ("tool", seen.tool, TOOL),
+    ):
+        assert path is not None
+        points(f"/{name}", times, path, colour, 0.008)
+        stream.log(f"/{name}/way", rr.LineStrips3D([path], colors=[rgb(colour)], radii=[0.0007]), static=True)
+    stream.disconnect()

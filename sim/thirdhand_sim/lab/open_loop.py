@@ -1,0 +1,34 @@
+"""The service's core in process, with an arm that moves exactly as commanded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import Tick
+from thirdhand.core.skill.skill import Skill, clamp
+from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand.workbench.takes.recorded_hands import frames_of, with_ideal_arm
+from thirdhand_sim.lab.results import Array
+
+USUAL = Settings()
+
+
+def controller(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Controller:
+    """The service's core with an arm that is where it is commanded."""
+    return Controller(with_ideal_arm(settings), skill, urdf=robot_description(settings), tuning=tuning)
+
+
+def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING) -> NDArray[np.void]:
+    """The service's frames (T,) of ticks."""
+    return frames_of(controller(skill, settings, tuning), ticks)
+
+
+def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:
+    """Targets (T, 3) [m] of the service for hands (T, 6) [m] at rest."""
+    still, reach = np.zeros(3), settings.reach
+    return np.array([clamp(at, still, still, box=skill.workspace, reach=reach).position for at in skill.mean(hands)])

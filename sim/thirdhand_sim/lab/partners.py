@@ -1,0 +1,420 @@
+"""Learned skills where a third hand does something other than soldering: recordings of real
+partners, and made tasks of eleven kinds. Ours beside rivals, on takes that were left out.
+
+What is judged is what a user has: the skill of `thirdhand learn` with its defaults. Where the
+command refuses, there is none, and the error that the skill would have had is given apart.
+Recordings are left out take by take, person by person, or in blocks. The made tasks are shown by
+some people and done by others. A rival that is given the via-points knows as much as a skill
+between them.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from thirdhand.core.skill.model import LEVELS
+from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import SkillError, StoredSkill
+from thirdhand.workbench.learning.learn import learn
+from thirdhand.workbench.learning.records import Figures
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.people.into_reach import RigidMap
+from thirdhand_sim.lab.people.left_out import (
+    JUDGED_HZ,
+    SESSION_RESTS_S,
+    Judged,
+    LeftOut,
+    judged,
+    left_out,
+    predicted_rounds,
+    read,
+)
+from thirdhand_sim.lab.reached import taught
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    OTHER,
+    REFERENCE,
+    TOOL,
+    ExperimentError,
+    Options,
+    Results,
+    brief,
+    pyplot,
+)
+from thirdhand_sim.lab.rivals.partners import RIVALS, left_out_by
+from thirdhand_sim.lab.workers import shared_out
+from thirdhand_sim.made_tasks import TASK_KINDS, takes
+
+SERVICE, TOLD = "service", ", told"
+RECORDED = {  # the beginnings of the files' names
+    "robot holds driver": ("robot_hold_driver",),
+    "robot hands over plate": ("robot_hand_over_plate",),
+    "robot hands over screw": ("robot_hand_over_screw",),
+    "those three in one": ("robot_hold_driver", "robot_hand_over_plate", "robot_hand_over_screw"),
+    "give": ("give",),
+    "walk": ("walk",),
+}
+PEOPLE = ("give",)  # its groups are persons
+NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
+BLOCK = 9  # takes of `walk` that are left out together
+SEEDS = EXPERIMENTS["partners"].seeds
+EACH = 2  # takes of a person
+OWN = 3  # takes by which a person refines the skill of the others
+DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
+WANTED_TOLD = 90.0  # [%] of the samples with an error above UNSURE_M should be held or unsure
+ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the others may be
+GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
+SHOWN = {
+    SERVICE: ("service", ADAPTED, "o"),
+    "same elapsed time": ("same elapsed time", REFERENCE, "|"),
+    "linear": ("linear", REFERENCE, "x"),
+    "Gaussian process": ("Gaussian process", OTHER, "s"),
+    "with 2 s of memory": ("Gaussian process with 2 s of memory", TOOL, "^"),
+    "memory and clock": ("Gaussian process with memory and clock", TOOL, "v"),
+    "HMM over demonstrations": ("HMM over demonstrations", "#CC79A7", "D"),
+}
+
+
+class Part(NamedTuple):
+    """The work of one process: a task and the group left out of it; made kinds leave none out."""
+
+    task: str
+    out: str
+    people: int
+    data: Path | None
+
+
+class Fold(NamedTuple):
+    """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
+
+    refusals: tuple[str, ...]  # reasons why the command writes no skill
+    residual: tuple[str, ...]  # risks that somebody must accept before the daemon serves it
+    figures: Figures | None  # none where nothing could be learned
+    model: str
+    accepted: list[Judged | None]  # each take with the command's skill; None: refused
+    again: list[list[Judged]]  # the further rounds of each accepted take, by their rests
+    in_spite: list[Judged]  # each take of a refused fold, with the skill used in spite of the refusal
+    take_refusals: list[str]  # via-points that the skill cannot be adapted to
+
+
+class Found(NamedTuple):
+    """The judged takes of each rival, the service's fold without and with via-points, and more that
+    some tasks have.
+    """
+
+    rivals: dict[str, list[Judged]]
+    service: dict[str, Fold]
+    moved: RigidMap | None = None  # of recorded takes, into the arm's reach
+    own: Fold | None = None  # the skill refined by OWN takes of the person who is left out, on the rest
+
+
+@functools.lru_cache(maxsize=2)
+def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], list[LeftOut]]:
+    """Takes to learn from, and those that are left out wherever they are not learned from."""
+    if task in TASK_KINDS:
+        groups = [
+            [
+                left_out(f"person {take.person} take {i % EACH}", "", take.demonstration)
+                for i, take in enumerate(takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed))
+            ]
+            for stream in (SEEDS.learned[task], SEEDS.evaluation[task])
+        ]
+        return groups[0], groups[1]
+    assert data is not None
+    files = [path for path in sorted(data.glob("*.npz")) if path.name.startswith(RECORDED[task])]
+    if len(files) < 2:
+        raise ExperimentError(f"{len(files)} recordings of {task!r} in {data}: {RECORDED[task][0]}*.npz needed")
+    found = [
+        left_out(path.stem, group, read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)))
+        for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
+    ]
+    return found, found
+
+
+def _group(task: str, number: int, name: str) -> str:
+    if task == "give":
+        return name.split("_")[1]
+    return f"block {number // BLOCK}" if task == "walk" else name
+
+
+def part(one: Part) -> Found:
+    """The fold of one part."""
+    shown, asked = _takes(one.task, one.people, one.data)
+    if one.out:
+        shown, asked = [t for t in shown if t.group != one.out], [t for t in asked if t.group == one.out]
+    named = bool(shown[0].demonstration.places)
+    found = Found({}, {})
+    if one.task not in TASK_KINDS:
+        into_reach = RigidMap.of(shown, Settings().reach)
+        found = found._replace(moved=into_reach)
+        shown, asked = (list(map(into_reach.moved, some)) for some in (shown, asked))
+    for told in [False] * (one.task not in TASK_KINDS) + [True] * named:
+        for name, rival in RIVALS.items():
+            said = left_out_by(rival, shown, asked, told=told)
+            found.rivals[name + TOLD * told] = [judged(*pair) for pair in zip(asked, said, strict=True)]
+        found.service[SERVICE + TOLD * told] = served(shown, asked, told=told)
+    if one.task in PEOPLE:
+        skill, _ = as_command(shown, told=named)
+        found = found._replace(own=served(asked[:OWN], asked[OWN:], told=named, refined=skill))
+    return found
+
+
+def as_command(
+    shown: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
+) -> tuple[StoredSkill | None, tuple[str, ...]]:
+    """The skill of `thirdhand learn`, an arm's reach included, and the reasons
+    why the command writes none. `told`: the takes hold their via-points. `refined`: the skill that
+    is given to --from.
+    """
+    try:
+        skill = learn(
+            [one.demonstration if told else one.demonstration._replace(places=()) for one in shown],
+            names=[one.name for one in shown],
+            refined=refined,
+        )
+    except SkillError as error:
+        return None, (str(error),)
+    return skill, figures_of(skill).unsafe
+
+
+def figures_of(skill: StoredSkill) -> Figures:
+    """The figures in a skill's file."""
+    return msgspec.json.decode(skill.figures, type=Figures)
+
+
+def served(
+    shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
+) -> Fold:
+    """The service's skill of the shown takes, on those that are left out.
+
+    An accepted skill is judged within the reach of the arm. A refused one is judged without it, as
+    otherwise the reach alone would decide.
+    """
+    skill, refusals = as_command(shown, told=told, refined=refined)
+    if skill is None:
+        return Fold(refusals, (), None, "", [None] * len(asked), [], [], [])
+    figures = figures_of(skill)
+    fold = Fold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [], [])
+    for take in asked:
+        rounds: list[Judged] = []
+        try:
+            there = taught(skill, take.demonstration.places) if told else skill
+            said = predicted_rounds(there, take, reach=None if refusals else Settings().reach)
+            rounds = [judged(take, one) for one in said]
+        except SkillError as error:
+            fold.take_refusals.append(str(error))
+        if refusals:
+            fold.in_spite.extend(rounds[:1])
+            fold.accepted.append(None)
+        else:
+            fold.accepted.append(rounds[0] if rounds else None)
+            fold.again.extend([rounds[1:]] if rounds else [])
+    return fold
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """The numbers of all sets."""
+    people = max(2, round(DEMONSTRATORS * options.share))
+    parts = [Part(kind, "", people, None) for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]]
+    if options.data is not None:
+        for task in RECORDED:
+            groups = sorted({take.group for take in _takes(task, 0, options.data)[0]})
+            parts += [Part(task, out, 0, options.data) for out in groups[: max(2, round(len(groups) * options.share))]]
+    else:
+        results.say("made tasks alone: --data DIR adds recordings")
+    by_task: dict[str, list[Found]] = {}
+    for one, found in zip(parts, shared_out(part, parts, options.workers), strict=True):
+        by_task.setdefault(one.task, []).append(found)
+        *_, ours = found.service.values()
+        results.say(f"{one.task} {one.out}: {_line(ours)}")
+    numbers: dict[str, Any] = {
+        "judged_hz": JUDGED_HZ,
+        "levels": LEVELS,
+        "demonstrators": people,
+        "takes_each": EACH,
+        "tested_people": people,
+        "recorded": {task: numbers_of(by_task[task]) for task in RECORDED if task in by_task},
+        "made": {kind: numbers_of(by_task[kind]) for kind in TASK_KINDS if kind in by_task},
+    }
+    for kind in ("recorded", "made"):
+        folds = [fold for task in numbers[kind] for found in by_task[task] for fold in found.service.values()]
+        numbers[f"all_{kind}"] = summary([one for fold in folds for one in fold.accepted if one])
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
+    """The numbers of a set: of each rival, and of the service.
+
+    Those of the service are of accepted takes alone, and `beside_mm` has each rival on these takes.
+    """
+    methods = {name: summary([one for part in found for one in part.rivals[name]]) for name in found[0].rivals}
+    for name in found[0].service:
+        folds, told = [part.service[name] for part in found], name.removeprefix(SERVICE)
+        accepted = [one is not None for fold in folds for one in fold.accepted]
+        beside = {rival: [one for part in found for one in part.rivals[rival + told]] for rival in RIVALS}
+        there = {rival: summary(list(itertools.compress(rows, accepted))) for rival, rows in beside.items()}
+        reasons = [text for fold in folds for text in (*fold.refusals, *fold.take_refusals)]
+        figures = [fold.figures for fold in folds if fold.figures]
+        methods[name] = summary([one for fold in folds for one in fold.accepted if one]) | {
+            "folds": len(folds),
+            "folds_refused": sum(bool(fold.refusals) for fold in folds),
+            "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
+            "risks": list(dict.fromkeys(text for fold in folds for text in fold.residual))[:2],
+            "refuses": accepted.count(False),
+            "reasons": list(dict.fromkeys(reasons))[:2],
+            "again": {
+                f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
+                for i, rest_s in enumerate(SESSION_RESTS_S)
+            },
+            "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
+            "beside_mm": {rival: rows.get("rms_mm") for rival, rows in there.items()},
+            "model": next((fold.model for fold in folds if fold.model), None),
+            "learn_says_mm": float(np.mean([one.all.error_mm for one in figures])) if figures else None,
+            "ambiguous": float(np.mean([one.ambiguous for one in figures])) / 100 if figures else None,
+            "unsafe": sum(bool(one.unsafe) for one in figures),
+            "says": [*figures[0].unsafe, *figures[0].warnings] if figures else [],
+        }
+    more: dict[str, Any] = {"moved": [part.moved for part in found]} if found[0].moved else {}
+    if own := [part.own for part in found if part.own]:
+        weights = [fold.figures.weight for fold in own if fold.figures]
+        more["own_takes"] = summary([one for fold in own for one in fold.accepted if one]) | {
+            "own": OWN,
+            "folds_refused": sum(bool(fold.refusals) for fold in own),
+            "weights": weights,
+        }
+    return {"folds": len(found), "methods": methods, **more}
+
+
+def summary(rows: Sequence[Judged]) -> dict[str, Any]:
+    """Errors over all samples [mm], and shares of samples; none of no takes."""
+    if not rows:
+        return {"takes": 0}
+    count = sum(one.samples for one in rows)
+    inside = [one.inside for one in rows if one.inside is not None]
+    held, unsure, told, falsely = (
+        [x for x in column if x is not None]
+        for column in zip(*((r.held, r.unsure, r.told, r.falsely_told) for r in rows), strict=True)
+    )
+    wrong = sum(one.wrong for one in rows)
+    return {
+        "takes": len(rows),
+        "rms_mm": 1000 * float(np.sqrt(sum(one.squares for one in rows) / count)),
+        "shifted_rms_mm": 1000 * float(np.sqrt(sum(one.shifted for one in rows) / count)),
+        "shift_s": float(np.median([one.shift_s for one in rows])),
+        "worst_mm": 1000 * max(one.worst_m for one in rows),
+        "coverage": [float(x) / count for x in np.sum(inside, axis=0)] if inside else None,
+        "held": sum(held) / count if held else None,
+        "unsure": sum(unsure) / count if unsure else None,
+        "wrong": wrong / count,
+        "told": sum(told) / wrong if told and wrong else None,  # of the wrong ones, held or unsure
+        "falsely_told": sum(falsely) / (count - wrong) if falsely and count > wrong else None,
+    }
+
+
+def _line(fold: Fold) -> str:
+    """A fold as a line of progress."""
+    one = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
+    return f"refused ({fold.refusals[0]}), in spite of it {one}" if fold.refusals else one
+
+
+class Verdict(NamedTuple):
+    """A set as `learn` judges it: summaries of accepted takes, and of refused skills in spite."""
+
+    accepted: Mapping[str, Any]
+    in_spite: Mapping[str, Any]
+    folds_refused: int
+    refused: str  # the number of refused skills or takes, in words
+    at_risk: int = 0  # skills that are served only if somebody accepts their residual risk
+
+    @property
+    def some_refused(self) -> bool:
+        """True if the errors are of some of the takes only, and rivals are known on the same."""
+        return bool(self.accepted["takes"] and self.accepted["refuses"] and "beside_mm" in self.accepted)
+
+
+def verdict(task: Mapping[str, Any], method: str) -> Verdict:
+    """The verdict on the service in a set's numbers.
+
+    In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
+    or none.
+    """
+    one, none = task["methods"][method], {"takes": 0}
+    folds_refused, takes = one.get("folds_refused", one["unsafe"]), one["takes"] + one["refuses"]
+    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{one['refuses']} of {takes} takes"
+    if "in_spite_of_refusal" not in one and folds_refused:
+        return Verdict(none, one, folds_refused, refused)
+    in_spite, at_risk = one.get("in_spite_of_refusal", none), one.get("folds_at_risk", 0)
+    return Verdict(one, in_spite, folds_refused, refused if one["refuses"] else "none", at_risk)
+
+
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
+    plt = pyplot()
+    panels = []
+    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, via-points given", numbers["made"])):
+        rows = []
+        for name, task in sets.items():
+            endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
+            rows += [(name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending) for ending in endings]
+        panels += [(title, rows)] if rows else []
+    heights = [len(rows) for _, rows in panels]
+    figure, axes = plt.subplots(
+        len(panels), 1, figsize=(7.5, 1.6 + 0.36 * sum(heights)), height_ratios=heights, squeeze=False, sharex=True
+    )
+    for ax, (title, rows) in zip(axes[:, 0], panels, strict=True):
+        labels = []
+        for y, (name, task, ending) in enumerate(rows):
+            ours = verdict(task, SERVICE + ending)
+            labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
+            ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
+            for who, (_, colour, marker) in SHOWN.items():
+                one = ours.accepted if who == SERVICE else task["methods"].get(who + ending, {})
+                ax.plot(one.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
+            ax.plot(ours.accepted.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
+            ax.plot(ours.in_spite.get("rms_mm", np.nan), y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
+        ax.set_yticks(range(len(rows)), labels)
+        ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
+        ax.set_title(title, loc="left", fontsize=9)
+    for label, colour, marker in SHOWN.values():
+        axes[0, 0].plot([], [], marker, color=colour, ms=5, ls="", label=label)
+    axes[0, 0].plot(
+        [], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, with the best time shift of each take"
+    )
+    label = "service, refused by learn, used in spite of it"
+    axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
+    axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+    results.figure(figure)
+    _draw_reliability(results, numbers)
+
+
+def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of what a skill says of its own errors, set by set."""
+    plt = pyplot()
+    figure, (inside, told) = plt.subplots(1, 2, figsize=(7.5, 3.6))
+    inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
+    told.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
+    for part, colour, label in (("recorded", TOOL, "recorded partners"), ("made", ADAPTED, "made tasks")):
+        for task in numbers[part].values():
+            name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
+            one = task["methods"][name]
+            if one["takes"] and one["coverage"]:
+                inside.plot(
+                    100 * np.array(numbers["levels"]), 100 * np.array(one["coverage"]), ".-", color=colour, lw=0.8
+                )
+            if one.get("falsely_told") is not None and one["told"] is not None:
+                told.plot(100 * one["falsely_told"], 100 * one["told"], "o", color=colour, ms=5)
+        inside.plot([], [], ".-", color=colour, label=label)
+    inside.set(xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]")
+    told.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
+    told.set_ylabel("wrong samples held or unsure [%]")
+    inside.legend(fontsize=8)
+    results.figure(figure, "reliability")

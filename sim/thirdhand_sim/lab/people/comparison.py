@@ -1,0 +1,336 @@
+"""Learned skills on modelled people who did not demonstrate, ours beside rivals.
+
+All methods learn from the same demonstrations, are given the same places with the same errors, and
+are followed by the same core. Parameters are chosen on the people of the tuning set, from the same
+number of candidates for each method. The figures are those of the test set.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thirdhand.core.skill.model import LEVELS
+from thirdhand_sim.lab.catalogue import DRAWING, EXPERIMENTS, Stream
+from thirdhand_sim.lab.people.recorded_people import recorded_people
+from thirdhand_sim.lab.people.trials import (
+    FAST_MPS,
+    FOR_S,
+    NEAR_M,
+    RATE_HZ,
+    SLOW_MPS,
+    WITHIN_M,
+    WRONG_M,
+    Outcome,
+    Seen,
+    judge,
+    seen,
+)
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    OTHER,
+    Array,
+    Options,
+    Results,
+    brief,
+    pyplot,
+)
+from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
+from thirdhand_sim.lab.rivals.method import Method, Model
+from thirdhand_sim.lab.rivals.mixtures import MixtureRegression, TaskParameterised
+from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
+from thirdhand_sim.lab.rivals.promp import InteractionProMP
+from thirdhand_sim.lab.rivals.service import Service, ServiceAsPaper
+from thirdhand_sim.lab.workers import shared_out
+from thirdhand_sim.people import Group, Places, person
+from thirdhand_sim.sessions import (
+    BREAKING,
+    SessionDemonstration,
+    breaking,
+    demonstrations,
+    session,
+)
+
+SEEDS = EXPERIMENTS["people"].seeds
+PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
+DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
+PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
+SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # scenes of a person, half with each sigma
+SIGMAS_M = (0.005, 0.010)
+BREAKING_SCENES: dict[Group, int] = {group: len(part["breaking"].numbers) for group, part in PARTS.items()}
+RESAMPLED = 2000
+SAME = 0.05  # candidates within this difference of success are equally good
+TEACHER = "teacher"
+
+
+class Entry(NamedTuple):
+    """A method: its label, and the parameters that were tried, the chosen ones first."""
+
+    label: str
+    candidates: tuple[Method, ...]
+
+
+METHODS = {
+    "ours": Entry("ours, between places", (Service(),)),
+    "as_paper": Entry("ours, the paper's way:\nplaces are via-points", (ServiceAsPaper(),)),
+    "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0))),
+    "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0))),
+    "gaussian_process": Entry(
+        "Gaussian process",
+        tuple(
+            GaussianProcess(each, own_m)
+            for each, own_m in ((15, 0.0), (30, 0.0), (30, 0.05), (30, 0.1), (15, 0.05), (15, 0.1))
+        ),
+    ),
+    "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
+    "paper": Entry(
+        "KMP, the paper's numbers,\nour neighbourhoods",
+        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.005, 0.0001, 0.001, 0.003, 0.01, 0.02)),
+    ),
+    "promp": Entry(
+        "Interaction ProMP",
+        tuple(
+            InteractionProMP(by_length=by_length, hands_m=hands_m)
+            for by_length in (True, False)
+            for hands_m in (0.01, 0.02, 0.03)
+        ),
+    ),
+    "tp_gmm": Entry(
+        "TP-GMM",
+        tuple(
+            TaskParameterised(components, 0.01, iterations)
+            for components, iterations in ((6, 40), (10, 1), (20, 3), (10, 3), (10, 40), (20, 1))
+        ),
+    ),
+}
+
+
+class Task(NamedTuple):
+    """One method with one candidate's parameters, in the people's scenes or in those that break."""
+
+    method: str
+    candidate: int
+    group: Group
+    kind: str  # "" or one of BREAKING
+    people: int
+    scenes: int
+    hands: Path | None
+
+
+@functools.cache
+def _taught() -> list[SessionDemonstration]:
+    return demonstrations(DEMONSTRATORS)
+
+
+@functools.cache
+def _learned(method: str, candidate: int) -> Model[Places]:
+    return METHODS[method].candidates[candidate].learn(_taught())
+
+
+@functools.lru_cache(maxsize=8)
+def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | None) -> list[Seen]:
+    """The sessions of a group: scene by scene with alternating sigma; exact places where one kind
+    of difference is tried.
+    """
+    if kind:
+        return [seen(breaking(kind, number, group=group)) for number in range(scenes)]
+    everyone = [person(group, number) for number in range(people)]
+    if hands is not None and group == "tuning":
+        everyone += recorded_people(hands)
+    return [
+        seen(session(who, number, group=group, sigma_m=SIGMAS_M[number % 2]))
+        for who in everyone
+        for number in range(scenes)
+    ]
+
+
+def outcomes(task: Task) -> list[Outcome]:
+    """The outcomes of a task's sessions."""
+    runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
+    if task.method == TEACHER:
+        return [judge(None, one) for one in runs]
+    model = _learned(task.method, task.candidate)
+    return [judge(model.place(one.session.told), one) for one in runs]
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
+    group = options.group
+    people, scenes = max(2, round(PEOPLE[group] * options.share)), SCENES[group]
+    each = max(2, round(BREAKING_SCENES[group] * options.share))
+    tasks = [Task(TEACHER, 0, group, "", people, scenes, options.hands)]
+    for method, entry in METHODS.items():
+        tried = range(len(entry.candidates)) if group == "tuning" and options.share == 1 else range(1)
+        tasks += [Task(method, number, group, "", people, scenes, options.hands) for number in tried]
+        tasks += [Task(method, 0, group, kind, 0, each, None) for kind in BREAKING]
+    found: dict[Task, list[Outcome]] = {}
+    for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
+        found[task] = rows
+        if task.kind:
+            results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
+        else:
+            results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
+    main = {task.method: rows for task, rows in found.items() if not task.kind and task.candidate == 0}
+    broken = {
+        method: {kind: _broken(found[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
+        for method in METHODS
+    }
+    for method, entry in METHODS.items():
+        compared = [rows for task, rows in found.items() if task.method == method and not task.kind]
+        if (best := chosen(compared)) > 0:
+            results.say(f"{method}: {entry.candidates[best]} is better than what is chosen; put it first")
+    numbers = {
+        "set": group,
+        "people": len({one.person for one in main["ours"]}),
+        "scenes_of_each": scenes,
+        "breaking_scenes_of_each": each,
+        "demonstrations": len(_taught()),
+        "rate_hz": RATE_HZ,
+        "success_is": {
+            "within_mm": 1000 * WITHIN_M,
+            "for_s": FOR_S,
+            "below_m_per_s": SLOW_MPS,
+            "no_nearer_to_a_hand_than_m": NEAR_M,
+            "when_faster_than_m_per_s": FAST_MPS,
+        },
+        "falsely_followed_is_farther_from_the_teacher_than_m": WRONG_M,
+        "levels": LEVELS,
+        "methods": {
+            method: {
+                **({} if method == TEACHER else {"parameters": repr(METHODS[method].candidates[0])}),
+                **summary(rows),
+                "success_by_sigma_mm": {
+                    f"{1000 * sigma:g}": float(np.mean([o.success for o in rows if o.number % 2 == i]))
+                    for i, sigma in enumerate(SIGMAS_M)
+                },
+                "success_more_than_ours": _more(rows, main["ours"]),
+            }
+            for method, rows in main.items()
+        },
+        "breaking": broken,
+        "candidates": {
+            f"{task.method} {METHODS[task.method].candidates[task.candidate]!r}": summary(rows)
+            for task, rows in found.items()
+            if not task.kind and task.method != TEACHER and group == "tuning"
+        },
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+MEASURES: dict[str, Callable[[Outcome], float]] = {
+    "success": lambda one: one.success,
+    "success_on_the_way": lambda one: one.kept,
+    "path_rms_mm": lambda one: one.path_mm,
+    "held": lambda one: one.held,
+    "falsely_held": lambda one: one.falsely_held,
+    "falsely_followed": lambda one: one.falsely_followed,
+    "negative_log_likelihood": lambda one: one.negative_log_likelihood,
+    "inside_50": lambda one: one.inside[LEVELS.index(0.5)],
+    "inside_95": lambda one: one.inside[LEVELS.index(0.95)],
+    "delay_s": lambda one: one.delay_s,
+    "tool_delay_s": lambda one: one.tool_delay_s,
+    "too_near": lambda one: one.too_near,
+}
+
+
+def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
+    """The mean of each measure with its 95 % interval by bootstrap over people, and more."""
+    out: dict[str, Any] = {}
+    for name, measure in MEASURES.items():
+        mean, low, high = _resampled(rows, np.array([float(measure(one)) for one in rows]))
+        out[name] = {"mean": mean, "low": low, "high": high}
+    out["coverage"] = np.mean([one.inside for one in rows], axis=0).tolist()
+    for name in ("predicted_mm", "error_mm"):
+        out[f"{name[:-3]}_rms_mm"] = float(np.sqrt(np.mean([getattr(one, name) ** 2 for one in rows])))
+    swapped = sum(one.swapped for one in rows)
+    out["swapped_held"] = sum(one.swapped_held for one in rows) / swapped if swapped else None
+    out["events"] = [float(np.mean([one.events[i].reached for one in rows])) for i in range(3)]
+    for name in ("error_mm", "true_error_mm"):
+        out[f"event_{name}_median"] = [float(np.median([getattr(o.events[i], name) for o in rows])) for i in range(3)]
+    return out
+
+
+def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
+    """The chosen candidate: among those whose success is within SAME of the best, the one whose
+    target is nearest to the teacher's tool.
+    """
+    success = [float(np.mean([one.success for one in rows])) for rows in tried]
+    path = [float(np.mean([one.path_mm for one in rows])) for rows in tried]
+    return min((p, i) for i, p in enumerate(path) if success[i] >= max(success) - SAME)[1]
+
+
+def _more(rows: Sequence[Outcome], ours: Sequence[Outcome]) -> dict[str, float]:
+    """Difference of its success rate to ours, scene by scene."""
+    difference = np.array([float(a.success) - float(b.success) for a, b in zip(rows, ours, strict=True)])
+    mean, low, high = _resampled(rows, difference)
+    return {"mean": mean, "low": low, "high": high}
+
+
+def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, float]:
+    """The mean of values (M,), and its 95 % interval by drawing people with replacement."""
+    names = sorted({one.person for one in rows})
+    index = np.array([names.index(one.person) for one in rows])
+    total, count = np.bincount(index, values), np.bincount(index)
+    drawn = np.random.default_rng(DRAWING).integers(len(names), size=(RESAMPLED, len(names)))
+    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    return float(values.mean()), float(np.percentile(means, 2.5)), float(np.percentile(means, 97.5))
+
+
+def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
+    """Successes, and failures in which the tool held through each event that it missed."""
+    held = [not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near for o in rows]
+    return {"successes": sum(one.success for one in rows), "held": sum(held), "of": len(rows)}
+
+
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
+    found = numbers["methods"]
+    plt = pyplot()
+    figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
+    labels = {TEACHER: "teacher who knows\nthe scene", **{name: entry.label for name, entry in METHODS.items()}}
+    colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
+    bars = (
+        ("success", 100.0, "success [%]\n(dark: on the teacher's path throughout)"),
+        ("path_rms_mm", 1.0, "distance of target and\nteacher's tool, rms [mm]"),
+        ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
+    )
+    for ax, (name, scale, label) in zip(axes, bars, strict=False):
+        for i, (method, one) in enumerate(found.items()):
+            mean, low, high = (scale * one[name][value] for value in ("mean", "low", "high"))
+            dark = mean
+            if name == "success":
+                dark = scale * one["success_on_the_way"]["mean"]
+                ax.barh(i, mean, color=colours[method], height=0.65, alpha=0.4)
+            ax.barh(i, dark, color=colours[method], height=0.65)
+            ax.plot((low, high), (i, i), color="black", lw=1.2)
+            ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
+        ax.set(xlabel=label)
+        ax.set_yticks(range(len(found)), [labels[m] for m in found] if ax is axes[0] else [""] * len(found), fontsize=8)
+        ax.invert_yaxis()
+    levels = 100 * np.array(LEVELS)
+    axes[3].plot((0, 100), (0, 100), "--", color="black", lw=0.8)
+    at = 104.0
+    for method, one in sorted(found.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]):
+        if method != TEACHER:
+            inside = 100 * np.array(one["coverage"])
+            axes[3].plot(levels, inside, "o-", ms=3, lw=1.2, color=colours[method], zorder=3 if method == "ours" else 2)
+            at = min(at - 4.5, inside[-1])  # below the one before it
+            axes[3].annotate(
+                labels[method].partition(",\n")[0].partition(":")[0].replace("\n", " "),
+                (levels[-1], inside[-1]),
+                (106, at),
+                va="center",
+                fontsize=7.5,
+                color=colours[method],
+                annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colours[method], "relpos": (0, 0.5), "shrinkB": 2},
+            )
+    axes[3].set(xlabel="nominal region [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
+    people, scenes = numbers["people"], numbers["scenes_of_each"]
+    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % intervals")
+    results.figure(figure)

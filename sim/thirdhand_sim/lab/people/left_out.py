@@ -1,0 +1,277 @@
+"""Takes that were left out, as the service's core sees them and predicts their tool, and their
+judgement.
+
+Hands pass sample by sample through the core's stages `intake` and `skill`, each take from a fresh
+state, alone or in a session: the same take again and again, with the way back of the hands and a
+rest before each further round. Targets are clamped only where a reach is given: most recordings lie
+outside the arm's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from thirdhand.contract.explain import in_words
+from thirdhand.contract.records import SIDES
+from thirdhand.contract.requests import Hands, ViaPoint
+from thirdhand.core.codes import HANDS_KNOWN
+from thirdhand.core.controller import start_state
+from thirdhand.core.frame import Event, blank, frame_layout
+from thirdhand.core.intake.stage import Intake
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.stage import SkillStage
+from thirdhand.core.skill.tuning import UNSURE_M
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Reach, Settings
+from thirdhand.skills.demonstration import Demonstration
+from thirdhand_sim.closed_loop import START_NS, hand_event
+from thirdhand_sim.lab.results import Array, ExperimentError
+from thirdhand_sim.lab.rivals.method import Observed, Predicted
+
+RATE_HZ, JUDGED_HZ = 125, 25
+LONGEST_SHIFT_S = 1.0
+SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
+BACK_S = 2.0  # the hands' way back to where the take begins
+FAR_M = 1e3  # the corner of a workspace that clamps nothing
+ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
+PLACE_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
+
+
+class LeftOut(NamedTuple):
+    """A take: its name, whom or what it is left out with, and what intake makes of it."""
+
+    name: str
+    group: str
+    demonstration: Demonstration
+    times: Array  # (T,) [s], JUDGED_HZ
+    hands: Array  # (T, 6) [m]; of one that conducts alone, twice
+    velocities: Array  # (T, 6) [m/s]
+    tool: Array  # (T, 3) [m] the teacher's
+
+    @property
+    def seen(self) -> Observed:
+        """The hands alone; nothing is estimated of their stillness."""
+        return Observed(self.times, self.hands, self.velocities, np.zeros((len(self.times), 2)))
+
+
+class Judged(NamedTuple):
+    """The judgement of a take: sums of squared errors [m²], and numbers of samples, for example
+    inside the region of each of LEVELS.
+    """
+
+    samples: int
+    squares: float
+    shifted: float  # with the time shift that makes this least
+    shift_s: float  # more than 0: the prediction is ahead of the teacher
+    worst_m: float
+    inside: tuple[int, ...] | None
+    held: int | None
+    unsure: int | None
+    wrong: int  # the tool is farther off than UNSURE_M
+    told: int | None  # of these, those where it held or reported to be uncertain
+    falsely_told: int | None  # the same of all others
+
+
+@cache
+def _settings(reach: Reach) -> Settings:
+    return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ, reach=reach)
+
+
+def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
+    """A take, once through intake."""
+    times, moving, _ = _through_core(demonstration)
+    stamps = (demonstration.stamps_ns - demonstration.stamps_ns[0]) * 1e-9
+    tool = np.stack([np.interp(times, stamps, column) for column in demonstration.tool[:, :3].T], axis=1)
+    return LeftOut(name, group, demonstration, times, moving[:, 0], moving[:, 1], tool)
+
+
+def predicted(skill: Skill, take: LeftOut, *, reach: Reach | None = None) -> Predicted:
+    """The core's prediction of a take with a skill; targets are held within `reach`, if any, and
+    within the skill's workspace then.
+    """
+    return _through_core(take.demonstration, skill, reach)[2]
+
+
+def predicted_rounds(
+    skill: Skill, take: LeftOut, *, reach: Reach | None = None, broken_share: float = 0.0
+) -> list[Predicted]:
+    """The core's predictions in each round of a session; the first one is that of `predicted`. See
+    `session_of`.
+    """
+    hands, begins = session_of(take.demonstration, broken_share)
+    said, count = _through_core(hands, skill, reach)[2], len(take.times)
+    assert said.covariance is not None
+    assert said.held is not None
+    assert said.uncertain is not None
+    parts = [slice(begin, begin + count) for begin in begins]
+    return [
+        Predicted(said.mean[part], said.covariance[part], said.held[part], said.uncertain[part], said.radii)
+        for part in parts
+    ]
+
+
+def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstration, list[int]]:
+    """The hands of a session, and the sample at JUDGED_HZ with which each round begins. Before each
+    further round, `broken_share` of the take is done and broken off, if it is not 0.
+
+    On the way back, position is a polynomial of minimum jerk over BACK_S, and orientation is the
+    normalized mean of the ends. The tool is where the take has it, and is not used.
+    """
+    seconds, poses, begins = [take.seconds], [np.hstack([take.left, take.right])], [0]
+    whole_s, whole = seconds[0], poses[0]
+    for rest_s in SESSION_RESTS_S:
+        for share in (broken_share, 1.0):
+            if share == 0.0:
+                continue
+            over_s, begin = seconds[-1][-1], math.ceil((seconds[-1][-1] + BACK_S + rest_s) * JUDGED_HZ)
+            way_s = np.arange(take.period_s, BACK_S, take.period_s)
+            rest_at_s = np.arange(over_s + BACK_S, begin / JUDGED_HZ - 0.5 * take.period_s, take.period_s)
+            done = max(2, round(share * len(whole)))
+            seconds += [over_s + way_s, rest_at_s, begin / JUDGED_HZ + whole_s[:done]]
+            poses += [
+                _way(poses[-1][-1], whole[0], way_s / BACK_S),
+                np.tile(whole[0], (len(rest_at_s), 1)),
+                whole[:done],
+            ]
+            if share == 1.0:
+                begins.append(begin)
+    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)  # one sample more, as rounding may cut off the last one
+    poses.append(poses[-1][-1:])
+    hands, stamps = np.concatenate(poses), np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)
+    return take._replace(stamps_ns=stamps, left=hands[:, :7], right=hands[:, 7:], tool=hands[:, :7]), begins
+
+
+def _way(first: Array, last: Array, shares: Array) -> Array:
+    """Poses (T, 14) of both hands at these shares (T,) of the time from `first` to `last` (14,)."""
+    moved = (shares**3 * (10.0 - 15.0 * shares + 6.0 * shares**2))[:, None]
+    out = first + moved * (last - first)
+    for part in (slice(3, 7), slice(10, 14)):
+        nearer = math.copysign(1.0, float(first[part] @ last[part])) * last[part]
+        turned = first[part] + moved * (nearer - first[part])
+        out[:, part] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    return out
+
+
+def _through_core(
+    demonstration: Demonstration, skill: Skill | None = None, reach: Reach | None = None
+) -> tuple[Array, Array, Predicted]:
+    """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and what a skill predicts.
+
+    While no hands are known, it holds what it predicted last.
+    """
+    settings, used = _settings(reach or ANYWHERE), skill or shipped_skill()
+    if reach is None:
+        used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
+    intake, stage, state = Intake(settings), SkillStage(settings, used), start_state(settings, used)
+    frame = blank(frame_layout(len(settings.joints.names)))
+    alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
+    received = hand_events(demonstration, range(2) if alone is None else [alone])
+    every = RATE_HZ // JUDGED_HZ
+    moving, means, covariances, held, unsure = [], [], [], [], []
+    for tick, inbox in enumerate(received):
+        known = intake.step(state, frame, 1, inbox)
+        hands = state["hands"]
+        if alone is not None:
+            known = HANDS_KNOWN * bool(frame["hand_ages"][alone] < frame["stale_ticks"][alone])
+            hands = hands[[alone, alone]]
+        goes = bool(known & HANDS_KNOWN)
+        if skill is not None and goes:
+            wanted = stage.step(state, frame)
+            goes = wanted.gate_m <= used.threshold and not wanted.is_ambiguous
+        if tick % every == 0:
+            moving.append(hands[:, :2].transpose(1, 0, 2).reshape(2, 6))
+            means.append(frame["target"].copy())
+            covariances.append(frame["covariance"].copy())
+            held.append(not goes)
+            unsure.append(bool(state["unsure"]))
+    times, told = np.arange(len(moving)) / JUDGED_HZ, (np.array(held), np.array(unsure))
+    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *told, used.regions.radii)
+
+
+def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
+    """The samples of a take's hands at each tick, RATE_HZ."""
+    since = demonstration.stamps_ns - demonstration.stamps_ns[0]
+    inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * RATE_HZ) + 1)]
+    for side in sides:
+        poses = (demonstration.left, demonstration.right)[side].tolist()
+        for ns, (x, y, z, *turn) in zip(since.tolist(), poses, strict=True):
+            if (tick := int(np.ceil(ns * 1e-9 * RATE_HZ - 1e-6))) < len(inboxes):
+                inboxes[tick].append(hand_event(SIDES[side], (x, y, z), START_NS + ns, tuple(turn)))
+    return inboxes
+
+
+def judged(take: LeftOut, said: Predicted) -> Judged:
+    """The judgement of a prediction of a take."""
+    count, errors = len(take.tool), take.tool - said.mean
+    shifted = []
+    for shift in range(-round(LONGEST_SHIFT_S * JUDGED_HZ), round(LONGEST_SHIFT_S * JUDGED_HZ) + 1):
+        if abs(shift) <= count // 2:
+            wanted = take.tool[max(0, shift) : count + min(0, shift)]
+            off = wanted - said.mean[max(0, -shift) : count - max(0, shift)]
+            shifted.append((float(np.mean(np.sum(off**2, axis=1))), abs(shift), shift))
+    least, _, shift = min(shifted)
+    inside = None
+    if said.covariance is not None:
+        squares = np.einsum("ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0])
+        inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
+    lengths = np.linalg.norm(errors, axis=1)
+    held, unsure, wrong = said.held, said.uncertain, lengths > UNSURE_M
+    told = None if held is None or unsure is None else held | unsure
+    return Judged(
+        count,
+        float(np.sum(errors**2)),
+        count * least,
+        shift / JUDGED_HZ,
+        float(lengths.max()),
+        inside,
+        None if held is None else int(held.sum()),
+        None if unsure is None else int(unsure.sum()),
+        int(wrong.sum()),
+        None if told is None else int((wrong & told).sum()),
+        None if told is None else int((~wrong & told).sum()),
+    )
+
+
+def read(path: Path, *, named: bool = False) -> Demonstration:
+    """A recorded take: `.npz` with t (T,) [s], and left, right and tool (T, 3) [m]; a hand that was
+    not seen is NaN throughout, the other conducts alone then. `named`: where it begins and ends are
+    its places.
+
+    Raises ExperimentError.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            times, left, right, tool = (np.asarray(data[name], np.float64) for name in ("t", "left", "right", "tool"))
+    except (KeyError, ValueError, OSError) as error:
+        raise ExperimentError(f"{path}: not a recording of hands and tool: {in_words(error, named=False)}") from None
+    conducts: Hands = "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
+    left, right = (right, right) if conducts == "right" else (left, left) if conducts == "left" else (left, right)
+    if not all(np.isfinite(part).all() for part in (times, left, right, tool)):
+        raise ExperimentError(f"{path}: holds numbers that are not finite, beside a hand that was not seen at all")
+    rows = [
+        {
+            "name": name,
+            **{part: x[i].tolist() for part, x in (("left", left), ("right", right), ("tool", tool))},
+            "std": PLACE_STD_M,
+            "radius": 0.03,
+        }
+        for name, i in (("start", 0), ("end", -1))
+    ]
+    untold = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    of_left, of_right, of_tool = (np.hstack([x, untold]) for x in (left, right, tool))
+    return Demonstration(
+        np.round(1e9 * (times - times[0] + 1.0)).astype(np.int64),
+        of_left,
+        of_right,
+        of_tool,
+        places=msgspec.convert(rows, tuple[ViaPoint, ...]) if named else (),
+        conducts=conducts,
+    )

@@ -1,0 +1,212 @@
+"""Mistakes of a tracker in a recording of hands: samples that jump off a hand's path, and samples
+in which left and right are exchanged.
+
+A run of samples is wrong if the samples before and after it predict that no hand can have been
+there. The prediction is a Gaussian process with the covariance of a very quick hand, conditioned on
+both sides: a smoother that looks both ways. Its squared Mahalanobis distance decides. A path that
+this covariance allows has no part that it excludes, so quick motion is left as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thirdhand_sim.lab.results import Array
+
+# A quick hand: standard deviation and time scale of a squared exponential. Its acceleration has a
+# standard deviation of 27 m/s^2 an axis: a reach of 0.2 m at 2 m/s has 33 m/s^2 at most.
+SPREAD_M, SCALE_S = 0.1, 0.08
+USUAL_MPS, SPEED_SPAN_S = 2.0, 0.1  # the spread is in proportion to a recording's speed above this
+SCALES_S = (SCALE_S, 0.12, 0.18, 0.27, 0.4)  # from quick to calm hands
+PLACE_M, DRIFT_MPS = 1.0, 1.0  # standard deviations of the place and of the speed over a window
+TRACKED_NOISE_FLOOR_M = 0.002  # includes a hand's tremor
+SAMPLES_BESIDE = 8  # samples on each side that predict
+LONGEST_S = 0.5  # longest run
+RUN_GROWTH = 1.25  # ratio of the lengths of runs, above the first few
+THRESHOLD, THRESHOLD_EACH = 30.0, 6.0  # squared distance of a wrong run, and more for each of its samples
+LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
+ALIKE = 0.5  # the candidates are runs with at least this share of the largest excess over the threshold
+CANDIDATES = 40  # the shortest of these are compared
+BRIDGE_MARGIN = 0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
+STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
+EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
+NOISE_ORDER = 5  # differences of this order contain a tracker's noise and hardly a hand's motion
+
+
+class Repaired(NamedTuple):
+    """Hands (T, 6) [m] without a tracker's mistakes; which samples of each hand were replaced
+    (T, 2), and in which left and right had been exchanged (T,).
+    """
+
+    hands: Array
+    wrong: NDArray[np.bool_]
+    exchanged: NDArray[np.bool_]
+
+
+class Process(NamedTuple):
+    """A hand's path as a Gaussian process, seen with a tracker's noise (standard deviation)."""
+
+    noise_m: float
+    spread_m: float
+    scale_s: float = SCALE_S
+
+    def covariance(self, t: Array) -> Array:
+        """Covariances (K, M, M) [m^2] of samples at times (K, M) [s], equal for each axis."""
+        from_middle = t - t.mean(axis=1, keepdims=True)
+        between = t[:, :, None] - t[:, None, :]
+        motion = self.spread_m**2 * np.exp(-0.5 * (between / self.scale_s) ** 2)
+        drift = PLACE_M**2 + DRIFT_MPS**2 * from_middle[:, :, None] * from_middle[:, None, :]
+        return np.asarray(motion + drift + self.noise_m**2 * np.eye(t.shape[1]))
+
+    def log_likelihood(self, t: Array, x: Array) -> float:
+        """Logarithm of the probability density of samples (M, 3) [m] at times (M,) [s]."""
+        covariance, off = self.covariance(t[None])[0], x - x.mean(axis=0)
+        squared = float(np.sum(off * np.linalg.solve(covariance, off)))
+        return -0.5 * (squared + 3 * (float(np.linalg.slogdet(covariance)[1]) + len(t) * math.log(2 * math.pi)))
+
+    def best(self, t: Array, x: Array) -> tuple[float, Process]:
+        """The largest log-likelihood of samples, over time scales, and its process."""
+        kinds = [self._replace(scale_s=scale_s) for scale_s in SCALES_S]
+        return max(((kind.log_likelihood(t, x), kind) for kind in kinds), key=lambda pair: pair[0])
+
+
+def repair(t: Array, hands: Array) -> Repaired:
+    """Recorded hands (T, 6) [m] at times (T,) [s], each wrong sample replaced by its prediction
+    from the samples around it.
+    """
+    exchanged = exchanged_samples(t, hands)
+    out = np.where(exchanged[:, None], np.roll(hands, 3, axis=1), hands)
+    wrong = np.zeros((len(t), 2), bool)
+    for side in (0, 1):
+        part = slice(3 * side, 3 * side + 3)
+        quick = quick_process(t, out[:, part])
+        wrong[:, side] = jumped_samples(t, out[:, part], quick)
+        out[:, part] = _bridged(t, out[:, part], wrong[:, side], quick)
+    return Repaired(out, wrong, exchanged)
+
+
+def noise_std_m(x: Array) -> float:
+    """Standard deviation of a tracker's noise per axis [m], robustly from differences of a path
+    (T, 3) [m]. 0 if it is too short.
+    """
+    if len(x) <= NOISE_ORDER:
+        return 0.0
+    gain = np.sqrt(np.sum(np.diff(np.eye(NOISE_ORDER + 1), NOISE_ORDER, axis=0) ** 2))
+    return float(np.median(np.abs(np.diff(x, NOISE_ORDER, axis=0))) / 0.6745 / gain)
+
+
+def quick_process(t: Array, x: Array) -> Process:
+    """The quickest motion to be expected of a hand with a path (T, 3) [m]: a walking person's hand
+    is quicker than that of a seated one.
+    """
+    span = max(1, round(SPEED_SPAN_S / float(np.median(np.diff(t)))))
+    speed = np.linalg.norm(x[span:] - x[:-span], axis=1) / (t[span:] - t[:-span])
+    usual = float(np.percentile(speed, 95)) if len(speed) else 0.0
+    return Process(max(noise_std_m(x), TRACKED_NOISE_FLOOR_M), SPREAD_M * max(1.0, usual / USUAL_MPS))
+
+
+def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
+    """Samples (T,) in which a tracker has exchanged left and right: it does so where both hands
+    jump to where the other one was, faster than hands move. Most samples are named rightly.
+    """
+    left, right = hands[:, :3], hands[:, 3:]
+
+    def moved(a: Array, b: Array) -> Array:
+        return np.asarray(np.linalg.norm(b[1:] - a[:-1], axis=1))
+
+    straight = np.minimum(moved(left, left), moved(right, right))
+    crossed = np.maximum(moved(left, right), moved(right, left))
+    at = (straight > EXCHANGE_MPS * np.diff(t)) & (crossed < straight / 3)
+    exchanged = np.concatenate([[False], np.cumsum(at) % 2 == 1])
+    return ~exchanged if exchanged.mean() > 0.5 else exchanged
+
+
+def jumped_samples(t: Array, x: Array, quick: Process) -> NDArray[np.bool_]:
+    """Samples (T,) of a path (T, 3) [m] that jump off it. The most improbable runs are taken out
+    first, until those that are left are probable.
+    """
+    wrong = np.zeros(len(t), bool)
+    while True:
+        kept = np.flatnonzero(~wrong)
+        runs = _improbable_runs(t[kept], x[kept], quick)
+        if not runs:
+            return wrong
+        for begin, end in runs:
+            wrong[kept[begin:end]] = True
+
+
+def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]]:
+    """Improbable runs [begin, end), each more so than all runs near it."""
+    if len(t) <= 2 * SAMPLES_BESIDE:
+        return []
+    longest = max(1, round(LONGEST_S / float(np.median(np.diff(t)))))
+    rows, length = [], 1
+    while length <= min(longest, len(t) - 2 * SAMPLES_BESIDE):
+        squared, off_m = _off_prediction(t, x, length, quick)
+        excess = squared - THRESHOLD - THRESHOLD_EACH * length
+        begins = np.flatnonzero((excess > 0) & (off_m > LEAST_JUMP_M))
+        rows.append(np.stack([excess[begins], begins, begins + length], axis=1))
+        length = max(length + 1, round(RUN_GROWTH * length))
+    found, runs, reach = np.concatenate(rows), [], longest + SAMPLES_BESIDE
+    while len(found):
+        excess, first, last = found[np.argmax(found[:, 0])]
+        alike = found[(found[:, 0] >= ALIKE * excess) & (found[:, 1] < last) & (found[:, 2] > first)]
+        alike = alike[np.argsort(alike[:, 2] - alike[:, 1], kind="stable")[:CANDIDATES]]
+        begin, end = _most_probable(t, x, alike[:, 1:].astype(int), quick)
+        runs.append((begin, end))
+        found = found[(found[:, 1] >= max(last, end) + reach) | (found[:, 2] <= min(first, begin) - reach)]
+    return runs
+
+
+def _most_probable(t: Array, x: Array, runs: NDArray[np.int_], quick: Process) -> tuple[int, int]:
+    """The run [begin, end) of several (K, 2) without which the samples around them are most
+    probable. A wrong sample is anywhere within 1 m^3: the logarithm of its density is 0.
+    """
+    around = np.arange(max(0, runs[:, 0].min() - SAMPLES_BESIDE), min(len(t), runs[:, 1].max() + SAMPLES_BESIDE))
+    right = [around[(around < begin) | (around >= end)] for begin, end in runs]
+    begin, end = runs[np.argmax([quick.best(t[one], x[one])[0] for one in right])]
+    return int(begin), int(end)
+
+
+def _off_prediction(t: Array, x: Array, length: int, quick: Process) -> tuple[Array, Array]:
+    """Squared Mahalanobis distance, and rms distance [m], of each run of a length from its
+    prediction by its neighbours, by the run's first sample.
+    """
+    size = 2 * SAMPLES_BESIDE + length
+    begins = np.arange(len(t) - length + 1)
+    firsts = np.clip(begins - SAMPLES_BESIDE, 0, len(t) - size)
+    squared, off_m = np.empty((2, len(begins)))
+    for offset in np.unique(begins - firsts):
+        of = np.flatnonzero(begins - firsts == offset)
+        at = firsts[of, None] + np.arange(size)
+        spans, which = np.unique(np.round((t[at] - t[at[:, :1]]) / STAMP_S), axis=0, return_inverse=True)
+        precision = np.linalg.inv(quick.covariance(STAMP_S * spans))
+        run = slice(offset, offset + length)
+        # For y ~ N(0, P^-1) the run is off by r = P_rr^-1 (P y)_r, whose covariance is P_rr^-1.
+        pull = precision[which.ravel(), run] @ x[at]
+        off = np.linalg.solve(precision[which.ravel(), run, run], pull)
+        squared[of] = np.sum(off * pull, axis=(1, 2))
+        off_m[of] = np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1))
+    return squared, off_m
+
+
+def _bridged(t: Array, x: Array, wrong: NDArray[np.bool_], quick: Process) -> Array:
+    """A path (T, 3) [m] with its wrong samples predicted from the right ones around them, by the
+    process that makes these most probable; hardly beyond where these are.
+    """
+    out, kept = x.copy(), np.flatnonzero(~wrong)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        around = np.concatenate([kept[kept < begin][-SAMPLES_BESIDE:], kept[kept >= end][:SAMPLES_BESIDE]])
+        process = quick.best(t[around], x[around])[1]
+        covariance = process.covariance(t[None, np.concatenate([around, np.arange(begin, end)])])[0]
+        middle, size = x[around].mean(axis=0), len(around)
+        weighted = np.linalg.solve(covariance[:size, :size], x[around] - middle)
+        low, high = x[around].min(axis=0), x[around].max(axis=0)
+        beyond = BRIDGE_MARGIN * (high - low)
+        out[begin:end] = np.clip(middle + covariance[size:, :size] @ weighted, low - beyond, high + beyond)
+    return out

@@ -1,0 +1,246 @@
+"""Sessions of a person with a skill, and their judgement: hands as a tracker sees them pass through
+the service's core, whose arm moves exactly as commanded.
+
+All run in process at one rate, the same for every skill.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from thirdhand.contract.records import SIDES, Mode
+from thirdhand.core.frame import Event, Tick
+from thirdhand.core.skill.model import CHI_SQUARE
+from thirdhand.core.skill.skill import Skill
+from thirdhand.recordings.shipped import shipped_skill
+from thirdhand.settings.config import Settings
+from thirdhand_sim.closed_loop import START_NS, hand_event
+from thirdhand_sim.lab.open_loop import controller, frames
+from thirdhand_sim.lab.results import Array
+from thirdhand_sim.lab.rivals.as_skill import Said, along_hands, rival
+from thirdhand_sim.lab.rivals.method import (
+    DependsOn,
+    Mask,
+    Observed,
+    Placed,
+    Predicted,
+)
+from thirdhand_sim.scene import TOOL_FROM_HAND
+from thirdhand_sim.sessions import Session
+from thirdhand_sim.teach import places_of
+
+RATE_HZ = 125
+WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # an event succeeds within 10 mm for 0.3 s below 5 cm/s
+NEAR_M, FAST_MPS = 0.05, 0.25  # nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
+WRONG_M = 0.10  # a target farther from the teacher's tool is followed falsely
+SMOOTHED = 5  # ticks; velocity of a target of a rival with a memory is taken over them
+LONGEST_DELAY_S = 0.6
+KEPT = 0.05  # largest share of the time falsely followed on the teacher's path
+SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A session as the service sees it, tick by tick, and as it is."""
+
+    session: Session
+    ticks: tuple[Tick, ...]
+    times: Array  # (T,) [s]
+    estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
+    rest: Array  # (T, 2) stillness of each hand, 0 to 1
+    fresh: Mask  # (T,) whether both hands are seen, by one source
+    swapped: Mask  # (T,) whether left is reported as right
+    hands: Array  # (T, 6) as they are
+    tool: Array  # (T, 3) the teacher's
+
+    @property
+    def due(self) -> Mask:
+        """True where holding is right (T,)."""
+        return np.asarray(~self.fresh | self.swapped)
+
+
+def settings() -> Settings:
+    """The service's own, at the rate of the trials."""
+    return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
+
+
+def ticks(session: Session) -> Iterator[Tick]:
+    """The tracker's samples of a session, tick by tick."""
+    inboxes: list[list[Event]] = [[] for _ in range(int(session.lasts_s * RATE_HZ))]
+    for side, (stamps, samples) in zip(SIDES, session.samples(), strict=True):
+        for stamp, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
+            if (k := int(np.ceil(stamp * RATE_HZ - 1e-9))) < len(inboxes):
+                inboxes[k].append(hand_event(side, (x, y, z), START_NS + round(1e9 * stamp)))
+    return (Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes))
+
+
+def seen(session: Session) -> Seen:
+    """The session through tracker and service, which holds only because of the hands."""
+    known = tuple(ticks(session))
+    core = controller(replace(shipped_skill(), threshold=np.inf), settings())
+    times = np.arange(len(known)) / RATE_HZ
+    estimates, rest, fresh = np.zeros((len(known), 3, 6)), np.zeros((len(known), 2)), np.zeros(len(known), bool)
+    for k, tick in enumerate(known):
+        fresh[k] = core.step(tick)["mode"] == Mode.FOLLOW
+        state = core.state
+        estimates[k], rest[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["hand_stillness"]
+    begin, end = session.swapped_s
+    swapped = (times >= begin) & (times < end + SWAP_OVER_S)
+    return Seen(session, known, times, estimates, rest, fresh, swapped, session.hands(times), session.tool(times))
+
+
+class EventOutcome(NamedTuple):
+    """One event: whether it succeeded, least distances [mm] from the perceived and from the true
+    place, and whether the tool held throughout its window.
+    """
+
+    reached: bool
+    error_mm: float
+    true_error_mm: float
+    held: bool
+
+
+class Outcome(NamedTuple):
+    """The outcome of a session with a skill. Shares are of the session's ticks."""
+
+    person: str
+    number: int
+    success: bool
+    events: tuple[EventOutcome, EventOutcome, EventOutcome]
+    too_near: bool
+    path_mm: float  # rms of the target from the teacher's tool, its delay taken out
+    delay_s: float  # of the target; and of the tool
+    tool_delay_s: float
+    held: float
+    falsely_held: float
+    falsely_followed: float
+    swapped: float  # from 0.3 s after the swap of hands
+    swapped_held: float  # of the session, as all shares
+    negative_log_likelihood: float
+    inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
+    predicted_mm: float  # rms that the covariance predicts
+    error_mm: float  # rms over the same ticks
+
+    @property
+    def kept(self) -> bool:
+        """True for a success on the teacher's path, not only at its places."""
+        return self.success and self.falsely_followed <= KEPT
+
+
+def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
+    """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
+    found = served(placed, one)
+    target, tool, held = found["target"], found["tool"], found["mode"] != Mode.FOLLOW
+    speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
+    events = tuple(_event(one, tool, speed, held, i) for i in range(3))
+    apart = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
+    too_near = bool(((apart < NEAR_M) & (speed > FAST_MPS)).any())
+    judged = one.times > 0.5
+    good = judged & ~one.due
+    delay, _ = _delayed(target, one.tool, good)
+    tool_delay, _ = _delayed(tool, one.tool, good & ~held)
+    wanted = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
+    errors, covariance = (wanted - target)[good], found["covariance"][good]
+    squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    radii = placed.regions.radii if isinstance(placed, Skill) else CHI_SQUARE
+    likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
+    wrong = np.linalg.norm(target - wanted, axis=1) > WRONG_M
+    planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
+    return Outcome(
+        one.session.person.name,
+        one.session.number,
+        all(event.reached for event in events) and not too_near,
+        events,  # type: ignore[arg-type]
+        too_near,
+        1000 * float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
+        delay / RATE_HZ,
+        tool_delay / RATE_HZ,
+        float(held[judged].mean()),
+        float((held & good).sum() / judged.sum()),
+        float((~held & wrong & judged).sum() / judged.sum()),
+        float(planted.sum() / judged.sum()),
+        float((held & planted).sum() / judged.sum()),
+        float(np.minimum(likelihood, 1e3).mean()),
+        tuple(float((squares <= radius).mean()) for radius in radii),
+        1000 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())),
+        1000 * float(np.sqrt(np.sum(errors**2, axis=1).mean())),
+    )
+
+
+def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
+    """The service's frames (T,) of a session: with its skill, or with a rival in its place."""
+    if isinstance(placed, Skill):
+        return frames(placed, one.ticks, settings())
+    predicted, motion = _moving(placed, one)
+    assert predicted.covariance is not None
+    covariance, held, now = predicted.covariance, predicted.held, 0
+
+    def counted() -> Iterator[Tick]:
+        nonlocal now
+        for tick in one.ticks:
+            now = tick.index
+            yield tick
+
+    skill = rival(
+        shipped_skill(),
+        lambda *moving: Said(motion[now], covariance[now], held is not None and bool(held[now])),
+        via_points=places_of(one.session.told),
+    )
+    return frames(skill, counted(), settings())
+
+
+def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
+    """A rival's predictions at all ticks, and the motion of its target (T, 3, 3).
+
+    The target of a function of the hands moves along with them, as that of the service's skill; the
+    velocity of others is taken from consecutive predictions.
+    """
+    s, v, a = one.estimates.transpose(1, 0, 2)
+    if placed is None:
+        count, as_told = len(one.times), replace(one.session, places=one.session.told)
+        predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)))
+    else:
+        seen = Observed(one.times, s, v, one.rest)
+        predicted = placed.predict(seen)
+        if placed.depends_on is DependsOn.HANDS:
+            return predicted, along_hands(lambda hands: placed.mean(seen._replace(hands=hands)), s, v, a)
+    before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
+    velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
+    return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)
+
+
+def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
+    begin, end = one.session.windows[i]
+    window = (one.times >= begin) & (one.times < end)
+    if i == 0:  # the board belongs where the hand is seen
+        told = one.estimates[window, 0, :3] + TOOL_FROM_HAND
+        true = one.hands[window, :3] + TOOL_FROM_HAND
+    else:
+        places = one.session.told, one.session.places
+        told, true = (np.broadcast_to(p.glass if i == 1 else p.carry, (int(window.sum()), 3)) for p in places)
+    off = np.linalg.norm(tool[window] - told, axis=1)
+    there = (off <= WITHIN_M) & (speed[window] < SLOW_MPS)
+    steps = int(FOR_S * RATE_HZ)
+    runs = np.convolve(there, np.ones(steps), mode="valid") if len(there) >= steps else np.zeros(1)
+    best = int(np.argmin(uniform_filter1d(off, steps, mode="nearest")))
+    true_off = np.linalg.norm(tool[window] - true, axis=1)
+    reached, was_held = bool((runs >= steps - 0.5).any()), bool(held[window].mean() > 0.8)
+    return EventOutcome(reached, 1000 * float(off[best]), 1000 * float(true_off[best]), was_held)
+
+
+def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:
+    """Delay [ticks] of `x` (T, 3) behind `wanted`, and the mean square distance at it [m²]."""
+    count = len(x)
+    found = []
+    for delay in range(0, int(LONGEST_DELAY_S * RATE_HZ), 2):
+        off = np.sum((x[delay:] - wanted[: count - delay]) ** 2, axis=1)[good[delay:]]
+        found.append((float(off.mean()) if len(off) else np.inf, delay))
+    least, delay = min(found)
+    return delay, least

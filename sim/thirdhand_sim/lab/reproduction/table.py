@@ -1,0 +1,131 @@
+"""The paper's Table I in numbers: DMP, ProMP, mixture regression and KMP on the same letters.
+
+Each letter is adapted as in `letters`. A DMP can be given another start and another end, so its
+via-points are those of the mean that it imitates; mixture regression cannot be given any point. The
+row of inputs of many dimensions is in `promp`, with six of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from kmp import Gaussians
+from thirdhand_sim.lab.reproduction.letters import (
+    SETS,
+    Case,
+    Letter,
+    Line,
+    by_kmp,
+    cases,
+    draw_lines,
+    gathered,
+)
+from thirdhand_sim.lab.reproduction.promp import conditioned
+from thirdhand_sim.lab.reproduction.writing import DURATION_S, TIMES
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    DESIRED,
+    OTHER,
+    Array,
+    ExperimentError,
+    Options,
+    Results,
+    pyplot,
+)
+
+WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
+METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}
+SHOWN = ("B", "G")
+
+Trajectory: TypeAlias = Callable[[Letter, Case], Array]
+"""A method: from a letter and an adaptation to a trajectory (200, 2) [cm]."""
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    methods: dict[str, Trajectory] = {
+        "kmp": by_kmp,
+        "promp": conditioned,
+        "dmp": configured,
+        "gmm": lambda letter, _: letter.reference,
+    }
+    numbers: dict[str, Any] = {"unit": "cm", "dmp_weights_per_output": WEIGHTS}
+    shown: list[dict[str, Line]] = []
+    for name, rows in gathered(results, options).items():
+        found = [
+            {who: Line(row, case, method(row, case)) for who, method in methods.items()}
+            for row in rows
+            for case in cases(row)
+        ]
+        numbers[SETS[name]] = {who: _summary([one[who] for one in found]) for who in methods}
+        numbers[SETS[name]]["inside_95_percent"] = _coverage(rows)
+        last = [one for one in found if len(one["kmp"].case.times) == 3]
+        shown += [one for one in last if one["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
+    _draw(results, shown)
+    return numbers
+
+
+def configured(letter: Letter, case: Case) -> Array:
+    """The letter's DMP (of movement_primitives), with the start and the end that the case wants."""
+    try:
+        from movement_primitives.dmp import DMP
+    except ImportError:
+        raise ExperimentError(
+            "DMPs need movement_primitives and pytransform3d: pip install 'thirdhand[experiments]'"
+        ) from None
+    mean = letter.demonstrations.mean(axis=0)
+    primitive = DMP(2, execution_time=DURATION_S, dt=TIMES[1], n_weights_per_dim=WEIGHTS)
+    primitive.imitate(TIMES, mean)
+    points = {float(t): point for t, point in zip(case.times, case.points, strict=True)}
+    primitive.configure(start_y=points.get(TIMES[0], mean[0]), goal_y=points.get(TIMES[-1], mean[-1]))
+    times, line = primitive.open_loop()
+    return np.column_stack([np.interp(TIMES, times, one) for one in line.T])
+
+
+def _summary(lines: list[Line]) -> dict[str, float]:
+    """The largest misses of start, via-point and end, the mean rms deviation elsewhere [cm]."""
+    misses: dict[str, list[float]] = {"start": [], "via": [], "end": []}
+    for line in lines:
+        for t, miss in zip(line.case.times, line.misses, strict=True):
+            misses[{TIMES[0]: "start", TIMES[-1]: "end"}.get(t, "via")].append(float(miss))
+    return {
+        **{f"largest_miss_of_{kind}_cm": max(values) for kind, values in misses.items()},
+        "mean_rms_deviation_elsewhere_cm": float(
+            np.mean([line.measured()["rms_deviation_elsewhere_cm"] for line in lines])
+        ),
+    }
+
+
+def _coverage(rows: list[Letter]) -> dict[str, float]:
+    """Share of the demonstrations' samples within the predicted 95 % regions [%].
+
+    Of KMP with the scale of its covariance as the paper has it, and of the mixture. A DMP predicts
+    no covariance.
+    """
+    found = {
+        "kmp": [row.primitive.predict(TIMES[:, None]) for row in rows],
+        "gmm": [row.primitive.reference for row in rows],
+    }
+    return {
+        who: 100 * float(np.mean([_inside(row, one) for row, one in zip(rows, each, strict=True)]))
+        for who, each in found.items()
+    }
+
+
+def _inside(row: Letter, predicted: Gaussians) -> float:
+    off = row.demonstrations - predicted.mean
+    squares = np.einsum("hti,tij,htj->ht", off, np.linalg.inv(predicted.covariance), off)
+    return float(np.mean(squares < 5.991))  # chi-square of two degrees of freedom
+
+
+def _draw(results: Results, shown: list[dict[str, Line]]) -> None:
+    figure, grid = pyplot().subplots(1, len(shown), figsize=(2.6 * len(shown), 3.2), squeeze=False)
+    for axes, one in zip(grid[0], shown, strict=True):
+        lines = {label: (one[who].points, colour) for who, (label, colour) in METHODS.items()}
+        draw_lines(axes, one["kmp"].letter, one["kmp"].case, lines, "black")
+    grid[0][0].set_ylabel("cm")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    results.figure(figure)

@@ -1,0 +1,97 @@
+"""Predictions of a rival as a skill that the service's core can run.
+
+The core estimates, holds, clamps, follows and limits all that is compared; only the predictions
+differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from thirdhand.core.numerics import MOTION_STEP_S
+from thirdhand.core.skill.model import Seen
+from thirdhand.core.skill.pose import NO_GRIPPER
+from thirdhand.core.skill.skill import Earlier, Prediction, Skill
+from thirdhand.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.lab.results import Array
+from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Placed
+
+HandsToTool: TypeAlias = Callable[[Array], Array]
+"""From hands (M, 6) [m] to tool (M, 3) [m]."""
+STEPS = np.array([-1.0, 0.0, 1.0])
+
+
+def along_hands(law: HandsToTool, hands: Array, velocities: Array, accelerations: Array) -> Array:
+    """Motion of the tool (T, 3, 3) by a law, for hands (T, 6) [m] with these velocities and
+    accelerations, computed as the service does for its skill between via-points.
+    """
+    speed = np.repeat(np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2), 3, axis=1)
+    goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
+    step, bend = MOTION_STEP_S * goes * velocities, 0.5 * MOTION_STEP_S**2 * goes * accelerations
+    return differences(*(law(hands + way * step + abs(way) * bend) for way in STEPS))
+
+
+def differences(behind: Array, now: Array, ahead: Array) -> Array:
+    """Motion (..., 3, 3) at the middle one of three positions (..., 3) [m], MOTION_STEP_S apart."""
+    acceleration = (ahead - 2.0 * now + behind) / MOTION_STEP_S**2
+    motion = [now, (ahead - behind) / (2.0 * MOTION_STEP_S), np.clip(acceleration, -MAX_TARGET_MPS2, MAX_TARGET_MPS2)]
+    return np.stack(motion, axis=-2)
+
+
+class Said(NamedTuple):
+    """A rival's prediction: motion (3, 3), covariance (3, 3) [m²], and whether the hands are far
+    from its data.
+    """
+
+    motion: Array
+    covariance: Array = np.zeros((3, 3))
+    far: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Rival(Skill):
+    """A skill that predicts by another law, from hands (6,), their velocities and accelerations;
+    all else is that of the skill it was made from.
+    """
+
+    says: Callable[[Array, Array, Array], Said] = field(kw_only=True)
+
+    def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
+        """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
+        said = self.says(*seen.now.copy())
+        position, velocity, acceleration = np.round(said.motion, 6)
+        turn, gate_m = self.constant_turn, float(said.far)
+        return Prediction(position, velocity, acceleration, said.covariance, gate_m, 0.0, turn, NO_GRIPPER)
+
+
+def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:
+    """The skill with another law, and with other changed fields."""
+    own = {one.name: getattr(skill, one.name) for one in fields(Skill)}
+    # The digest is of the name alone: nothing is recorded that would need the rest.
+    return Rival(**{**own, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed}, says=says)
+
+
+def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
+    """A placed model as a skill in a bench, made from `skill`; a rival is never far from its data.
+
+    A rival over time starts with the hands, and its motion is that of its means in time.
+    """
+    if isinstance(placed, Skill):
+        return lambda bench: placed
+    if placed.depends_on is DependsOn.TIME:
+
+        def over_time(bench: Bench) -> Said:
+            rows = placed.mean(Observed.resting(np.zeros((3, 6)), bench.time_s + STEPS * MOTION_STEP_S))
+            return Said(differences(*rows))
+
+        return lambda bench: rival(skill, lambda *moving: over_time(bench))
+
+    def of_hands(*moving: Array) -> Said:
+        return Said(along_hands(lambda at: placed.mean(Observed.resting(at)), *(x[None] for x in moving))[0])
+
+    return lambda bench: rival(skill, of_hands)

@@ -1,0 +1,106 @@
+"""The interface of all that predicts the tool: a function learns from demonstrations, its model is
+placed in a scene, and what is placed predicts from the hands.
+
+To add a rival, write a class or a function here or beside, and name it where it is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thirdhand.core.skill.model import CHI_SQUARE
+from thirdhand.core.skill.skill import Skill
+from thirdhand_sim.lab.results import Array
+
+Scene_contra = TypeVar("Scene_contra", contravariant=True)
+Mask = NDArray[np.bool_]
+
+
+class DependsOn(Enum):
+    """The input of a prediction; it decides how the predicted tool moves."""
+
+    HANDS = "the hands now"
+    PAST = "the hands until now"
+    TIME = "the time since the hands began"
+
+
+class Observed(NamedTuple):
+    """Both hands as the service estimates them, one row a sample, in the order of time."""
+
+    times: Array  # (T,) [s]
+    hands: Array  # (T, 6) [m]
+    velocities: Array  # (T, 6) [m/s]
+    stillness: Array  # (T, 2) of each hand, from 0 to 1
+
+    @staticmethod
+    def resting(hands: Array, times: Array | float = 0.0) -> Observed:
+        """Hands (T, 6) [m] at rest."""
+        shape = len(hands)
+        return Observed(np.broadcast_to(times, shape), hands, np.zeros((shape, 6)), np.ones((shape, 2)))
+
+
+class Predicted(NamedTuple):
+    """The predicted tool: means (T, 3) [m], covariances (T, 3, 3) [m²] if there are any, where the
+    method holds and where it reports to be uncertain (T,), and the squared Mahalanobis distances of
+    the regions of LEVELS.
+    """
+
+    mean: Array
+    covariance: Array | None = None
+    held: Mask | None = None
+    uncertain: Mask | None = None
+    radii: tuple[float, ...] = CHI_SQUARE
+
+
+class Placed(Protocol):
+    """A model in a scene."""
+
+    @property
+    def depends_on(self) -> DependsOn:
+        """The input of the prediction."""
+
+    def predict(self, seen: Observed) -> Predicted:
+        """The tool for observed hands."""
+
+    def mean(self, seen: Observed) -> Array:
+        """The means alone (T, 3) [m]."""
+
+
+class Model(Protocol[Scene_contra]):
+    """The result of learning from demonstrations."""
+
+    def place(self, scene: Scene_contra) -> Placed | Skill:
+        """The model, or a skill of the service, in a scene."""
+
+
+Learn: TypeAlias = Callable[[Sequence[Any]], Model[Any]]
+"""From demonstrations to a model."""
+
+
+class Method(Protocol):
+    """A way to learn, with its parameters."""
+
+    def learn(self, demonstrations: Sequence[Any]) -> Model[Any]:
+        """The model of demonstrations."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """A model that is the same in each scene, and predicts by a function."""
+
+    predict: Callable[[Observed], Predicted]
+    depends_on: DependsOn = DependsOn.PAST
+
+    def place(self, scene: object) -> Law:
+        """The same."""
+        return self
+
+    def mean(self, seen: Observed) -> Array:
+        """As `Placed.mean`."""
+        return self.predict(seen).mean

@@ -1,0 +1,166 @@
+"""Gaussian mixtures of hands and tool: mixture regression, and its task-parameterised form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kmp import GaussianMixture
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.results import Array
+from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
+from thirdhand_sim.people import Places
+from thirdhand_sim.scene import TOOL_FROM_HAND
+from thirdhand_sim.sessions import SessionDemonstration
+
+SEED = EXPERIMENTS["people"].seeds.method
+# Hands are far below this quantile of the demonstrations' log densities, less a slack [nat].
+UNUSUAL, SLACK = 0.001, 10.0
+
+
+def frames(places: Places) -> Array:
+    """Hands and tool at start, handover, glass and soldering, as perceived: (4, 9) [m]."""
+    p = places
+    return np.array(
+        [
+            np.concatenate([p.left_start, p.right_start, p.robot_start]),
+            np.concatenate([p.handover, p.right_start, p.handover + TOOL_FROM_HAND]),
+            np.concatenate([p.board, p.iron, p.glass]),
+            np.concatenate([p.board, p.right_final, p.carry]),
+        ]
+    )
+
+
+def joined(shown: SessionDemonstration) -> Array:
+    """Hands and tool (T, 9) [m]."""
+    return np.hstack([shown.hands, shown.tool])
+
+
+def path_share(shown: SessionDemonstration) -> Array:
+    """Share (T,) of the path of hands and tool; at rest it does not grow."""
+    window = np.ones(13) / 13  # half a second
+    x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
+    speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
+    gone = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] below 2 cm/s they rest
+    return np.asarray((gone - gone[0]) / (gone[-1] - gone[0]))
+
+
+@dataclass(frozen=True)
+class MixtureRegression:
+    """A Gaussian mixture of hands and tool, conditioned on the hands (GMR). Knows no places."""
+
+    components: int = 10
+
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedMixture:
+        """The mixture, by EM."""
+        samples = np.concatenate([joined(one) for one in demonstrations])
+        mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
+        return LearnedMixture(mixture, threshold([log_density(mixture, one.hands) for one in demonstrations]))
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedMixture:
+    """A mixture, and the log density of hands below which they are far."""
+
+    mixture: GaussianMixture
+    threshold: float
+    depends_on = DependsOn.HANDS
+
+    def place(self, places: Places) -> LearnedMixture:
+        """The same: it takes no places."""
+        return self
+
+    def mean(self, seen: Observed) -> Array:
+        """As `Placed.mean`."""
+        return self.mixture.regress(seen.hands).mean
+
+    def predict(self, seen: Observed) -> Predicted:
+        """As `Placed.predict`; it holds where such hands were not demonstrated."""
+        found = self.mixture.regress(seen.hands)
+        return Predicted(found.mean, found.covariance, log_density(self.mixture, seen.hands) < self.threshold)
+
+
+def log_density(mixture: GaussianMixture, hands: Array) -> Array:
+    """Log density (T,) [nat] of hands (T, 6) under a mixture of hands and more."""
+    logs = np.log(mixture.weights) + np.stack(
+        [
+            log_normal(hands, mean[:6], covariance[:6, :6])
+            for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
+        ],
+        axis=1,
+    )
+    return _log_sum(logs)
+
+
+def _log_sum(logs: Array) -> Array:
+    top = logs.max(axis=1)
+    return np.asarray(top + np.log(np.exp(logs - top[:, None]).sum(axis=1)))
+
+
+def log_normal(x: Array, mean: Array, covariance: Array) -> Array:
+    """Log density (T,) of x (T, D) under a normal distribution."""
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, (x - mean).T)
+    return np.asarray(-np.log(np.diag(root)).sum() - 0.5 * (white**2).sum(axis=0) - 0.5 * len(mean) * np.log(2 * np.pi))
+
+
+def threshold(densities: Sequence[Array]) -> float:
+    """The log density [nat] below which hands are far from the demonstrations."""
+    return float(np.quantile(np.concatenate(densities), UNUSUAL)) - SLACK
+
+
+@dataclass(frozen=True)
+class TaskParameterised:
+    """TP-GMM (Calinon 2016): one mixture seen from frames at the start and at each place, whose
+    normals are multiplied where the frames are now, and then conditioned on the hands.
+
+    A frame moves hands and tool each by where they are at its place.
+    """
+
+    components: int = 10
+    regularization_m: float = 0.02
+    iterations: int = 40
+
+    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedFrames:
+        """The mixture, by EM from equal spans of the way; the frames share responsibilities."""
+        local = np.concatenate([joined(one)[:, None] - frames(one.places) for one in demonstrations])  # (M, 4, 9)
+        phase = 0.999 * np.concatenate([path_share(one) for one in demonstrations])
+        count = self.components
+        share = np.eye(count)[(phase * count).astype(int)]
+        weights, means, covariances = np.empty(0), np.empty(0), np.empty(0)
+        for _ in range(self.iterations):
+            total = share.sum(axis=0) + 1e-9
+            weights = total / total.sum()
+            means = np.einsum("mk,mfi->kfi", share, local) / total[:, None, None]
+            off = local[:, None] - means
+            covariances = np.einsum("mk,mkfi,mkfj->kfij", share, off, off, optimize=True) / total[:, None, None, None]
+            covariances += self.regularization_m**2 * np.eye(9)
+            logs = np.log(weights) + np.stack(
+                [sum(log_normal(local[:, f], means[k, f], covariances[k, f]) for f in range(4)) for k in range(count)],
+                axis=1,
+            )
+            share = np.exp(logs - _log_sum(logs)[:, None])
+        learned = LearnedFrames(weights, means, covariances, -np.inf)
+        placed = [log_density(learned.place(one.places).mixture, one.hands) for one in demonstrations]
+        return replace(learned, threshold=threshold(placed))
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedFrames:
+    """A mixture in four frames: weights (K,), means (K, 4, 9), covariances (K, 4, 9, 9) [m]."""
+
+    weights: Array
+    means: Array
+    covariances: Array
+    threshold: float
+
+    def place(self, places: Places) -> LearnedMixture:
+        """The mixture where the frames are now."""
+        precisions = np.linalg.inv(self.covariances)
+        covariances = np.linalg.inv(precisions.sum(axis=1))
+        moved = self.means + frames(places)
+        means = np.einsum("kij,kj->ki", covariances, np.einsum("kfij,kfj->ki", precisions, moved))
+        covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+        return LearnedMixture(GaussianMixture(self.weights, means, covariances), self.threshold)

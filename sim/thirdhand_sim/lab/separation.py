@@ -1,0 +1,392 @@
+"""Distance and speed of the arm toward hands: random scenes in closed loop, and scenes in which a
+hand is thrust in its way.
+
+Both are judged from outside: joints as the simulation measures them, hands as they are.
+"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import msgspec
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+from kmp.compiled import compiled
+from thirdhand.contract.records import Flag
+from thirdhand.core.geometry import between_segments, place
+from thirdhand.core.separation.body import Body, body_of
+from thirdhand.core.separation.stage import Separation
+from thirdhand.core.separation.step import allowed_speed
+from thirdhand.core.tuning import TUNING
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.bench import Bench
+from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.reached import EVENTS, ours
+from thirdhand_sim.lab.rehearsal import (
+    NOISE_M,
+    TREMOR_M,
+    Rehearsed,
+    rehearse,
+)
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    OTHER,
+    Array,
+    Options,
+    Results,
+    brief,
+    pyplot,
+)
+from thirdhand_sim.lab.scenes import OFFSET_M, Drawn, draw
+from thirdhand_sim.lab.workers import shared_out
+from thirdhand_sim.script import (
+    PAUSE_RAMP_S,
+    Clock,
+    HandMotions,
+    HandScript,
+    PointMotion,
+    ScriptPause,
+    Teacher,
+)
+
+SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
+KINDS = ("random", "thrust", "unheeded")
+EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
+GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
+REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
+AHEAD_M, AHEAD_S = 0.22, 1.5  # a hand is thrust this far ahead of the tool on its path, and at most this time
+THRUST_STEP_S = 0.02  # times at which the path is sampled
+CLEARANCE_TICKS, WITHIN_M = 5, 0.3
+SHOWN_M, STEP_S = 0.3, 1e-6
+SHOWN_SCENES, SHOWN_TICKS = 5, 10  # the figure shows the first scenes, and every tenth tick
+HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more is hurried
+UNHEEDED_EVERY = 4  # scenes run without separation too, to measure its cost
+
+
+class ThrustScript(HandScript):
+    """Hands of a random scene; one is thrust into the tool's path once, stays, and returns.
+
+    Meanwhile the task returns to where it was, so that nothing of it is lost.
+    """
+
+    def __init__(self, drawn: Drawn) -> None:
+        random = np.random.default_rng([drawn.seed, 7])
+        clock = Clock(speed=drawn.speed, pauses=drawn.pauses)
+        teacher = Teacher(drawn.scene, seed=drawn.seed, clock=clock)
+        self.side, self.lasts_s = int(random.integers(2)), float(random.uniform(*REACH_S))
+        self.away_s = 2 * self.lasts_s + STAY_S
+        self.at_s, self._place = _thrust(random, teacher, drawn, clock.elapsed(drawn.scene.duration_s), self.lasts_s)
+        there_s = self.at_s + self.lasts_s
+        later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
+        back = ScriptPause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
+        super().__init__(
+            drawn.scene,
+            seed=drawn.seed,
+            speed=drawn.speed,
+            pauses=(*later, back),
+            offset_std=OFFSET_M,
+            tremor_rms=TREMOR_M,
+            noise_std=NOISE_M,
+        )
+
+    def truth(self, t: float) -> HandMotions:
+        """Both hands' motion, the thrust included."""
+        hands = list(super().truth(t))
+        begin = (t - self.at_s) / self.lasts_s
+        back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
+        share, rate = (a - b for a, b in zip(_reach(begin), _reach(back), strict=True))
+        motion, way = hands[self.side], self._place - hands[self.side].position
+        hands[self.side] = PointMotion(
+            motion.position + share * way,
+            (1.0 - share) * motion.velocity + rate / self.lasts_s * way,
+            motion.acceleration,
+        )
+        return HandMotions(*hands)
+
+
+def _thrust(
+    random: np.random.Generator, teacher: Teacher, drawn: Drawn, duration_s: float, lasts_s: float
+) -> tuple[float, Array]:
+    """Time [s], outside of pauses, and place (3,) [m] on the tool's path of a thrust.
+
+    The tool is AHEAD_M from the place and gets there within AHEAD_S. If the tool is never that
+    fast, the time and the place are those where it gets farthest.
+    """
+    times, count = np.arange(0.5, duration_s - 1.0, THRUST_STEP_S), round(AHEAD_S / THRUST_STEP_S)
+    path = np.array([teacher.truth(times[0] + i * THRUST_STEP_S).position for i in range(len(times) + count - 1)])
+    ahead = sliding_window_view(path, count, axis=0).transpose(0, 2, 1)  # (T, count, 3)
+    away_m = np.linalg.norm(ahead - ahead[:, :1], axis=2)
+    for pause in drawn.pauses:
+        away_m[(times < pause.at_s + pause.lasts_s) & (times + lasts_s > pause.at_s)] = 0.0
+    least_m = min(AHEAD_M, away_m.max())
+    start = random.choice(np.flatnonzero(away_m.max(axis=1) >= least_m))
+    return float(times[start]), ahead[start, np.argmax(away_m[start] >= least_m)]
+
+
+def _reach(u: float) -> tuple[float, float]:
+    """A minimum-jerk step from 0 to 1 for u in [0, 1], and its derivative."""
+    u = min(max(u, 0.0), 1.0)
+    return u**3 * (10 - 15 * u + 6 * u * u), 30 * (u * (1 - u)) ** 2
+
+
+class Outcome(NamedTuple):
+    """One run. While the tool offers the board to the left hand, the contact speed applies, as in
+    the service.
+    """
+
+    kind: str
+    number: int
+    success: bool
+    errors_mm: tuple[float, float, float]
+    times_s: tuple[float, float, float]  # of the events
+    away_s: float  # time in which a hand was thrust in
+    shapes_mm: float  # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    capsules_mm: float  # the same for the capsules of the rule, which are wider
+    pushed_mm: float  # path of a part of the arm toward a hand that it touches
+    excess_at_once: float  # [m/s] largest excess over the rule
+    excess_after_reaction: float  # [m/s] over the largest allowed speed within the reaction time
+    excess_hurried: float  # the same for hands that were faster than the rule had assumed
+    excess_lasts_s: float  # longest time of an excess above slip_speed_mps
+    fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
+    limited_s: float  # time in which separation limited the arm
+    self_mm: float  # least distance of links that are kept apart
+    table_mm: float
+    near: Array  # (N, 2): distance [m] and speed [m/s] of the pair nearest to its limit, some ticks
+
+
+def run_one(task: tuple[str, int]) -> Outcome:
+    """The outcome of one scene."""
+    kind, number = task
+    drawn = draw(number, seed=SCENES.seed)
+    script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
+    clearances: list[tuple[float, float]] = []
+
+    def look(bench: Bench) -> None:
+        if bench.tick % CLEARANCE_TICKS == 0:
+            world = bench.world
+            clearances.append(
+                (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
+            )
+
+    skill_for = ours(drawn.scene)
+    with patch.object(Separation, "step") if kind == "unheeded" else nullcontext():
+        done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
+    away_s = script.away_s if isinstance(script, ThrustScript) else 0.0
+    return _judged(kind, number, drawn, away_s, done, clearances)
+
+
+def _judged(
+    kind: str, number: int, drawn: Drawn, away_s: float, done: Rehearsed, clearances: list[tuple[float, float]]
+) -> Outcome:
+    settings, dt = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), 1 / RATE_HZ
+    people, body = settings.people, body_of(settings, robot_description(settings))
+    distance, speed, coming, own, table = nearest(settings, body, done.joints, done.hands)
+    reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
+    allowed = np.empty_like(distance)
+    _allow(distance, coming, people.brake, reaction_s, people.distance, allowed)
+    offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
+    links = body.capsules["link"]
+    tool = links[links > 0] == len(settings.joints.names)
+    allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
+    half = round(0.5 * reaction_s / dt)
+    lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
+    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, TUNING.separation.unknown_speed_mps)
+    over = speed - lately
+    began = np.flatnonzero(done.time_s > 0)
+    pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
+    worst = np.argmax((speed - allowed).reshape(len(speed), -1), axis=1)
+    rows = np.arange(len(speed))
+    picked = np.stack([x.reshape(len(x), -1)[rows, worst] for x in (distance, speed)], axis=1)
+    return Outcome(
+        kind,
+        number,
+        done.events.success,
+        done.errors_mm,
+        tuple(getattr(done.events, name).time_s for name in EVENTS),
+        away_s,
+        1000 * min(map(min, clearances)),
+        1000 * float(distance[began].min()),
+        1000 * float(pushed.max()),
+        float((speed - allowed)[began].max()),
+        float(np.where(assumed, over, -1.0)[began].max()),
+        float(np.where(assumed, -1.0, over)[began].max()),
+        dt * _longest(((speed - allowed > TUNING.separation.slip_speed_mps) & assumed)[began]),
+        float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
+        float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
+        1000 * float(own.min()),
+        1000 * float(table.min()),
+        picked[began][::SHOWN_TICKS],
+    )
+
+
+def _longest(found: NDArray[np.bool_]) -> int:
+    """The largest number of consecutive ticks in which something is found, (T, ...)."""
+    run, most = np.zeros(found.shape[1:], np.int64), 0
+    for now in found:
+        run = (run + 1) * now
+        most = max(most, int(run.max()))
+    return most
+
+
+def _later_by(ticks: int, values: Array) -> Array:
+    """Values (T, ...) delayed by a number of ticks; the first one is repeated."""
+    return np.concatenate([np.repeat(values[:1], ticks, axis=0), values])[: len(values)]
+
+
+def nearest(settings: Settings, body: Body, joints: Array, hands: Array) -> tuple[Array, ...]:
+    """Distance [m] of each moving capsule of the body from each hand, approach speeds of the
+    capsule's nearest point and of the hand [m/s], (T, 2, N) each; then least distances (T,) [m]
+    between links, and between links and table. Joints (T, 2, J) [rad, rad/s], hands (T, 2, 3) [m].
+    """
+    people, count = settings.people, int((body.capsules["link"] > 0).sum())
+    moving = np.stack([hands, np.gradient(hands, settings.period_s, axis=0)], axis=2)
+    pairs, least = np.empty((3, len(hands), 2, count)), np.ones((2, len(hands)))
+    forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
+    shape = np.array([people.radius, *forearm, settings.table.centre[2]])
+    _measure(np.ascontiguousarray(joints), moving, body, shape, pairs, least)
+    return (*pairs, *least)
+
+
+@compiled
+def _measure(joints: Array, hands: Array, body: Body, shape: Array, pairs: Array, least: Array) -> None:
+    """`nearest`, with the hands' velocities (T, 2, 2, 3), and the shape (5,) of a forearm and the
+    table: radius, way to the elbow, height. Into pairs (3, T, 2, N) and least (2, T).
+    """
+    frames, axes, capsules, kept_apart = body
+    count, near, arm = len(capsules), np.empty(9), np.empty((2, 3))
+    here, then, fixed = np.empty((count, 2, 3)), np.empty((count, 2, 3)), count - pairs.shape[3]
+    for t in range(len(joints)):
+        q = joints[t, 0]
+        place(q, frames, axes, capsules, here)
+        place(q + STEP_S * joints[t, 1], frames, axes, capsules, then)
+        for pair in range(len(kept_apart)):
+            one, other = kept_apart[pair, 0], kept_apart[pair, 1]
+            apart = between_segments(here[one], here[other], near) - capsules[one].radius - capsules[other].radius
+            least[0, t] = min(least[0, t], apart)
+        for c in range(fixed, count):
+            if max(here[c, 0, 0], here[c, 1, 0]) > 0.35:
+                least[1, t] = min(least[1, t], min(here[c, 0, 2], here[c, 1, 2]) - capsules[c].radius - shape[4])
+            for side in range(2):
+                arm[0] = hands[t, side, 0]
+                arm[1] = arm[0] + shape[1:4]
+                pairs[0, t, side, c - fixed] = between_segments(here[c], arm, near) - capsules[c].radius - shape[0]
+                long = whole = along = coming = 0.0
+                for i in range(3):
+                    way = here[c, 1, i] - here[c, 0, i]
+                    whole += way * way
+                    long += way * (near[i] - here[c, 0, i])
+                share = long / whole if whole > 0.0 else 0.0
+                for i in range(3):
+                    first, second = then[c, 0, i] - here[c, 0, i], then[c, 1, i] - here[c, 1, i]
+                    along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
+                    coming -= near[6 + i] * hands[t, side, 1, i]
+                pairs[1, t, side, c - fixed], pairs[2, t, side, c - fixed] = along, max(coming, 0.0)
+
+
+@compiled
+def _allow(distance: Array, coming: Array, brake: float, reaction: float, clearance: float, out: Array) -> None:
+    for t in range(distance.shape[0]):
+        for side in range(2):
+            for c in range(distance.shape[2]):
+                out[t, side, c] = allowed_speed(distance[t, side, c], coming[t, side, c], brake, reaction, clearance)
+
+
+def run(results: Results, options: Options) -> dict[str, Any]:
+    """The numbers."""
+    scenes = SCENES.share(options.share)
+    found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
+    tasks = [(kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+    for one in shared_out(run_one, tasks, options.workers):
+        found[one.kind].append(one)
+        if len(found[one.kind]) % max(1, len(scenes) // 5) == 0:
+            results.say(f"{one.kind}: {brief(_summary(found[one.kind]))}")
+    recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
+    results.series(
+        {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in found.items() for name in recorded}, "scene"
+    )
+    numbers = {
+        "scenes": len(scenes),
+        "rate_hz": RATE_HZ,
+        "slip_m_per_s": TUNING.separation.slip_speed_mps,
+        **{kind: _summary(rows) for kind, rows in found.items()},
+        "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
+        "later_for_a_thrust_s": _later_for(found["thrust"], found["random"]),
+        "worst_scene": {
+            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
+        },
+        "failed_scenes": {kind: [one.number for one in rows if not one.success] for kind, rows in found.items()},
+        "shown": {kind: _shown([one for one in rows if one.number < SHOWN_SCENES]) for kind, rows in found.items()},
+    }
+    draw_numbers(results, numbers)
+    return numbers
+
+
+def _shown(rows: list[Outcome]) -> dict[str, Any]:
+    """Content of the figure: points at distances [mm] and speeds [mm/s]."""
+    near = np.concatenate([one.near for one in rows])
+    return {
+        "scenes": len(rows),
+        "closest_of_capsules_mm": min(one.capsules_mm for one in rows),
+        "closest_of_shapes_mm": min(one.shapes_mm for one in rows),
+        "points": np.round(1000 * near[near[:, 0] < SHOWN_M]).astype(int).T,
+    }
+
+
+def _summary(rows: list[Outcome]) -> dict[str, Any]:
+    closest = np.array([one.shapes_mm for one in rows])
+    return {
+        "successes": sum(one.success for one in rows),
+        "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
+        "overlaps": int((closest < 0).sum()),
+        "above_after_reaction": sum(one.excess_after_reaction > TUNING.separation.slip_speed_mps for one in rows),
+        "limited_s": float(np.mean([one.limited_s for one in rows])),
+        **{name: max(getattr(one, name) for one in rows) for name in GREATEST},
+        **{name: min(getattr(one, name) for one in rows) for name in ("self_mm", "table_mm")},
+    }
+
+
+def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
+    """Delay of the events [s] against the same scenes without separation."""
+    late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
+    return {name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())} for i, name in enumerate(EVENTS)}
+
+
+def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:
+    """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
+    both runs succeed.
+    """
+    both = [(one, other) for one, other in zip(thrust, undisturbed, strict=True) if one.success and other.success]
+    late = np.array([one.times_s[-1] - other.times_s[-1] - one.away_s for one, other in both])
+    away = float(np.mean([one.away_s for one in thrust]))
+    return {"away": away, "mean": float(late.mean()), "least": float(late.min()), "most": float(late.max())}
+
+
+def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
+    """The figure of the experiment's numbers."""
+    plt, people = pyplot(), Settings().people
+    reaction_s = (Settings().hands.stale_ms + people.reaction_ms) / 1000
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), sharey=True)
+    titles = ("random scenes", "a hand thrust into the path", "random scenes, without separation")
+    colours = (OTHER, ADAPTED, "#595959")
+    for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
+        shown = numbers["shown"][kind]
+        distance_mm, speed_mm_s = np.array(shown["points"])
+        ax.scatter(distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True)
+        distances = np.linspace(-0.1, SHOWN_M, 200)
+        for hand, style in ((0.0, "-"), (0.5, "--")):
+            rule = [allowed_speed(d, hand, people.brake, reaction_s, people.distance) for d in distances]
+            ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
+        closest = shown["closest_of_capsules_mm"]
+        ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"least distance: {closest:.0f} mm")
+        ax.axvline(0, color="black", lw=0.6)
+        ax.set_title(f"{title} ({shown['scenes']} shown)", fontsize=9)
+        ax.set(xlim=(-100, 1000 * SHOWN_M), ylim=(-0.6, 0.9))
+        ax.legend(frameon=False, fontsize=7.5, loc="lower right")
+    axes[0].set(ylabel="speed toward the hand [m/s]")
+    axes[1].set(xlabel="distance between the rule's capsules of arm and hand [mm]")
+    results.figure(figure)

@@ -1,0 +1,91 @@
+"""The world of a real arm, or of one that another program simulates: its joint states give its
+position. Only hands and things are simulated here.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from thirdhand.contract import cdr, messages
+from thirdhand.contract.joint_states import JointStates, measured
+from thirdhand.core.arm.stage import Arm
+from thirdhand.core.geometry import between_segments, place, quaternion_of
+from thirdhand.core.separation.body import body_of
+from thirdhand.settings.config import Settings, robot_description
+from thirdhand_sim.world import (
+    LEVEL,
+    Floats,
+    Pose,
+    World,
+    WorldBody,
+    carried_by,
+)
+
+
+class ObservedWorld(World):
+    """The bench's world around an observed arm, which another program moves."""
+
+    heard = False  # True once a joint state was received
+
+    def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
+        self._names = settings.joints.names
+        description = robot_description(settings)
+        self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies
+        self._newest: tuple[Floats, Floats] = posture, (0.0,) * len(posture)
+        self._states = JointStates(self._names, settings.arm.silent_ms / 1000)
+
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Store a joint state. Others are ignored, because the service reports them. For any
+        thread.
+        """
+        try:
+            found = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
+            if found is None:
+                return
+            state = measured(found, self._names)
+        except messages.WireError:
+            return
+        if messages.finite(state[0] + state[1]):
+            self._newest, self.heard = state, True
+
+    def follow(self, position: Floats, velocity: Floats) -> None:
+        """Do nothing: the arm follows commands itself."""
+
+    def step(self) -> None:
+        """Do nothing: the arm moves in real time."""
+
+    def joints(self) -> tuple[Floats, Floats]:
+        """Position [rad] and velocity [rad/s] of the joints in chain order."""
+        return self._newest
+
+    def tool(self) -> tuple[Pose, Floats]:
+        """Pose and velocity [m/s] of the tool."""
+        position, velocity = self._newest
+        here, turn = self._arm.at(np.array(position)), np.empty(4)
+        quaternion_of(here.rotation, turn)
+        x, y, z, w = turn.tolist()
+        speed = here.jacobian[:3] @ velocity
+        return Pose(tuple(here.position.tolist()), (x, y, z, w)), tuple(speed.tolist())
+
+    def _place(self, body: str, pose: Pose) -> None:
+        """Do nothing: the base class stores the pose."""
+
+    def clearance(self, body: str, *, within: float = 2.0) -> float:
+        """Smallest distance between the arm's capsules and a hand [m], but at most `within`."""
+        capsules, near = self._body.capsules, np.empty(9)
+        placed = np.empty((len(capsules), 2, 3))
+        place(np.array(self._newest[0]), self._body.frames, self._body.axes, capsules, placed)
+        at, look = self.pose(body), self._bodies[body].look
+        hand = np.array([at.position, carried_by(at, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position])
+        apart = [between_segments(one, hand, near) for one in placed] - capsules["radius"]
+        return min(within, float(apart.min()) - look.size[0] / 2)
+
+    def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
+        raise NotImplementedError("there is no engine that draws; thirdhand view live shows the cell")
+
+    def close(self) -> None:
+        """Do nothing: there are no resources."""
