@@ -24,7 +24,7 @@ GROUPS = {
     "stop and continue": ("hold", "resume", "reset"),
     "teach": ("record", "learn", "via-points", "stage", "correct"),
     "look": ("status", "view", "report"),
-    "check": ("doctor", "metrics", "bundle", "replay", "tune", "bench"),
+    "check": ("doctor", "metrics", "bundle", "replay", "bench"),
     "set up": ("arm", "calibrate"),
 }
 CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes

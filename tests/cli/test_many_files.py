@@ -1,8 +1,7 @@
-"""`replay --each`, `report` and `tune` over several files: by one process, two, or a cluster."""
+"""`replay --each` and `report` over several files: by one process, two, or a cluster."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
@@ -11,17 +10,13 @@ from pathlib import Path
 import pytest
 
 from support.cell import told
-from support.cell_commands import succeeded
 from support.in_process import ASSUMED, ticks_of
-from support.paths import RECORDINGS, ROOT
+from support.paths import ROOT
 from support.wam import URDF
 from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import Frame, Tick
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import Recorder
-from thirdhand.workbench.cli import tune
-from thirdhand.workbench.report.tracking import TrackingFigures
-from thirdhand.workbench.report.variants import CHANGES, VariantFigures, pooled
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -88,24 +83,3 @@ def test_a_cluster_of_two_workers_prints_the_same(files: list[str], tmp_path: Pa
     alone = told(*command)
     assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr
     assert named_failures(done.stderr) == named_failures(alone.stderr)
-
-
-def test_the_figures_of_several_files_are_weighted_by_their_judged_time() -> None:
-    def figures(error_mm: float, lag_ms: float, overshoot_mm: float, stops: int, cause: str) -> VariantFigures:
-        seen = TrackingFigures(error_mm, 2 * error_mm, lag_ms, 10.0, overshoot_mm, stops)
-        return VariantFigures("as recorded", {}, seen, {"hold: stale_hand": 0.5}, {}, {cause: 1})
-
-    nan = float("nan")
-    (one,) = pooled([(1.0, [figures(2.0, 50.0, 1.5, 2, "older")]), (3.0, [figures(4.0, nan, nan, 0, "jumped")])])
-    assert one.tracking == TrackingFigures(3.5, 7.0, 50.0, 10.0, 1.5, 2)
-    assert (one.held_s, one.rejected) == ({"hold: stale_hand": 1.0}, {"older": 1, "jumped": 1})
-
-
-@pytest.mark.timeout(300)
-def test_several_takes_are_tuned_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tune, "CHANGES", CHANGES[:5:4])
-    takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
-    done = succeeded("tune", *takes, "--part", "3", "7")
-    for words in ("how the tool follows, over 2 files", "max_jerk = 100"):
-        assert words in done.stdout
-    assert len(re.findall(r"Noise and tremor of the hands", done.stdout)) == 2

@@ -63,7 +63,6 @@ def commands_in(folder: Path) -> Iterator[str]:
     yield f"learn --from {folder}/staged.npz {second} --output {folder}/refined.npz"
     yield f"replay {RECORDINGS}/golden.mcap --output {folder}/whole.mcap"
     yield f"report {folder}/whole.mcap"
-    yield f"tune {RECORDINGS}/golden.mcap --part 0 3"
     yield "bench --seconds 0.5"
     yield f"arm service/thirdhand/arms/wam.urdf --output {folder}/arm.toml"
     yield f"demo --output {folder}/demo"

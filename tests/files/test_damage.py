@@ -26,7 +26,6 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.cli.view import convert
 from thirdhand.workbench.report.report import reported
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
-from thirdhand.workbench.takes.recorded_hands import recorded_hands
 
 COUNT = 600
 
@@ -143,7 +142,7 @@ def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes
     path = tmp_path / "a.mcap"
     for at in (whole.index(b"skill.npz") + 300, whole.index(b"arm.urdf") + 300):
         path.write_bytes(flipped(whole, at))
-        for use in (replay, recorded_hands, lambda path: convert(path, tmp_path / "a.rrd")):
+        for use in (replay, lambda path: convert(path, tmp_path / "a.rrd")):
             with pytest.raises(RecordingError, match=r"lacks its (skill|arm); .*an attachment's checksum is wrong"):
                 use(path)
         columns = reported(path).columns

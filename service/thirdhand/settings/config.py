@@ -118,7 +118,7 @@ class ToolSettings(Section, frozen=True):
     max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
-    follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: see `tune`
+    follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: docs/tune.md
 
     @property
     def engaging_speed(self) -> float:

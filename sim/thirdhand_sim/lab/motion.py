@@ -22,7 +22,6 @@ from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import decoded
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.report.tracking import derivative, lag_ms, rms
 from thirdhand_sim.lab import gains, spectra
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.open_loop import targets
@@ -64,6 +63,7 @@ from thirdhand_sim.lab.rivals.followers import (
 from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
 from thirdhand_sim.lab.workers import shared_out
 
+TRIED_LAGS_S = (-0.06, 0.2)  # lags that are tried
 SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE, SMALL = (SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small"))
 SMALL_HZ = range(1, 13)
@@ -113,6 +113,36 @@ class Figures:
     joint_speeds: list[float]  # [rad/s] by frequency, as of `spectra`
     tracker: str = ""  # its kind, of recorded hands
     error_with_jumps_mm: float = math.nan  # rms error against the truth with the tracker's jumps
+
+
+def derivative(path: Array, period_s: float, *, order: int) -> Array:
+    """The derivative of an order by central differences, of the path's shape [m/s^order]."""
+    for _ in range(order):
+        path = np.gradient(path, period_s, axis=0)
+    return path
+
+
+def rms(rows: Array) -> float:
+    """Root mean square of the norms of rows (N, 3)."""
+    return float(np.sqrt(np.mean(np.sum(rows**2, axis=1))))
+
+
+def lag_ms(target: Array, tool: Array, period_s: float) -> float:
+    """The lag [ms] within TRIED_LAGS_S with the largest cross-correlation of the speeds; NaN for a
+    path that is too short, or a target that does not move.
+    """
+    first, last = (round(limit_s / period_s) for limit_s in TRIED_LAGS_S)
+    begin = -2 * first
+    end = len(target) - last + 2 * first
+    if end <= begin:
+        return math.nan
+    target_speed, tool_speed = (np.linalg.norm(derivative(path, period_s, order=1), axis=1) for path in (target, tool))
+    inner = (target_speed - target_speed.mean())[begin:end]
+    tool_speed = tool_speed - tool_speed.mean()
+    if not inner.any():
+        return math.nan
+    score = [float(inner @ tool_speed[begin + k : end + k]) for k in range(first, last + 1)]
+    return float(1000 * period_s * (int(np.argmax(score)) + first))
 
 
 def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:

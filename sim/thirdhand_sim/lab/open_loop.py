@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from thirdhand.core.controller import Controller
-from thirdhand.core.frame import Tick
+from thirdhand.core.controller import Controller, run
+from thirdhand.core.frame import Frame, Tick
 from thirdhand.core.skill.skill import Skill, clamp
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.workbench.takes.recorded_hands import frames_of, with_ideal_arm
 from thirdhand_sim.lab.results import Array
 
 USUAL = Settings()
@@ -20,12 +21,18 @@ USUAL = Settings()
 
 def controller(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Controller:
     """The service's core with an arm that is where it is commanded."""
-    return Controller(with_ideal_arm(settings), skill, urdf=robot_description(settings), tuning=tuning)
+    arm = msgspec.structs.replace(settings.arm, source="assumed")
+    return Controller(
+        msgspec.structs.replace(settings, arm=arm), skill, urdf=robot_description(settings), tuning=tuning
+    )
 
 
 def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING) -> NDArray[np.void]:
     """The service's frames (T,) of ticks."""
-    return frames_of(controller(skill, settings, tuning), ticks)
+    made: list[Frame] = []
+    with threadpool_limits(1):
+        run(controller(skill, settings, tuning), ticks, [lambda tick, frame: made.append(frame)])
+    return np.array(made)
 
 
 def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:

@@ -118,25 +118,6 @@ def replay(add: Commands) -> None:
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
 
-def tune(add: Commands) -> None:
-    """Options of `tune`."""
-    c = add(
-        "tune",
-        "Tries about a dozen settings on the hands of a recording or a take: error, lag, jerk, overshoot and "
-        "rejections of each, and the noise and tremor of the hands. Prints the lines to write for the best trade-off, "
-        "of several files for all of them.",
-        "thirdhand tune recordings/golden.mcap --plot tune.png\n  thirdhand tune archive/*.mcap --workers 8",
-    )
-    option(c, "files", "FILE", "a recording of the daemon, or a take (.mcap); several are judged together", nargs="+")
-    option(c, "--config", "CELL", f"the cell (default: the settings in the file): {ARM_HELP}")
-    option(c, "--skill", "FILE", "the skill (default: that in the file; for a take the shipped soldering skill)")
-    part = "use this part only, in seconds from the start; the default is all of it"
-    c.add_argument("--part", nargs=2, type=within(float, 0, 1e6, " s"), metavar=("FROM", "TO"), help=part)
-    option(c, "--plot", "PNG", "draw the variants and the hands of a single file to this file")
-    option(c, "--workers", "WORKERS", WORKERS_HELP)
-    flag(c, "--json", "print the figures as one JSON object")
-
-
 def record(add: Commands) -> None:
     """Options of `record`."""
     c = add("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
@@ -281,4 +262,4 @@ def view(add: Commands) -> None:
     reach(c)
 
 
-COMMANDS = (demo, bench, play, hands, replay, tune, record, report, learn, bundle, metrics, arm, calibrate, sim, view)
+COMMANDS = (demo, bench, play, hands, replay, record, report, learn, bundle, metrics, arm, calibrate, sim, view)
