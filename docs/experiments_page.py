@@ -3,7 +3,7 @@ recordings/experiments: experiments.md from its template, experiments.md.jinja; 
 camera.md, tune.md and faults.md what stands between `<!-- evidence -->` marks, and the last cells
 of the table of faults.
 
-A number of a template is an expression of a result, as `{{ phase.tremor_mm | fixed(1) }}`; without
+A number of a template is an expression of a result, as `{{ camera.pictures | fixed(1) }}`; without
 that result it is an error. What was measured with another version is marked as stale.
 """
 

@@ -176,7 +176,7 @@ def test_motion_follows_through_the_controller() -> None:
 
 @pytest.mark.parametrize("teach", [True, False])
 def test_what_is_rehearsed_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`statistics`, `phase`, `orientation`, `separation`, and `hands` in process."""
+    """`statistics`, `separation`, and `hands` in process."""
     known: list[Tick] = []
     run = rehearsal.run
 
@@ -197,7 +197,7 @@ def test_what_is_rehearsed_is_what_the_controller_does(teach: bool, monkeypatch:
 
 @pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
 def test_an_open_loop_target_is_where_the_controller_leads_the_tool(file: str) -> None:
-    """`demonstrations`, `hands` beside the paper, and what `motion` measures against."""
+    """`hands` beside the paper, and what `motion` measures against."""
     known = decoded((recordings() / file).read_bytes(), origin=file)
     rows = known.hands[:: max(1, len(known.hands) // 8)] + 0.004
     for row, target in zip(rows, targets(known, rows), strict=True):

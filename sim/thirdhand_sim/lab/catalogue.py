@@ -120,8 +120,6 @@ _FOLLOWED = {
 }
 _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
 _FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
-_ORDERS = {"demonstrations": Stream("demonstration", 1, range(1, 21)), "orders": Stream("order", 0, range(4))}
-_HELD_OUT = {"demonstrations": Stream("demonstration", 1, range(21, 26))}
 _SENSITIVITY = Seeds(  # one of each for each seed of a session
     {},
     tuning={
@@ -150,15 +148,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "correlation": Experiment(
         "reproduction.correlation", KMP, Seeds(_IN_SPACE | {"points": Stream("via-point", 0, range(2))})
     ),
-    "runs": Experiment("reproduction.runs", KMP, Seeds(_IN_SPACE | {"searches": Stream("search", 0, range(10))})),
     "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
-    "phase": Experiment("phase", CORE, Seeds(_hands(11), learned=_SHIPPED)),
-    "orientation": Experiment(
-        "orientation", ALL, Seeds(_hands(31) | _scenes(5), tuning=TUNED_SCENES, learned=_SHIPPED)
-    ),
-    "demonstrations": Experiment(
-        "demonstrations", ("learning", "kmp"), Seeds(_scenes(40) | _HELD_OUT, tuning=TUNED_SCENES, learned=_ORDERS)
-    ),
     "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
     "camera": Experiment("camera", (), Seeds({"hands": Stream("rendered hands", 0, range(12))})),
 }

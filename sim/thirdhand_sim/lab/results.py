@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 # paper, the left hand is red, the right one blue, and the robot green.
 LEFT, RIGHT, TOOL = "#D55E00", "#0072B2", "#009E73"
 ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-SERIES = (LEFT, RIGHT, TOOL)
 DPI, COLOURS = 110, 256
 ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
 
