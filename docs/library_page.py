@@ -125,7 +125,7 @@ def _described(name: str, value: Any) -> Iterator[str]:
         return
     for part, member in inspect.getmembers(value):
         module = getattr(inspect.unwrap(getattr(member, "fget", getattr(member, "func", member))), "__module__", "")
-        ours = (module or "").startswith(("kmp.", "service."))
+        ours = (module or "").startswith(("kmp.", "thirdhand."))
         if part.startswith("_") or not ours or part in INSIDE or not member.__doc__ or _is_inherited(value, part):
             continue
         yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
@@ -134,7 +134,7 @@ def _described(name: str, value: Any) -> Iterator[str]:
 
 def _is_inherited(value: type, part: str) -> bool:
     """True if a class of the client has a member from another one, which is listed there."""
-    return any(part in vars(base) for base in value.__mro__[1:] if base.__module__.startswith("service."))
+    return any(part in vars(base) for base in value.__mro__[1:] if base.__module__.startswith("thirdhand."))
 
 
 def _signature(name: str, value: Any) -> str:

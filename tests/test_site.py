@@ -131,13 +131,14 @@ def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() ->
         return str(page.templates(results, dict.fromkeys(("core", "learning", "kmp"), "a")).from_string(text).render())
 
     assert (
-        written("{{ stale('phase', 'motion', 'faults') }}") == "*Measured with an earlier version: `motion` at 1234+.*"
+        written("{{ stale('separation', 'motion', 'faults') }}")
+        == "*Measured with an earlier version: `motion` at 1234+.*"
     )
-    assert written("{{ version('motion') }} {{ version('phase') }}") == "**stale**: 1234+ `1234+`"
-    assert written("{{ stale('phase') }}") == ""
-    assert written("{{ phase.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}") == "1234+, 0.06, 0.360"
+    assert written("{{ version('motion') }} {{ version('separation') }}") == "**stale**: 1234+ `1234+`"
+    assert written("{{ stale('separation') }}") == ""
+    assert written("{{ separation.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}") == "1234+, 0.06, 0.360"
     with pytest.raises(jinja2.UndefinedError, match="tremor"):
-        written("{{ phase.tremor }}")
+        written("{{ separation.tremor }}")
 
 
 def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them() -> None:

@@ -11,13 +11,13 @@ import contextlib
 import importlib
 import os
 
-import thirdhand.cli.options
-import thirdhand.workbench.cli.options
-from thirdhand.cli.usage import Commands, Parser, UsageError, reaching
+from thirdhand.cli.options import RUN_TIME
+from thirdhand.cli.usage import House, Parser, UsageError, reaching
 from thirdhand.contract.explain import ExplainedError, in_file, in_words
 from thirdhand.process import foreign_modules, interrupt
 from thirdhand.process.progress import say
 from thirdhand.settings.file_content import SettingsError, UnreadableError
+from thirdhand.workbench.cli.options import WORKBENCH
 
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
@@ -40,9 +40,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     subparsers = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     abouts: dict[str, str] = {}
-    for options in (thirdhand.cli.options, thirdhand.workbench.cli.options):
-        add = Commands(subparsers, options.__name__.removesuffix(".options"), abouts)
-        for add_options in options.COMMANDS:
+    for home, commands in (("thirdhand.cli", RUN_TIME), ("thirdhand.workbench.cli", WORKBENCH)):
+        add = House(subparsers, home, abouts)
+        for add_options in commands:
             add_options(add)
     top.groups = {
         title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()

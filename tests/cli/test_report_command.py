@@ -131,7 +131,7 @@ def test_a_thinned_curve_keeps_its_extremes_and_its_gaps() -> None:
 
 
 def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_holds(tmp_path: Path) -> None:
-    (tmp_path / "sim.py").write_text("raise SystemExit('not this one')\n")
+    (tmp_path / "thirdhand_sim.py").write_text("raise SystemExit('not this one')\n")
     done = subprocess.run(
         [sys.executable, "-P", "-m", "thirdhand", "sim", "--help"],
         capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,

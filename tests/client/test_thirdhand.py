@@ -60,7 +60,7 @@ def test_the_bare_distribution_is_the_client(editable: bool, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("command", "extra"),
-    [("serve", "cell"), ("learn take.mcap --output skill.npz", "cell"), ("sim", "cell"), ("status", "cell")],
+    [("serve", "cell"), ("learn take.mcap --output skill.npz", "cell"), ("sim", "sim")],
 )
 def test_a_command_whose_extra_is_missing_says_what_to_install(command: str, extra: str, tmp_path: Path) -> None:
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
@@ -68,7 +68,7 @@ def test_a_command_whose_extra_is_missing_says_what_to_install(command: str, ext
     done = isolated(site, code, *DEPENDENCIES)
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
-    assert done.stderr.endswith(f"is not installed: pip install 'thirdhand[{extra}]'\n")
+    assert f"installed: pip install 'thirdhand[{extra}]'" in done.stderr
 
 
 # --- a connection --------------------------------------------------------------------------------

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from thirdhand.cli.usage import ARM_HELP, RATE_HELP, Commands, add_end_with, described, flag, option, reach, within
+from thirdhand.cli.usage import ARM_HELP, RATE_HELP, House, add_end_with, described, flag, option, reach, within
 from thirdhand.contract import channels
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import TOLERANCE_M, ViaPoint
 
 
-def follow(add: Commands) -> None:
+def follow(add: House) -> None:
     """Options of `follow`."""
     c = add(
         "follow",
@@ -22,7 +22,7 @@ def follow(add: Commands) -> None:
     reach(c)
 
 
-def serve(add: Commands) -> None:
+def serve(add: House) -> None:
     """Options of `serve`."""
     c = add(
         "serve",
@@ -56,7 +56,7 @@ def serve(add: Commands) -> None:
     add_end_with(c)
 
 
-def via_points(add: Commands) -> None:
+def via_points(add: House) -> None:
     """Options of `via-points`."""
     c = add(
         "via-points",
@@ -96,7 +96,7 @@ def via_points(add: Commands) -> None:
     reach(described(actions, "clear", "remove all via-points", f"{example} clear"))
 
 
-def stage(add: Commands) -> None:
+def stage(add: House) -> None:
     """Options of `stage`."""
     c = reach(
         add(
@@ -109,7 +109,7 @@ def stage(add: Commands) -> None:
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
 
 
-def correct(add: Commands) -> None:
+def correct(add: House) -> None:
     """Options of `correct`."""
     c = reach(
         add(
@@ -127,7 +127,7 @@ def correct(add: Commands) -> None:
     flag(c, "--undo", "undo the last correction")
 
 
-def status(add: Commands) -> None:
+def status(add: House) -> None:
     """Options of `status`."""
     about = "Shows the status of a running daemon, or of all."
     c = reach(add("status", about, "thirdhand status --json\n  thirdhand status --all"))
@@ -139,7 +139,7 @@ def status(add: Commands) -> None:
     c.add_argument("--all", action="store_const", dest="run", const="thirdhand.cli.cells.cells", help=every)
 
 
-def doctor(add: Commands) -> None:
+def doctor(add: House) -> None:
     """Options of `doctor`."""
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = reach(add("doctor", about, "thirdhand doctor"))
@@ -147,11 +147,11 @@ def doctor(add: Commands) -> None:
     option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))
 
 
-def holding(add: Commands) -> None:
+def holding(add: House) -> None:
     """Options of `hold`, `resume` and `reset`."""
     reach(add("hold", "Stops the arm until `resume`.", "thirdhand hold", run="clients.hold"))
     reach(add("resume", "Ends an operator's hold.", "thirdhand resume", run="clients.resume"))
     reach(add("reset", "Ends a fault.", "thirdhand reset", run="clients.reset"))
 
 
-COMMANDS = (follow, serve, via_points, stage, correct, status, doctor, holding)
+RUN_TIME = (follow, serve, via_points, stage, correct, status, doctor, holding)

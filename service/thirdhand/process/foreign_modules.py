@@ -15,7 +15,7 @@ from thirdhand.contract.explain import ExplainedError
 EXTRAS = {  # the modules that each extra of the distribution brings
     "cell": ("kmp", "mcap", "numba", "numpy", "pinocchio", "psutil", "rich", "ruckig", "scipy", "threadpoolctl"),
     "view": ("PIL", "rerun"),
-    "learn": ("matplotlib", "tomlkit"),
+    "learn": ("matplotlib", "sklearn", "tomlkit"),
     "formats": ("ezc3d", "rosbags"),
     "hands": ("aiohttp",),
     "camera": ("mediapipe",),

@@ -1,4 +1,4 @@
-"""Commands on many files: one file that cannot be used does not stop the others."""
+"""House on many files: one file that cannot be used does not stop the others."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thirdhand.cli.usage import ARM_HELP, RATE_HELP, WORKERS_HELP, Commands, flag, option, reach, within
+from thirdhand.cli.usage import ARM_HELP, RATE_HELP, WORKERS_HELP, House, flag, option, reach, within
 from thirdhand.contract.records import SIDES
 from thirdhand.skills.residual_risk import OPTION
 from thirdhand.workbench.cli import calibrate_options, record_options
@@ -15,7 +15,7 @@ DEMO_RATE = (
 )
 
 
-def demo(add: Commands) -> None:
+def demo(add: House) -> None:
     """Options of `demo`."""
     c = add(
         "demo",
@@ -40,7 +40,7 @@ def demo(add: Commands) -> None:
     flag(c, "--json", "print the report as one JSON object")
 
 
-def bench(add: Commands) -> None:
+def bench(add: House) -> None:
     """Options of `bench`."""
     c = add(
         "bench",
@@ -55,7 +55,7 @@ def bench(add: Commands) -> None:
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
 
 
-def play(add: Commands) -> None:
+def play(add: House) -> None:
     """Options of `play`."""
     c = add(
         "play",
@@ -69,7 +69,7 @@ def play(add: Commands) -> None:
     reach(c)
 
 
-def hands(add: Commands) -> None:
+def hands(add: House) -> None:
     """Options of `hands`."""
     c = add(
         "hands",
@@ -101,7 +101,7 @@ def hands(add: Commands) -> None:
     reach(c)
 
 
-def replay(add: Commands) -> None:
+def replay(add: House) -> None:
     """Options of `replay`."""
     c = add(
         "replay",
@@ -118,14 +118,14 @@ def replay(add: Commands) -> None:
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
 
-def record(add: Commands) -> None:
+def record(add: House) -> None:
     """Options of `record`."""
     c = add("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
     reach(c)
 
 
-def report(add: Commands) -> None:
+def report(add: House) -> None:
     """Options of `report`."""
     c = add(
         "report",
@@ -143,7 +143,7 @@ def report(add: Commands) -> None:
     option(c, "--workers", "WORKERS", WORKERS_HELP)
 
 
-def learn(add: Commands) -> None:
+def learn(add: House) -> None:
     """Options of `learn`."""
     c = add(
         "learn",
@@ -189,7 +189,7 @@ def learn(add: Commands) -> None:
     option(c, OPTION, "NAME", accept)
 
 
-def bundle(add: Commands) -> None:
+def bundle(add: House) -> None:
     """Options of `bundle`."""
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
     c = add("bundle", about, "thirdhand bundle --config cell.toml")
@@ -201,7 +201,7 @@ def bundle(add: Commands) -> None:
     reach(c)
 
 
-def metrics(add: Commands) -> None:
+def metrics(add: House) -> None:
     """Options of `metrics`."""
     about = "Serves the statuses of all cells on a network as metrics for Prometheus."
     c = add("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
@@ -209,7 +209,7 @@ def metrics(add: Commands) -> None:
     reach(c, one=False)
 
 
-def arm(add: Commands) -> None:
+def arm(add: House) -> None:
     """Options of `arm`."""
     c = add(
         "arm",
@@ -227,14 +227,14 @@ def arm(add: Commands) -> None:
     option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)
 
 
-def calibrate(add: Commands) -> None:
+def calibrate(add: House) -> None:
     """Options of `calibrate`."""
     c = add("calibrate", calibrate_options.ABOUT_CALIBRATE, calibrate_options.CALIBRATE_EXAMPLE)
     calibrate_options.add_options(c)
     reach(c)
 
 
-def sim(add: Commands) -> None:
+def sim(add: House) -> None:
     """Options of `sim`."""
     # `python -m thirdhand_sim` reads all arguments, so there are no options here, not even --help.
     about = "Runs the simulated bench: it publishes hands and joint states, and follows commands."
@@ -242,7 +242,7 @@ def sim(add: Commands) -> None:
     c.add_argument("options", nargs="*")
 
 
-def view(add: Commands) -> None:
+def view(add: House) -> None:
     """Options of `view`."""
     c = add(
         "view",
@@ -262,4 +262,4 @@ def view(add: Commands) -> None:
     reach(c)
 
 
-COMMANDS = (demo, bench, play, hands, replay, record, report, learn, bundle, metrics, arm, calibrate, sim, view)
+WORKBENCH = (demo, bench, play, hands, replay, record, report, learn, bundle, metrics, arm, calibrate, sim, view)
