@@ -25,28 +25,37 @@ references in other ways; `orientation`, `constraints`, `plot`, `estimator`; `st
 `named_arrays` write files.
 """
 
+import importlib
 import typing
 
-from kmp.arrays.checks import RankReached, ViaPointMissed
-from kmp.constraints import LinearConstraints
-from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel
-from kmp.mixture import GaussianMixture
-from kmp.orientation import OrientationKMP
-from kmp.predictor import Uncertainty
-from kmp.primitive import KMP
-from kmp.problem.hyperparameters import AffineMean
-from kmp.query import MotionPrediction
-from kmp.references.correlation import Correlation, Improvement, improve
-from kmp.references.frames import CoordinateFrame, LocalKMP
-from kmp.references.gaussian_process import gaussian_process_reference
-from kmp.references.superposition import superposed
-from kmp.selection import Learned, Score, learn
-from kmp.storage import Stored, load, save
-from kmp.time_kernels import PeriodicKernel, VelocityKernel
-
 if typing.TYPE_CHECKING:
+    from kmp.arrays.checks import RankReached as RankReached
+    from kmp.arrays.checks import ViaPointMissed as ViaPointMissed
+    from kmp.constraints import LinearConstraints as LinearConstraints
     from kmp.estimator import KMPRegressor as KMPRegressor
+    from kmp.gaussians import Gaussians as Gaussians
+    from kmp.kernel import GaussianKernel as GaussianKernel
+    from kmp.mixture import GaussianMixture as GaussianMixture
+    from kmp.orientation import OrientationKMP as OrientationKMP
+    from kmp.predictor import Uncertainty as Uncertainty
+    from kmp.primitive import KMP as KMP
+    from kmp.problem.hyperparameters import AffineMean as AffineMean
+    from kmp.query import MotionPrediction as MotionPrediction
+    from kmp.references.correlation import Correlation as Correlation
+    from kmp.references.correlation import Improvement as Improvement
+    from kmp.references.correlation import improve as improve
+    from kmp.references.frames import CoordinateFrame as CoordinateFrame
+    from kmp.references.frames import LocalKMP as LocalKMP
+    from kmp.references.gaussian_process import gaussian_process_reference as gaussian_process_reference
+    from kmp.references.superposition import superposed as superposed
+    from kmp.selection import Learned as Learned
+    from kmp.selection import Score as Score
+    from kmp.selection import learn as learn
+    from kmp.storage import Stored as Stored
+    from kmp.storage import load as load
+    from kmp.storage import save as save
+    from kmp.time_kernels import PeriodicKernel as PeriodicKernel
+    from kmp.time_kernels import VelocityKernel as VelocityKernel
 
 __version__ = "0.1.0"
 
@@ -80,14 +89,48 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> typing.Any:
-    """`KMPRegressor`, imported when it is first needed, as scikit-learn loads slowly."""
-    if name == "KMPRegressor":
-        from kmp.estimator import KMPRegressor
+_MODULES = {
+    "AffineMean": "kmp.problem.hyperparameters",
+    "CoordinateFrame": "kmp.references.frames",
+    "Correlation": "kmp.references.correlation",
+    "GaussianKernel": "kmp.kernel",
+    "GaussianMixture": "kmp.mixture",
+    "Gaussians": "kmp.gaussians",
+    "Improvement": "kmp.references.correlation",
+    "KMP": "kmp.primitive",
+    "KMPRegressor": "kmp.estimator",
+    "Learned": "kmp.selection",
+    "LinearConstraints": "kmp.constraints",
+    "LocalKMP": "kmp.references.frames",
+    "MotionPrediction": "kmp.query",
+    "OrientationKMP": "kmp.orientation",
+    "PeriodicKernel": "kmp.time_kernels",
+    "RankReached": "kmp.arrays.checks",
+    "Score": "kmp.selection",
+    "Stored": "kmp.storage",
+    "Uncertainty": "kmp.predictor",
+    "VelocityKernel": "kmp.time_kernels",
+    "ViaPointMissed": "kmp.arrays.checks",
+    "gaussian_process_reference": "kmp.references.gaussian_process",
+    "improve": "kmp.references.correlation",
+    "learn": "kmp.selection",
+    "load": "kmp.storage",
+    "save": "kmp.storage",
+    "superposed": "kmp.references.superposition",
+}
 
-        return KMPRegressor
-    raise AttributeError(f"module 'kmp' has no attribute {name!r}")
+
+def __getattr__(name: str) -> typing.Any:
+    """A name or a module of this package, which is imported when it is first needed."""
+    if name not in _MODULES:
+        try:
+            return importlib.import_module(f"kmp.{name}")
+        except ModuleNotFoundError:
+            raise AttributeError(f"module 'kmp' has no attribute {name!r}") from None
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), "KMPRegressor"])
+    return sorted({*globals(), *_MODULES})

@@ -194,6 +194,26 @@ def test_lines_that_break_a_contract_are_found_and_named(
         assert f"- {module}{brought}" in re.sub("-  +", "- ", done.stdout), done.stdout
 
 
+@pytest.mark.parametrize(
+    ("process", "most", "without"),
+    [
+        ("thirdhand.daemon.daemon", 195, ("thirdhand.workbench", "thirdhand_sim", "rerun", "mcap", "sklearn", "rich")),
+        (
+            "thirdhand.scribe.process, thirdhand.viewer.stream",
+            80,
+            ("thirdhand.workbench", "thirdhand.daemon", "pinocchio", "ruckig", "zenoh", "sklearn", "kmp.primitive"),
+        ),
+    ],
+    ids=["control process", "scribe"],
+)
+def test_a_process_of_a_cell_imports_what_it_needs(process: str, most: int, without: tuple[str, ...]) -> None:
+    code = f"import sys, {process}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    modules = done.stdout.split()
+    assert [name for name in modules if name.startswith(without)] == []
+    assert len([name for name in modules if name.split(".")[0] in PACKAGES]) <= most
+
+
 def test_core_and_contract_import_neither_a_clock_nor_the_outside() -> None:
     assert {named(path): imported(path) & OUTSIDE for path in PURE if imported(path) & OUTSIDE} == {}
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import KMP
 from kmp.compiled import compiled
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.task_clock import TaskClock
+
+if TYPE_CHECKING:
+    from kmp import KMP
 
 MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to micrometres
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²

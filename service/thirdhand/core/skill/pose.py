@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from kmp import KMP
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.frame import Vector
@@ -21,6 +20,9 @@ from thirdhand.core.skill.tuning import (
     GRIPPER_OPEN_BELOW,
     GRIPPER_THERE_M,
 )
+
+if TYPE_CHECKING:
+    from kmp import KMP
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
