@@ -28,20 +28,20 @@ from thirdhand_sim.scene import Scene
 
 PICTURE = Path(__file__).with_name("correct.png")
 DPI = 90
-STAGE, SHARE = 0, 0.5  # the correction is made halfway to the handover
+SEGMENT, SHARE = 0, 0.5  # the correction is made halfway to the handover
 LED_M = np.array([0.03, 0.0, 0.07])  # [m] displacement of the tool that is led
 REST_S, MOVE_S, SAMPLE_TICKS = 1.0, 2.5, 5
 
 
 def hands_at(skill: Skill, time_s: float) -> Vector:
-    """Hands (6,) [m], which move once through the stage with minimum jerk."""
+    """Hands (6,) [m], which move once through the segment with minimum jerk."""
     t = min(max((time_s - REST_S) / MOVE_S, 0.0), 1.0)
-    begin, end = skill.model.hands[STAGE : STAGE + 2]
+    begin, end = skill.model.hands[SEGMENT : SEGMENT + 2]
     return np.asarray(begin + (10 * t**3 - 15 * t**4 + 6 * t**5) * (end - begin))
 
 
 def motion(skill: Skill, path: Skill, settings: Settings) -> tuple[Vector, Vector]:
-    """Left hand (T, 3) and tool (T, 3) [m] while the hands move through the stage of `path`."""
+    """Left hand (T, 3) and tool (T, 3) [m] while the hands move through the segment of `path`."""
     times = np.arange(0.0, 2.0 * REST_S + MOVE_S, settings.period_s)
 
     def ticks() -> Iterator[Tick]:
@@ -64,10 +64,10 @@ def main() -> None:
     settings = Settings()
     settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
     before = adapted(shipped_skill(), Scene().via_points(), tolerance=0.05)
-    begin, end = before.model.hands[STAGE : STAGE + 2]
+    begin, end = before.model.hands[SEGMENT : SEGMENT + 2]
     held = begin + SHARE * (end - begin)
-    tool = before.mean(held[None], [before.model.names[STAGE + 1]])[0] + LED_M
-    made = correction_at(before, held, STAGE, tool)
+    tool = before.mean(held[None], [before.model.names[SEGMENT + 1]])[0] + LED_M
+    made = correction_at(before, held, SEGMENT, tool)
     after, effect = corrected(before, made.among(before.via_points), made.point)
 
     begun = round(REST_S / settings.period_s)

@@ -5,7 +5,7 @@ files it enters, in order, and how often one calls into another.
 
 Compiled functions run as plain Python here, so that they are seen too. A call from one function of
 a file to a function of another counts once, however often a loop repeats it. A re-entry is such a
-call into a file that was entered before. A stage's class and its compiled step count as one file.
+call into a file that was entered before. A segment's class and its compiled step count as one file.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ ENTRY_POINTS = [
     if not path.is_relative_to(ROOT / "tests") and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
 ]
 STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
-    *("MODES", "STATES", "NO_TREMOR", "KEPT", "WAY", "HULL_SPANS", "ORDER", "TURNS", "TURN_INPUTS", "MOST_STAGES"),
-    *("OUTPUTS", "NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_STAGE"),
+    *("MODES", "STATES", "NO_TREMOR", "KEPT", "WAY", "HULL_SPANS", "ORDER", "TURNS", "TURN_INPUTS", "MOST_SEGMENTS"),
+    *("OUTPUTS", "NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_SEGMENT"),
     *("NO_GRIPPER", "MAX_SKILL_DISTANCE_M", "FARTHEST_REPORTED_M", "TABLE_DEPTH_M"),  # of files, of reports, of a shape
     *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
 }

@@ -108,8 +108,8 @@ def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
     whole, ticks = json.loads((kept / "bench.json").read_text())["whole"], SECONDS / 3 * RATE_HZ
     assert whole["ticks"] == pytest.approx(ticks, abs=0.1 * ticks)
     assert sum(whole["work_counts"]) == pytest.approx(ticks, abs=0.1 * ticks)
-    stages = sum(one["p50"] for one in whole["stages_us"].values())
-    assert 0.2 < stages / whole["work_us"]["p50"] < 1.1
+    segments = sum(one["p50"] for one in whole["stages_us"].values())
+    assert 0.2 < segments / whole["work_us"]["p50"] < 1.1
     assert {"daemon", "fork server", "scribe", "skill worker"} == set(whole["processes"])
     assert (kept / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert replay(next(kept.glob("*.mcap"))).exact

@@ -30,7 +30,14 @@ PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings"
 UNITS = ("_M", "_M2", "_M3", "_S", "_S2", "_RAD", "_RADPS", "_MPS", "_MPS2", "_M2PS5", "_PER_S", "_PER_S2", "_PER_M")
 UNITS += ("_PER_M2", "_SHARE", "_SHARES", "_SAMPLES", "_STDS", "_WEIGHT", "_POWER", "_ODDS", "_PROBABILITY", "_SPEEDS")
 DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a primitive's inputs
-    *("MODE_PRIOR", "TREMOR_DAMPING", "MAX_INNOVATION", "STAGE_DISTANCE", "STAGE_DISTANCE_BESIDE", "REST_SHARPNESS"),
+    *(
+        "MODE_PRIOR",
+        "TREMOR_DAMPING",
+        "MAX_INNOVATION",
+        "SEGMENT_DISTANCE",
+        "SEGMENT_DISTANCE_BESIDE",
+        "REST_SHARPNESS",
+    ),
     *("ERROR_WIDTH", "GRIPPER_OPEN_BELOW", "STOP_SECANTS", "PLANNED_BRAKE_LIMITS", "MAX_SQUARED_DEVIATION"),
     *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
 }
@@ -61,7 +68,7 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 
 def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
     page = program("tuning_page")
-    numbers = [number for stage in page.STAGES for number in page.numbers_of(stage)]
+    numbers = [number for segment in page.STAGES for number in page.numbers_of(segment)]
     assert len(numbers) > 70
     for number in numbers:
         assert number.meaning, number.name
@@ -72,7 +79,7 @@ def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -
 
 def test_the_page_lists_each_tuned_number_that_is_data() -> None:
     page = program("tuning_page")
-    listed = {f"{stage}.{number.name}" for stage in page.STAGES for number in page.numbers_of(stage)}
+    listed = {f"{segment}.{number.name}" for segment in page.STAGES for number in page.numbers_of(segment)}
     assert set(sensitivity.numbers()) <= listed
 
 
@@ -104,7 +111,7 @@ def test_the_index_and_the_navigation_have_every_page() -> None:
     assert there <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
-@pytest.mark.parametrize("name", ["frames", "loop", "segment"])
+@pytest.mark.parametrize("name", ["frames", "loop", "path"])
 def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawing = program(f"{name}_picture")
     monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")

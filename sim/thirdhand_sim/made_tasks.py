@@ -1,8 +1,9 @@
 """Synthetic tasks other than soldering: demonstrations of a dozen kinds of task by modelled people,
 in scenes with different places in each take. Each depends only on its numbers.
 
-A task is a list of stages with positions of both hands and of the tool. A person's hands move from
-stage to stage, and a teacher leads the tool by the progress of the slower hand, with a small delay.
+A task is a list of segments with positions of both hands and of the tool. A person's hands move
+from segment to segment, and a teacher leads the tool by the progress of the slower hand, with a
+small delay.
 """
 
 from __future__ import annotations
@@ -76,16 +77,16 @@ class Take(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A task: the names of its stages, the indices of their places of left hand, right hand and
+    """A task: the names of its segments, the indices of their places of left hand, right hand and
     tool, and the motion of hands and tool.
     """
 
     names: tuple[str, ...]
-    stages: Array  # (N, 3) indices of places, int
+    segments: Array  # (N, 3) indices of places, int
     follow: Array  # (N,) 1 where the tool moves with the left hand, else 0
     left_leads: bool = False  # True if the tool ignores the right hand
     carried: bool = False  # True if the tool is fixed to the thing that the left hand carries
-    curved: int = -1  # the stage after which the left hand moves on a curve
+    curved: int = -1  # the segment after which the left hand moves on a curve
     ahead_s: float = 0.0  # lead of the left hand
     dwells: tuple[float, float] = (0.7, 1.6)  # [s] range of the rests at places
     pauses: float = PAUSES  # probability that a hand pauses in a leg, or both hands after it
@@ -96,24 +97,24 @@ def plan(kind: str) -> Plan:
     once = {"three": 3, "six": 6, "twelve": 12, "loose": 6, "ahead": 3, "heading": 3, "long": 24}
     if kind in once:
         count = once[kind]
-        names, stages = tuple(f"stage {i + 1}" for i in range(count)), [(i, i, i) for i in range(count)]
+        names, segments = tuple(f"segment {i + 1}" for i in range(count)), [(i, i, i) for i in range(count)]
     elif kind in ("cyclic", "thrice"):
         names = ("start", "left out", "work", "left out again", "work again", "left out a third time")
-        stages = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (2, 1, 4), (1, 0, 5)]
-        names, stages = (names, stages) if kind == "thrice" else (names[:4], stages[:4])
+        segments = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (2, 1, 4), (1, 0, 5)]
+        names, segments = (names, segments) if kind == "thrice" else (names[:4], segments[:4])
     elif kind == TAUGHT:
         names = ("start", "tray", "work", "tray again", "done")
-        stages = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (3, 0, 4)]
+        segments = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (3, 0, 4)]
     elif kind == "path":
-        names, stages = ("start", "path begins", "path ends"), [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
+        names, segments = ("start", "path begins", "path ends"), [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
     elif kind == "one_hand":
-        names, stages = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
+        names, segments = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
     else:
         raise ValueError(f"{kind!r}: no kind of synthetic task; {', '.join(TASK_KINDS)} accepted")
     follow = {"path": [0.0, 1.0, 1.0], "heading": [1.0] * 3}.get(kind, [0.0] * len(names))
     return Plan(
         names,
-        np.array(stages),
+        np.array(segments),
         np.array(follow),
         left_leads=kind in ("path", "heading", "one_hand"),
         carried=kind == "heading",
@@ -125,7 +126,7 @@ def plan(kind: str) -> Plan:
 
 
 class TaskScene(NamedTuple):
-    """The positions of hands and tool at each stage (N, 3) [m], and yaw, pitch and roll of the
+    """The positions of hands and tool at each segment (N, 3) [m], and yaw, pitch and roll of the
     thing that the left hand carries (N, 3) [rad].
     """
 
@@ -157,7 +158,7 @@ def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | N
         scene = scene._replace(right=np.tile(right_rests, (len(task.names), 1)))
     order = _order(len(task.names), random) if kind == "loose" else [(i, False) for i in range(len(task.names))]
     return Run(
-        task, scene, habits, who, tuple(stage for stage, _ in order), key, _legs(task, scene, habits, order, key)
+        task, scene, habits, who, tuple(segment for segment, _ in order), key, _legs(task, scene, habits, order, key)
     )
 
 
@@ -169,7 +170,7 @@ class Run:
     scene: TaskScene
     habits: Person
     number: int
-    order: tuple[int, ...]  # the stages in the order of the run
+    order: tuple[int, ...]  # the segments in the order of the run
     key: tuple[int, ...]
     legs: tuple[tuple[Leg, ...], tuple[Leg, ...]]
 
@@ -237,7 +238,7 @@ class Run:
     def _perceived(self, random: np.random.Generator) -> tuple[ViaPoint, ...]:
         """The places with errors of PERCEIVED_M; a place that is visited twice has one error."""
         parts = []
-        for part, column in zip(self.scene[:3], self.task.stages.T, strict=True):
+        for part, column in zip(self.scene[:3], self.task.segments.T, strict=True):
             off = PERCEIVED_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
             parts.append(np.round(part + off[column], 6))
         rows = [
@@ -269,7 +270,7 @@ def _usual(kind: str, seed: int) -> list[Array]:
     random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS["made"], TASK_KINDS.index(kind), seed])
     boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
     out = []
-    for box, column in zip(boxes, task.stages.T, strict=True):
+    for box, column in zip(boxes, task.segments.T, strict=True):
         found: list[Array] = []
         apart, way = 0.16, 0.22  # [m] least distance from all other places, and from the one before
         while len(found) <= column.max():
@@ -309,8 +310,8 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> T
             places.append(placed(part, index, places[-1] if places else None))
         parts.append(np.array(places))
     turns = usual[3] + np.array(TURNS_RAD) * random.standard_normal(usual[3].shape)
-    left, right, tool = (at[column] for at, column in zip(parts, task.stages.T, strict=True))
-    turns = turns[task.stages[:, 0]]
+    left, right, tool = (at[column] for at, column in zip(parts, task.segments.T, strict=True))
+    turns = turns[task.segments[:, 0]]
     if task.carried:
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
     else:
@@ -329,8 +330,8 @@ def _reached(tool: Array) -> bool:
 
 
 def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
-    """The order of stages, each with True if the hands interrupt their motion to it: as taught, or
-    with one stage left out, repeated or interrupted.
+    """The order of segments, each with True if the hands interrupt their motion to it: as taught,
+    or with one segment left out, repeated or interrupted.
     """
     order = [(i, False) for i in range(count)]
     at, how = int(random.integers(1, count - 1)), int(random.integers(4))
@@ -346,13 +347,13 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
 def _legs(
     task: Plan, scene: TaskScene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
 ) -> tuple[tuple[Leg, ...], tuple[Leg, ...]]:
-    """The legs of both hands from stage to stage; each hand waits for the other, except for the
+    """The legs of both hands from segment to segment; each hand waits for the other, except for the
     lead.
     """
     random = np.random.default_rng([*key, 5])
     habit = np.random.default_rng([*key[:2], key[-2], 6])
     ends = np.stack([scene.left, scene.right])
-    for side, column in enumerate(task.stages[:, :2].T):
+    for side, column in enumerate(task.segments[:, :2].T):
         off = habit.standard_normal((len(task.names), 3))
         off *= habit.uniform(*HAND_OFF_M, (len(off), 1)) / np.linalg.norm(off, axis=1, keepdims=True)
         ends[side] += (off + HAND_SCATTER_M * random.standard_normal(off.shape))[column]
@@ -382,7 +383,7 @@ def _legs(
                 both = max(*free, both) + random.uniform(1.0, 2.0)
         for side in (0, 1):
             begin = max(free[side] + 0.1, both - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
-            if task.stages[a, side] == task.stages[b, side]:  # the hand rests, and the other does not wait for it
+            if task.segments[a, side] == task.segments[b, side]:  # the hand rests, and the other does not wait for it
                 here = ends[side, a]
                 begin, at_once = max(free[side], begin - 0.6), np.linspace(0, 1, SHAPE_STEPS)
                 legs[side].append(Leg(begin, 0.1, here, here, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))

@@ -107,7 +107,7 @@ def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pyt
         ("unixsock-stream//run/x.sock#key=y", "unixsock-stream//run/x.sock#(left out)"),
         ("tls/a:1#iface=lo,key=y, or", "tls/a:1#(left out), or"),
         ("a-new-one/a:1#key=y;other=z,w", "a-new-one/a:1#(left out)"),
-        ("# a comment, stage #2, tcp/127.0.0.1:7447", "# a comment, stage #2, tcp/127.0.0.1:7447"),
+        ("# a comment, segment #2, tcp/127.0.0.1:7447", "# a comment, segment #2, tcp/127.0.0.1:7447"),
         ("cut: -----BEGIN PRIVATE KEY-----\nMHcC", "cut: (a private key, left out)"),
     ],
 )  # fmt: skip

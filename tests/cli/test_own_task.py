@@ -48,7 +48,7 @@ class Shell:
                 self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert self.daemon.stdout is not None
                 assert self.daemon.stdout.readline().startswith("listening on ")
-            case ["thirdhand", "via-points" | "stage" | "status", *_]:
+            case ["thirdhand", "via-points" | "segment" | "status", *_]:
                 assert main([*words[1:], "--connect", self.at]) == 0
             case ["thirdhand", *rest]:
                 assert main(rest) == 0

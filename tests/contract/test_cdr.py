@@ -364,7 +364,7 @@ def test_the_error_of_a_request_names_the_place_in_it(data: bytes, kind: Any, er
 
 
 def test_events_keep_the_numbers_that_recordings_know_them_by() -> None:
-    kinds = ["hands/left", "hands/right", "joints/state", "skill", "hold", "resume", "reset", "fault", "way", "stage"]
+    kinds = ["hands/left", "hands/right", "joints/state", "skill", "hold", "resume", "reset", "fault", "way", "segment"]
     kinds += ["clutch", "gripper/wish", "joints/guided"]
     assert dict(enumerate(kinds)) == channels.EVENT_KINDS
 

@@ -74,7 +74,7 @@ def test_a_new_member_does_not_import_until_it_is_described(tmp_path: Path) -> N
 
 
 def test_a_reason_is_named_where_it_is_decided_and_explained_and_hardly_elsewhere() -> None:
-    """So a new one needs `records.py`, `incidents.py` and the stage that decides it."""
+    """So a new one needs `records.py`, `incidents.py` and the segment that decides it."""
     package = ROOT / "service" / "thirdhand"
     named = {
         (str(path.relative_to(package)), found)

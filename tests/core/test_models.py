@@ -17,10 +17,13 @@ from thirdhand.skills.skill_file import decoded, with_file
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.scene import Scene
 
-FILES = {"HandsKMP": "experiments/as-paper.npz", "StagedKMP": "soldering.npz"}
+FILES = {"HandsKMP": "experiments/as-paper.npz", "SegmentedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])
 H = 0.02
-LATER = {"HandsKMP": {"error_inputs", "error_samples", "error_unknown_std"}, "StagedKMP": {"levers"}}  # files lack them
+LATER = {
+    "HandsKMP": {"error_inputs", "error_samples", "error_unknown_std"},
+    "SegmentedKMP": {"levers"},
+}  # files lack them
 
 
 @pytest.fixture(params=MODELS, ids=lambda model: model.__name__)

@@ -415,15 +415,15 @@ def test_joints_of_which_some_lead_away_do_not_take_turns_between_stopping_and_g
     cell = cell_of("panda")
     urdf = robot_description(cell)
     arm, separation, state, frame = Arm(cell, urdf), Separation(cell, urdf), blank(STATE), blank(frame_layout(7))
-    stage = LimiterStage(cell, arm)
-    stage.begin(state, np.array(cell.arm.posture))
+    segment = LimiterStage(cell, arm)
+    segment.begin(state, np.array(cell.arm.posture))
     state["joints"][1:] = [[-0.4, -0.17, 0.33, 0.12, 0.18, -0.28, -0.1], [-1.29, -3.0, -2.22, -1.79, -1.4, -1.89, 1.32]]
     separation.constraints["row"][0] = row = np.array([-0.5, 0.03, -0.48, -0.1, 0.12, 0.06, -0.01])
     separation.constraints["planned"][0], separation.constraints["allowed"][0] = 0.0, 0.006
     separation.count = 1
     wanted, approach = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1]), []
     for _ in range(100):
-        stage.step(state, frame, wanted, np.zeros(7), separation)
+        segment.step(state, frame, wanted, np.zeros(7), separation)
         approach.append(row @ state["joints"][1])
     assert max(approach) < 0.05
     assert max(approach[50:]) <= 0.006
@@ -432,9 +432,9 @@ def test_joints_of_which_some_lead_away_do_not_take_turns_between_stopping_and_g
 def test_a_stop_in_a_hold_does_not_approach_a_hand_that_it_passes() -> None:
     """The direction to a hand that sweeps past turns, until a straight stop approaches it."""
     separation, state, frame = Separation(ASSUMED, URDF), blank(STATE), blank(frame_layout(7))
-    stage, approach = LimiterStage(ASSUMED, ARM), []
+    segment, approach = LimiterStage(ASSUMED, ARM), []
     for is_heeded in (False, True):
-        stage.begin(state, POSTURE)
+        segment.begin(state, POSTURE)
         state["joints"][1] = [0.8, -0.35, 1.0, 0.25, 1.4, 0.45, 0.0]
         along = ARM.at(POSTURE).tasks[:3] @ state["joints"][1]
         along /= np.linalg.norm(along)
@@ -446,7 +446,7 @@ def test_a_stop_in_a_hold_does_not_approach_a_hand_that_it_passes() -> None:
             row = (math.sin(turn) * along + math.cos(turn) * away) @ ARM.at(state["joints"][0]).tasks[:3]
             separation.constraints["row"][0], separation.constraints["allowed"][0] = row, SLIP_SPEED_MPS
             separation.count = int(is_heeded)
-            stage.stop(state, frame, separation)
+            segment.stop(state, frame, separation)
             speeds.append(row @ state["joints"][1])
         assert not state["joints"][1].any()
         approach.append(max(speeds))

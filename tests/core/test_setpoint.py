@@ -167,7 +167,7 @@ def test_a_setpoint_waits_for_a_tool_that_cannot_come() -> None:
 
 def test_a_setpoint_outside_the_workspace_waits_for_a_tool_that_cannot_come() -> None:
     arm = Arm(Settings(), URDF)
-    stage, state, here = SetpointStage(Settings(), arm), blank(STATE), arm.at(np.array(Settings().arm.posture))
+    segment, state, here = SetpointStage(Settings(), arm), blank(STATE), arm.at(np.array(Settings().arm.posture))
     state["orientation"][3] = 1.0
     frame = blank(frame_layout(7))
     frame["orientation"][3] = 1.0
@@ -177,7 +177,7 @@ def test_a_setpoint_outside_the_workspace_waits_for_a_tool_that_cannot_come() ->
     SetpointGenerator(Settings()).begin(state, at_rest(start))
     wanted = Wanted(target, state["orientation"], np.zeros(3), 0.0, is_ambiguous=False, needs_unseen_hand=False)
     for _ in range(1000):
-        stage.step(state, frame, wanted, here, box, 1.0)
+        segment.step(state, frame, wanted, here, box, 1.0)
     np.testing.assert_allclose(state["setpoint"][0], start, atol=1e-3)
 
 

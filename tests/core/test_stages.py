@@ -1,4 +1,4 @@
-"""Stages: how far along one hands are, and the filtered belief in which one it is."""
+"""Segments: how far along one hands are, and the filtered belief in which one it is."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from support.wam import URDF
 from thirdhand.core.controller import Controller, start_state
 from thirdhand.core.frame import Tick, order, structured
 from thirdhand.core.skill.memory import along, delayed
-from thirdhand.core.skill.skill import Skill
-from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.stages import (
-    MOST_STAGES,
-    STAGE,
+from thirdhand.core.skill.segments import (
+    MOST_SEGMENTS,
+    SEGMENT,
     along_way,
     recognise,
 )
-from thirdhand.core.skill.tuning import FIRST_STAGE_ODDS
+from thirdhand.core.skill.skill import Skill
+from thirdhand.core.skill.stage import SkillStage
+from thirdhand.core.skill.tuning import FIRST_SEGMENT_ODDS
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import decoded
@@ -31,14 +31,14 @@ PERIOD_S = 0.01
 @pytest.fixture
 def there_and_back() -> np.ndarray:
     """The left hand goes to B and back to A, twice; the right one rests."""
-    stages = structured(4, STAGE)
+    segments = structured(4, SEGMENT)
     for k in range(4):
         sign = 1.0 if k % 2 == 0 else -1.0
-        stages["begins"][k, 0] = (0.5 if k % 2 == 0 else 0.9, 0.0, 0.1)
-        stages["way"][k, 0] = (0.4 * sign, 0.0, 0.0)
-        stages["begins"][k, 1] = (0.8, 0.3, 0.1)
-    stages["square"], stages["off"], stages["follow"] = (stages["way"] ** 2).sum(axis=2), 0.03, -1
-    return stages
+        segments["begins"][k, 0] = (0.5 if k % 2 == 0 else 0.9, 0.0, 0.1)
+        segments["way"][k, 0] = (0.4 * sign, 0.0, 0.0)
+        segments["begins"][k, 1] = (0.8, 0.3, 0.1)
+    segments["square"], segments["off"], segments["follow"] = (segments["way"] ** 2).sum(axis=2), 0.03, -1
+    return segments
 
 
 def motion(x: np.ndarray) -> np.ndarray:
@@ -58,10 +58,10 @@ def legs(*ends: float) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def beliefs(stages: np.ndarray, x: np.ndarray) -> np.ndarray:
-    belief, out = np.zeros(MOST_STAGES), []
+def beliefs(segments: np.ndarray, x: np.ndarray) -> np.ndarray:
+    belief, out = np.zeros(MOST_SEGMENTS), []
     for one in motion(x):
-        recognise(belief, one, PERIOD_S, stages, FIRST_STAGE_ODDS)
+        recognise(belief, one, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
         out.append(belief.copy())
     return np.array(out)
 
@@ -78,24 +78,24 @@ def test_what_was_before_tells_visits_of_a_place_apart(there_and_back: np.ndarra
 
 
 def test_a_belief_that_is_wrong_comes_right_within_a_second(there_and_back: np.ndarray) -> None:
-    """A stage whose ways are elsewhere is told by where hands are; those before are forgotten."""
-    stages = there_and_back.copy()
-    stages["begins"][3, 0], stages["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
-    belief = np.zeros(MOST_STAGES)
+    """A segment whose ways are elsewhere is told by where hands are; those before are forgotten."""
+    segments = there_and_back.copy()
+    segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
+    belief = np.zeros(MOST_SEGMENTS)
     belief[0] = 1.0
     for one in motion(np.full(100, 0.7)):
         one[0, 1] = 0.4
-        recognise(belief, one, PERIOD_S, stages, FIRST_STAGE_ODDS)
+        recognise(belief, one, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
     assert belief[3] > 0.8
 
 
 def test_a_hand_that_rests_near_an_end_is_there_and_a_moving_one_on_its_way(there_and_back: np.ndarray) -> None:
-    stage = there_and_back[0]
+    segment = there_and_back[0]
     near, half = np.array([0.54, 0.02, 0.1]), np.array([0.7, 0.0, 0.1])
-    assert along_way(near, 1.0, stage, 0) < 0.01
-    assert along_way(near, 0.0, stage, 0) == pytest.approx(0.1)
-    assert along_way(half, 1.0, stage, 0) == along_way(half, 0.0, stage, 0) == pytest.approx(0.5)
-    assert along_way(half, 0.0, stage, 1) == 1.0  # the right hand stays
+    assert along_way(near, 1.0, segment, 0) < 0.01
+    assert along_way(near, 0.0, segment, 0) == pytest.approx(0.1)
+    assert along_way(half, 1.0, segment, 0) == along_way(half, 0.0, segment, 0) == pytest.approx(0.5)
+    assert along_way(half, 0.0, segment, 1) == 1.0  # the right hand stays
 
 
 def test_hands_are_delayed_as_they_were_learned_or_foreseen() -> None:
@@ -112,26 +112,26 @@ def test_hands_are_delayed_as_they_were_learned_or_foreseen() -> None:
     assert out[0, 0] == pytest.approx(0.2 * np.sin(times[at] + 0.1), abs=0.002)
 
 
-def test_the_stage_is_set_kept_over_a_hold_and_begun_anew_by_another_task() -> None:
+def test_the_segment_is_set_kept_over_a_hold_and_begun_anew_by_another_task() -> None:
     settings, skill = Settings(), shipped_skill()
-    stage, state = SkillStage(settings, skill), start_state(settings, skill)
-    stage.set_stage(state, "glass")
-    assert state["stage_belief"].argmax() == skill.model.names.index("glass")
-    stage.set_stage(state, "nowhere")
-    assert state["stage_belief"].argmax() == skill.model.names.index("glass")
-    stage.adopt(state, skill)
-    assert state["stage_belief"].max() == 1.0
-    another = stage_less(skill)
-    stage.adopt(state, another)
-    assert not state["stage_belief"].any()
+    segment, state = SkillStage(settings, skill), start_state(settings, skill)
+    segment.set_segment(state, "glass")
+    assert state["segment_belief"].argmax() == skill.model.names.index("glass")
+    segment.set_segment(state, "nowhere")
+    assert state["segment_belief"].argmax() == skill.model.names.index("glass")
+    segment.adopt(state, skill)
+    assert state["segment_belief"].max() == 1.0
+    another = segment_less(skill)
+    segment.adopt(state, another)
+    assert not state["segment_belief"].any()
 
 
-def stage_less(skill: Skill) -> Skill:
-    """Another skill, which has no stages."""
+def segment_less(skill: Skill) -> Skill:
+    """Another skill, which has no segments."""
     return decoded((RECORDINGS / "experiments/as-paper.npz").read_bytes(), origin="as-paper.npz")
 
 
-def test_a_request_sets_the_stage_in_the_loop() -> None:
+def test_a_request_sets_the_segment_in_the_loop() -> None:
     controller = Controller(Settings(), shipped_skill(), urdf=URDF)
-    controller.step(Tick(0, (order("stage", "glass"),)))
-    assert controller.state["stage_belief"].argmax() == shipped_skill().model.names.index("glass")
+    controller.step(Tick(0, (order("segment", "glass"),)))
+    assert controller.state["segment_belief"].argmax() == shipped_skill().model.names.index("glass")

@@ -15,9 +15,9 @@ from thirdhand.core.frame import blank, frame_layout
 from thirdhand.core.numerics import UNPRIMED_DECIDED
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.model import LEVELS, NORMAL_RATIOS, Regions
+from thirdhand.core.skill.segmented import SegmentedKMP, Unknown
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.staged import StagedKMP, Unknown
 from thirdhand.core.skill.support import LocalErrors, error_probability
 from thirdhand.core.skill.tuning import LEAST_STD_M, UNSURE_M
 from thirdhand.recordings.shipped import shipped_skill
@@ -69,20 +69,20 @@ def test_an_error_probability_is_the_share_of_errors_beyond_each_level_and_grows
     assert error_probability(np.zeros((3, 3)), 0.0, ratios) == 0.0
 
 
-def staged(**more: object) -> StagedKMP:
+def segmented(**more: object) -> SegmentedKMP:
     model = shipped_skill().model
-    assert isinstance(model, StagedKMP)
+    assert isinstance(model, SegmentedKMP)
     return replace(model, **more)  # type: ignore[arg-type]
 
 
 def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are_uncertain() -> None:
-    known = staged(unknown=None)
+    known = segmented(unknown=None)
     count = len(known.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
-    model = staged(unknown=Unknown(FAR_STD_M, scatters))
+    model = segmented(unknown=Unknown(FAR_STD_M, scatters))
     at_last, last = known.hands[-1:], known.names[-1:]
 
-    def covariance(one: StagedKMP, hands: np.ndarray) -> np.ndarray:
+    def covariance(one: SegmentedKMP, hands: np.ndarray) -> np.ndarray:
         belief = np.zeros(64)
         belief[count - 2] = 1.0
         return one.placed.covariance(hands[0], belief)
@@ -92,9 +92,9 @@ def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are
     added = covariance(model, at_last) - covariance(known, at_last)
     assert np.diag(added) == pytest.approx([0.02, 0.03, 0.01], rel=0.2)
     assert np.abs(covariance(given, at_last) - covariance(known, at_last)).max() < 2e-3
-    few = staged(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=known.errors[known.errors[:, 2] < 0.5])
-    alone = staged(errors=few.errors, unknown=None)
-    assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this stage"
+    few = segmented(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=known.errors[known.errors[:, 2] < 0.5])
+    alone = segmented(errors=few.errors, unknown=None)
+    assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this segment"
 
 
 def test_a_skill_of_the_hands_inputs_gates_by_its_primitive_whatever_its_covariance() -> None:
@@ -116,24 +116,24 @@ def test_a_skill_of_the_hands_inputs_gates_by_its_primitive_whatever_its_covaria
 
 def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], list[bool], float]:
     """Error probabilities and flags of hands (2, 3) that rest, and the last unprimed belief in the
-    first stage."""
+    first segment."""
     settings = Settings()
-    stage, state = SkillStage(settings, skill), start_state(settings, skill)
+    segment, state = SkillStage(settings, skill), start_state(settings, skill)
     frame = blank(frame_layout(len(settings.joints.names)))
     state["hands"][:, 0], state["hand_stillness"] = hands, 1.0
     found, unsure = [], []
     for tick in range(1, ticks + 1):
         state["tick"], state["hand_ticks"] = tick, tick
-        stage.step(state, frame)
+        segment.step(state, frame)
         found.append(float(frame["error_probability"]))
         unsure.append(bool(state["unsure"]))
     return found, unsure, float(state["unprimed_belief"][0])
 
 
-def test_a_task_that_may_have_begun_in_another_stage_is_unsure_until_the_hands_tell() -> None:
+def test_a_task_that_may_have_begun_in_another_segment_is_unsure_until_the_hands_tell() -> None:
     shipped = shipped_skill()
     regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
-    model = staged()
+    model = segmented()
     begin, at = model.hands[0].reshape(2, 3), model.nominal.at.copy()
     at[2, :6] = model.hands[0]  # the hands return to where they began, and the tool is elsewhere then
     at[2, 6:] = at[0, 6:] + (0.0, 0.3, 0.0)
@@ -150,7 +150,7 @@ def test_a_task_that_may_have_begun_in_another_stage_is_unsure_until_the_hands_t
 
 def test_a_skill_without_an_alarm_has_an_error_probability_and_the_flag_that_it_had() -> None:
     shipped = shipped_skill()
-    shipped = replace(shipped, model=staged(unknown=None), regions=Regions(*shipped.regions[:3]))
+    shipped = replace(shipped, model=segmented(unknown=None), regions=Regions(*shipped.regions[:3]))
     told, unsure, decided = doubts(shipped, shipped.hands[1].reshape(2, 3), 3)
     assert 0.0 < told[-1] < 0.01
     assert not unsure[-1]

@@ -13,8 +13,8 @@ import pytest
 from support.kinds import KINDS, learned, named, takes
 from support.skills import at_rest, figures_of
 from thirdhand.core.skill.hands_kmp import HandsKMP
+from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.core.skill.skill import Prediction
-from thirdhand.core.skill.staged import StagedKMP
 from thirdhand.core.skill.task_clock import (
     CLOCK_CHANGE,
     CLOCK_RATE,
@@ -100,19 +100,24 @@ def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
 def test_the_task_begins_again_once_in_each_rest_where_it_begins() -> None:
     rows = RUNS.rows(np.stack([HOME, AWAY]))
     state, begun = np.zeros(CLOCK_SIZE), []
-    for speed, hands, stage in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
-        begun.append(count(hands, speed, 0.0, PERIOD_S, stage, rows, state))
+    for speed, hands, segment in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
+        begun.append(count(hands, speed, 0.0, PERIOD_S, segment, rows, state))
     assert np.flatnonzero(begun) == pytest.approx(50 + RUNS.home_s / PERIOD_S, abs=1)
-    for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a stage begins anew, but not the task
+    for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a segment begins anew, but not the task
         assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
     assert state[CLOCK_S] == 0.0
 
 
-def test_where_hands_began_is_kept_through_the_stages_of_a_task() -> None:
+def test_where_hands_began_is_kept_through_the_segments_of_a_task() -> None:
     rows, state = RUNS.rows(np.stack([HOME, HOME + 1.0])), np.zeros(CLOCK_SIZE)
     begun = [
-        count(hands, speed, float(speed == 0.0), PERIOD_S, stage, rows, state)
-        for speed, hands, stage, ticks in [(0.0, OWN, 0, 50), (0.3, AWAY, 0, 50), (0.3, AWAY, 1, 50), (0.0, OWN, 1, 50)]
+        count(hands, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)
+        for speed, hands, segment, ticks in [
+            (0.0, OWN, 0, 50),
+            (0.3, AWAY, 0, 50),
+            (0.3, AWAY, 1, 50),
+            (0.0, OWN, 1, 50),
+        ]
         for _ in range(ticks)
     ]
     assert np.flatnonzero(begun) == pytest.approx(150 + RUNS.home_s / PERIOD_S, abs=1)
@@ -127,7 +132,7 @@ def test_numbers_of_a_file_that_are_no_clock_are_refused() -> None:
 
 def clock(skill: StoredSkill) -> TaskClock | None:
     """The clock that is an input of a skill's model, if there is one."""
-    assert isinstance(skill.model, HandsKMP | StagedKMP)
+    assert isinstance(skill.model, HandsKMP | SegmentedKMP)
     return skill.model.clock if skill.model.is_timed else None
 
 
@@ -141,8 +146,8 @@ def test_the_intake_finds_when_hands_begin_to_move() -> None:
 
 @pytest.mark.parametrize(
     ("kind_of_takes", "says", "late_s", "error_mm"),
-    [(takes, "timetable", 6.0, 30.0), (named, "anew in each stage", 7.0, 20.0)],
-    ids=["one clock", "in each stage"],
+    [(takes, "timetable", 6.0, 30.0), (named, "anew in each segment", 7.0, 20.0)],
+    ids=["one clock", "in each segment"],
 )
 @pytest.mark.thorough
 def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else(
@@ -187,10 +192,10 @@ def test_each_round_of_a_session_is_predicted_as_the_first_one(kind: str) -> Non
         assert (again.held or 0) - (first.held or 0) <= 0.03 * first.samples
 
 
-def test_a_clock_starts_anew_in_each_stage_with_the_next_motion() -> None:
+def test_a_clock_starts_anew_in_each_segment_with_the_next_motion() -> None:
     rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(CLOCK_SIZE), []
-    for speed, stage in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
-        count(AWAY, speed, float(speed == 0.0), PERIOD_S, stage, rows, state)
+    for speed, segment in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
+        count(AWAY, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)
         seconds.append(state[CLOCK_S])
     assert seconds[199] == pytest.approx(1.9, abs=0.05)
     assert not any(seconds[200:300])

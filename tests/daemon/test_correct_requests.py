@@ -29,7 +29,7 @@ def held(cell: Cell, taught: Skill) -> Cell:
     cell.client.add(PLACES)
     state, hands = cell.state, taught.model.hands
     state["tick"], state["arm_tick"], state["held_tick"], state["guided_tick"] = 1000, 1000, 900, 990
-    state["operator_hold"], state["held"], state["held_stage"] = 1, HELD_SEEN, 0
+    state["operator_hold"], state["held"], state["held_segment"] = 1, HELD_SEEN, 0
     state["held_hands"] = (0.5 * (hands[0] + hands[1])).reshape(2, 3)
     state["measured"] = cell.settings.arm.posture
     state["measured"][0] += 0.2
@@ -48,9 +48,9 @@ def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> N
         ({"guided_tick": 899}, ADD, "the arm was not led in this hold"),
         ({"arm_tick": 500}, ADD, "the arm's joints are not measured now"),
         ({"measured_velocities": 0.3}, ADD, "the arm moves at 0.30 rad/s; 0.05 rad/s accepted"),
-        ({"held_stage": -1}, ADD, "the stage of the task was not known"),
+        ({"held_segment": -1}, ADD, "the segment of the task was not known"),
         ({}, ADD | {"tool": right}, "the tool is 0 mm from where the skill has it for these hands; 5 mm or more"),
-        ({"held_hands": 0.3}, ADD, "the distance of a hand from its segments is "),
+        ({"held_hands": 0.3}, ADD, "the distance of a hand from its paths is "),
         ({}, ADD | {"tool": [0.5, 0.0, 2.0]}, "$.tool: [0.5, 0.0, 2.0] outside the skill's workspace"),
         ({}, ADD | {"tool": [0.6, 0.0, -0.02]}, "$.tool: [0.6, 0.0, -0.02]"),
         (
@@ -93,8 +93,8 @@ def test_a_correction_is_made_in_its_own_hold_alone(
 def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> None:
     first = held.client.correct()
     assert first.correction is not None
-    assert (first.correction.name, first.correction.stage) == ("correction-1", ("start", "handover"))
-    assert held.kinds()[-2:] == ["skill", "stage"]  # the stage of the hold, whatever the hand did that led
+    assert (first.correction.name, first.correction.segment) == ("correction-1", ("start", "handover"))
+    assert held.kinds()[-2:] == ["skill", "segment"]  # the segment of the hold, whatever the hand did that led
     one = held.client.places()
     held.state["measured"][0] += 0.1
     second = held.client.correct()

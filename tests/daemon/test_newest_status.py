@@ -58,8 +58,8 @@ def shown(status: dict[str, Any], request: str, reply: dict[str, Any]) -> bool:
     """Whether a status shows what a request did."""
     if request in ("hold", "resume", "reset"):
         return status["tick"] >= reply["tick"] and (status["reason"] == "operator") == (request == "hold")
-    if request == "stage":
-        return bool(status["stage"]) and status["stage"][0] == "glass"
+    if request == "segment":
+        return bool(status["segment"]) and status["segment"][0] == "glass"
     return status["places"] == [point["name"] for point in reply["points"]]
 
 
@@ -70,7 +70,7 @@ REQUESTS: list[tuple[str, dict[str, Any]]] = [
     ("hold", {}),
     ("reset", {}),
     ("resume", {}),
-    ("stage", {"name": "glass"}),
+    ("segment", {"name": "glass"}),
     ("via_points", {"op": "add", "points": PLACES[:1]}),
     ("via_points", {"op": "remove", "names": [PLACES[0]["name"]]}),
     ("via_points", {"op": "add", "points": PLACES[1:2]}),
@@ -105,7 +105,7 @@ def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -
                     time.sleep(0.01)
                 assert all(one["tick"] >= reply["tick"] for one in published[before:]), request
                 status = published[before]
-                if request != "stage":  # which the hands tell anew
+                if request != "segment":  # which the hands tell anew
                     assert all(shown(one, request, reply) for one in published[before:]), request
             assert shown(status, request, reply), (request, status)
             time.sleep(0.013 * round_ % 0.1)  # at every phase of the published ones

@@ -25,12 +25,12 @@ TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
 
 
 def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Every request to a daemon, one of them in a hold for hands in a stage of its task."""
+    """Every request to a daemon, one of them in a hold for hands in a segment of its task."""
     client = daemon.client
     first = PLACES[0]
     yield "add", lambda: client.add(PLACES)
     hands.left, hands.right = first.left, first.right
-    yield "stage", lambda: client.set_stage(first.name)
+    yield "segment", lambda: client.set_segment(first.name)
     daemon.until(lambda status: status["mode"] == "follow", 60.0)
     yield "hold", client.hold
     x, y, z = daemon.until(lambda status: status["target_m"] is not None)["target_m"]
@@ -59,8 +59,8 @@ def commands_in(folder: Path) -> Iterator[str]:
         write_demonstration(path, visits(number))
     first, second = (" ".join(map(str, paths)) for paths in (visited[:3], visited[3:]))
     yield f"learn {TAKES} --output {folder}/plain.npz"
-    yield f"learn {first} --output {folder}/staged.npz"
-    yield f"learn --from {folder}/staged.npz {second} --output {folder}/refined.npz"
+    yield f"learn {first} --output {folder}/segmented.npz"
+    yield f"learn --from {folder}/segmented.npz {second} --output {folder}/refined.npz"
     yield f"replay {RECORDINGS}/golden.mcap --output {folder}/whole.mcap"
     yield f"report {folder}/whole.mcap"
     yield "bench --seconds 0.5"

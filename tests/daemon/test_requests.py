@@ -214,7 +214,7 @@ def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) ->
     assert taught_cell.kinds()[-1] == "hold"
 
 
-# --- skills and stages ---
+# --- skills and segments ---
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
@@ -278,18 +278,18 @@ def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_pa
     assert cell.failures == []
 
 
-def test_the_stage_of_the_task_is_told_by_client_and_command(
+def test_the_segment_of_the_task_is_told_by_client_and_command(
     cell: Cell, sessions: tuple[zenoh.Session, zenoh.Session], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "There are: start, handover, glass, soldering" in cell.refusal("stage", {"name": "elsewhere"})
-    reply = cell.client.set_stage("glass")
-    assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "stage")
-    command = ["stage", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
+    assert "There are: start, handover, glass, soldering" in cell.refusal("segment", {"name": "elsewhere"})
+    reply = cell.client.set_segment("glass")
+    assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "segment")
+    command = ["segment", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
     for mode, reason, told in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
         cell.mode, cell.reason = mode, reason
         assert main(command) == 0
         assert re.search(rf"^at soldering since tick \d+: {re.escape(told)}$", capsys.readouterr().out, re.MULTILINE)
-    assert cell.kinds()[-3:] == ["stage"] * 3
+    assert cell.kinds()[-3:] == ["segment"] * 3
 
 
 def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a_warning(

@@ -1,4 +1,4 @@
-"""Saved state: via-points and the stage of the task survive a restart, whole or not at all."""
+"""Saved state: via-points and the segment of the task survive a restart, whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from support.cell import serving
 from thirdhand.cli.usage import added_in
 from thirdhand.contract.requests import RequestError
 from thirdhand.core.skill.skill import Skill
-from thirdhand.daemon.saved_stage import MAX_RESTART_S, SavedStage
+from thirdhand.daemon.saved_segment import MAX_RESTART_S, SavedSegment
 from thirdhand.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.single_instance import state_folder
@@ -95,7 +95,7 @@ def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
         assert unreached.read(skill) == ((), 0.03)
         assert re.search("cannot be set aside .*File too large", unreached.remark)
         with pytest.raises(OSError, match="File too large"):
-            SavedStage(settings).keep(skill, (POINTS[0].name, POINTS[1].name), 1.0)
+            SavedSegment(settings).keep(skill, (POINTS[0].name, POINTS[1].name), 1.0)
         mesh_cover._keep("capsule", (1.0,) * 7)  # noqa: SLF001
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -205,7 +205,7 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
     assert saved.read(skill) == (POINTS, 0.03)
 
 
-# --- the stage of the task ---
+# --- the segment of the task ---
 
 
 @pytest.fixture
@@ -214,17 +214,17 @@ def settings(tmp_path: Path) -> Settings:
 
 
 def test_it_is_kept_for_its_skill_and_for_a_while(settings: Settings, skill: Skill, tmp_path: Path) -> None:
-    saved = SavedStage(settings)
+    saved = SavedSegment(settings)
     assert saved.read(skill) == ""
     saved.keep(skill, ("handover", "glass"), 0.9)
     saved.keep(skill, ("start", "handover"), 0.4)
-    assert SavedStage(settings).read(skill) == "handover"
+    assert SavedSegment(settings).read(skill) == "handover"
     others = replace(skill, learned_from="others")
     assert saved.read(others) == ""
     for loaded in (others, skill):  # a skill may be loaded at a via-point that another one has too
         saved.keep(loaded, ("handover", "glass"), 0.9)
-        assert SavedStage(settings).read(loaded) == "handover"
-    file = tmp_path / "lab/bench2/stage.json"
+        assert SavedSegment(settings).read(loaded) == "handover"
+    file = tmp_path / "lab/bench2/segment.json"
     assert [one.name for one in file.parent.iterdir()] == [file.name]
     old = file.stat().st_mtime - MAX_RESTART_S - 1.0
     os.utime(file, (old, old))
@@ -265,12 +265,12 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
     how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = state_folder(settings)
-    saved_points, stage = SavedViaPoints(settings), folder / "stage.json"
-    for path in (stage, saved_points.path(skill)):
+    saved_points, segment = SavedViaPoints(settings), folder / "segment.json"
+    for path in (segment, saved_points.path(skill)):
         damage(path, how)
-    assert SavedStage(settings).read(skill) == ""
+    assert SavedSegment(settings).read(skill) == ""
     assert saved_points.read(skill) is None
-    for path in (stage, saved_points.path(skill)):
+    for path in (segment, saved_points.path(skill)):
         (reason,) = re.findall(rf"{path} cannot be used: (.*); the file is kept", caplog.text)
         assert reason in REASONS.get(how, (NOT_OURS,))
         assert not os.path.lexists(path)
@@ -279,26 +279,26 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
         assert os.path.lexists(aside)
         assert not isinstance(how, bytes) or aside.read_bytes() == how
     assert saved_points.read(skill) is None  # once is enough
-    SavedStage(settings).keep(skill, ("handover", "glass"), 0.9)
-    assert SavedStage(settings).read(skill) == "handover"
+    SavedSegment(settings).keep(skill, ("handover", "glass"), 0.9)
+    assert SavedSegment(settings).read(skill) == "handover"
 
 
 def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path: Path, skill: Skill) -> None:
     settings = Settings(files=Files(state=str(tmp_path / "state")))
     folder, points = state_folder(settings), SavedViaPoints(settings).path(skill)
-    for path in (folder / "stage.json", points, folder / "daemon.lock"):
+    for path in (folder / "segment.json", points, folder / "daemon.lock"):
         damage(path, DEEP)
     with serving(tmp_path, "--joints", "assumed") as daemon:
         log = daemon.log.read_text()
         assert "Traceback" not in log
-        assert f"{folder / 'stage.json'} cannot be used" in log
+        assert f"{folder / 'segment.json'} cannot be used" in log
         assert f"{points} cannot be used" in log
-        assert daemon.client.status().stage == ()
-        assert daemon.client.set_stage("glass").mode == "hold"
-        assert daemon.until(lambda now: (folder / "stage.json").exists() and now["stage"])["stage_belief"] == 1.0
+        assert daemon.client.status().segment == ()
+        assert daemon.client.set_segment("glass").mode == "hold"
+        assert daemon.until(lambda now: (folder / "segment.json").exists() and now["segment"])["segment_belief"] == 1.0
     with serving(tmp_path, "--joints", "assumed") as daemon:
         assert "cannot be used" not in daemon.log.read_text()
-        assert daemon.until(lambda now: bool(now["stage"]))["stage"] == ["glass", "soldering"]
+        assert daemon.until(lambda now: bool(now["segment"]))["segment"] == ["glass", "soldering"]
         said = daemon.log.read_text()
         assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
         assert daemon.end() == 0

@@ -90,26 +90,26 @@ def test_the_picture_is_one(good: list[Demonstration], tmp_path: Path) -> None:
     learn(good, points=80, show=seen.append)
     draw(seen[0], tmp_path / "skill.png")
     assert (tmp_path / "skill.png").read_bytes().startswith(b"\x89PNG")
-    assert not [axes for axes in drawn(seen[0]).axes if "stage" in axes.get_title()]
+    assert not [axes for axes in drawn(seen[0]).axes if "segment" in axes.get_title()]
 
 
-def test_the_picture_shows_the_stages_of_a_demonstration_and_what_was_predicted_of_its_errors() -> None:
+def test_the_picture_shows_the_segments_of_a_demonstration_and_what_was_predicted_of_its_errors() -> None:
     seen: list[Evidence] = []
     learn(made("cyclic", range(2)), show=seen.append)
     by_title = {axes.get_title(): axes for axes in drawn(seen[0]).axes}
-    (stages,) = (axes for title, axes in by_title.items() if "stage" in title)
-    name = stages.get_title().split(",")[0]
+    (segments,) = (axes for title, axes in by_title.items() if "segment" in title)
+    name = segments.get_title().split(",")[0]
     h = [row.name for row in seen[0].figures.demonstrations].index(name)
-    labels = [text.get_text() for text in stages.get_legend().get_texts()]
+    labels = [text.get_text() for text in segments.get_legend().get_texts()]
     told = ["1: start → left out", "2: left out → work", "3: work → left out again"]
     assert labels == [*told, "error of the predicted tool", "expected before calibration"]
-    off, predicted = (np.asarray(line.get_ydata()) for line in stages.get_lines())
+    off, predicted = (np.asarray(line.get_ydata()) for line in segments.get_lines())
     row = seen[0].figures.demonstrations[h]
     assert np.sqrt(np.mean(off**2)) == pytest.approx(row.error_mm)
     belief = seen[0].held_out[h].belief
     assert belief is not None
     likely = belief.argmax(axis=1)
-    shown = [patch for patch in stages.patches if patch.get_alpha()]
+    shown = [patch for patch in segments.patches if patch.get_alpha()]
     assert len(shown) == 1 + np.count_nonzero(np.diff(likely))
     # what is predicted is of the tool, not how far hands are off their ways
     (line,) = (line for line in by_title["error of the predicted tool"].get_lines() if "expected" in line.get_label())

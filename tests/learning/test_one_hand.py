@@ -16,7 +16,7 @@ from support.spoiled import Streams, streams_of, write_streams
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import Hands, ViaPoint
 from thirdhand.core.frame import Records, Tick
-from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
@@ -105,7 +105,7 @@ def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() ->
         take = made("one_hand", [seed], each=1)[0]
         shown.append(take._replace(right=take.left, conducts="left"))
     learnt = learn(shown)
-    assert isinstance(learnt.model, StagedKMP)
+    assert isinstance(learnt.model, SegmentedKMP)
     assert learnt.conductor == 0
     aimed = adapted(learnt, shown[0].places, tolerance=0.05)
     for point in shown[0].places:

@@ -12,7 +12,7 @@ from support.skills import figures_of, made
 from thirdhand.skills.demonstration import Demonstration, persons
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods.staged import is_clear
+from thirdhand.workbench.learning.methods.segmented import is_clear
 from thirdhand.workbench.learning.takes import takes_of
 
 

@@ -10,8 +10,8 @@ import pytest
 from support.circling import circling
 from support.skills import figures_of, made
 from thirdhand.core.frame import Vector
-from thirdhand.core.skill.staged import StagedKMP
-from thirdhand.core.skill.stages import LEFT
+from thirdhand.core.skill.segmented import SegmentedKMP
+from thirdhand.core.skill.segments import LEFT
 from thirdhand.skills.demonstration import Demonstration, NamedDemonstration
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
 from thirdhand.skills.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
@@ -76,7 +76,9 @@ def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_their
     assert sorted(row.name for row in both.demonstrations) == ["a", "b", "c", "d"]
     assert both.weights_mm[both.weight] < both.weights_mm["1"]
     assert both.delay_s is not None
-    with pytest.raises(SkillError, match=r"demonstration 1 has the via-points \(none\): stage 1, .* needed, as in the"):
+    with pytest.raises(
+        SkillError, match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the"
+    ):
         learn([one._replace(places=()) for one in mine[:2]], refined=skill)
 
 
@@ -122,6 +124,6 @@ def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
 def test_which_hand_leads_is_chosen_over_all_takes_and_not_by_three_of_one_person() -> None:
     of_others = learn(made("path", range(4)), name="others")
     mine = learn(made("path", [32], each=3), name="mine", refined=of_others)
-    assert isinstance(of_others.model, StagedKMP)
-    assert isinstance(mine.model, StagedKMP)
+    assert isinstance(of_others.model, SegmentedKMP)
+    assert isinstance(mine.model, SegmentedKMP)
     assert mine.model.task.leads == of_others.model.task.leads == LEFT

@@ -131,8 +131,8 @@ def test_unsure_is_told_from_where_the_region_reaches_too_far_and_does_not_flick
     def told(times: float) -> bool:
         """Whether it is, with regions that reach so many times as far as is told of."""
         state["covariance"] = np.eye(3) * (times * UNSURE_M) ** 2 / REGION_95
-        stage = SkillStage(settings, replace(skill, regions=Regions(1.0)))
-        stage.step(state, frame)
+        segment = SkillStage(settings, replace(skill, regions=Regions(1.0)))
+        segment.step(state, frame)
         assert np.sqrt(REGION_95 * np.linalg.eigvalsh(frame["covariance"])[-1]) == pytest.approx(times * UNSURE_M)
         return bool(state["unsure"])
 

@@ -51,7 +51,7 @@ from thirdhand.workbench.report.report import (
     reported,
     why_missed,
 )
-from thirdhand.workbench.report.stages import LEAST_S
+from thirdhand.workbench.report.segments import LEAST_S
 from thirdhand.workbench.report.tables import tables, verdict
 from thirdhand_sim.golden import (
     AWAY_S,
@@ -198,7 +198,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     asked = held[Reason.OPERATOR]
     assert (asked.why, asked.remedy) == ("an operator requested a hold, or the daemon was stopped", "thirdhand resume")
     far = re.fullmatch(
-        r"the distance of a hand from its segments is (.*) cm, 11.0 accepted",
+        r"the distance of a hand from its paths is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
     )
     assert far is not None
@@ -248,17 +248,21 @@ def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_we
     assert again.hands_m > 0.03
 
 
-def test_the_stages_of_a_task_are_told_in_their_order(session: Report) -> None:
-    assert session.stages[0].start_s < 0.5
-    assert [one.name for one in session.stages][:3] == ["start to handover", "handover to glass", "glass to soldering"]
-    for one, after in itertools.pairwise(session.stages):
+def test_the_segments_of_a_task_are_told_in_their_order(session: Report) -> None:
+    assert session.segments[0].start_s < 0.5
+    assert [one.name for one in session.segments][:3] == [
+        "start to handover",
+        "handover to glass",
+        "glass to soldering",
+    ]
+    for one, after in itertools.pairwise(session.segments):
         assert one.name != after.name
         assert one.start_s + one.lasts_s <= after.start_s + 1e-9
     frames = session.columns.frames
-    for one in session.stages:
+    for one in session.segments:
         assert one.lasts_s > LEAST_S
         at = int((one.start_s + one.lasts_s / 2) / PERIOD_S)
-        assert one.probable == pytest.approx(frames["stage_belief"][at], abs=0.5)
+        assert one.probable == pytest.approx(frames["segment_belief"][at], abs=0.5)
 
 
 def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:
@@ -434,7 +438,7 @@ def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page
 def test_a_thin_recording_is_reported_as_one_with_all_frames_is(golden: Path, tmp_path: Path) -> None:
     whole, found = (reported(path) for path in (golden, thin(golden, tmp_path / "thin.mcap")))
     frames, others = whole.columns.frames, found.columns.frames
-    for name in ("tick", "mode", "reason", "flags", "commanded", "stage"):
+    for name in ("tick", "mode", "reason", "flags", "commanded", "segment"):
         np.testing.assert_array_equal(others[name], frames[name])
     assert [span[:4] for span in found.spans] == [span[:4] for span in whole.spans]
     assert found.limits == whole.limits

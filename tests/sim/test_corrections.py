@@ -76,9 +76,9 @@ def test_a_tool_that_was_led_goes_there_from_then_on_and_back_when_it_is_undone(
         answer = told("correct", "--connect", daemon.endpoint)
         assert answer.returncode == 0, answer.stderr
         assert answer.stdout.startswith("correction-1 in force since tick "), answer.stdout
-        assert "in the stage start -> handover" in answer.stdout
+        assert "in the segment start -> handover" in answer.stdout
         (point,) = daemon.client.places()
-        assert (point.name, point.stage, point.corrections) == ("correction-1", "start", 1)
+        assert (point.name, point.segment, point.corrections) == ("correction-1", "start", 1)
         np.testing.assert_allclose(point.left, HALFWAY, atol=5e-3)
         np.testing.assert_allclose(point.tool, tool, atol=NEAR_M)
         assert point.missed_by_m < 1e-3

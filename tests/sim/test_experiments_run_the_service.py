@@ -20,15 +20,15 @@ from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Tick
 from thirdhand.core.skill.model import NORMAL
+from thirdhand.core.skill.segmented import SegmentedKMP
+from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.skill import Skill
-from thirdhand.core.skill.staged import StagedKMP
-from thirdhand.core.skill.stages import MOST_STAGES
 from thirdhand.recordings.shipped import recordings, shipped_skill
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods import staged
+from thirdhand.workbench.learning.methods import segmented
 from thirdhand_sim.lab import rehearsal
 from thirdhand_sim.lab.open_loop import targets
 from thirdhand_sim.lab.people.moving_hands import stops
@@ -122,14 +122,14 @@ class TestPeople:
     def test_a_rival_that_predicts_as_ours_gets_the_target_that_ours_has(
         self, shown: Seen, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Of one stage and without a clock, so that nothing before makes a difference."""
-        monkeypatch.setattr(staged, "CLOCKS", {})
+        """Of one segment and without a clock, so that nothing before makes a difference."""
+        monkeypatch.setattr(segmented, "CLOCKS", {})
         of_two = [one._replace(places=(one.places[0], one.places[2])) for one in by_people(3)]
         learned = learn(of_two)
-        assert isinstance(learned.model, StagedKMP)
+        assert isinstance(learned.model, SegmentedKMP)
         assert not learned.model.is_timed
         exact = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
-        placed, belief = exact.model.placed, np.eye(1, MOST_STAGES)[0]
+        placed, belief = exact.model.placed, np.eye(1, MOST_SEGMENTS)[0]
 
         class Copy:
             """Our means and covariances as a rival's: only how they move is the experiments'."""
@@ -203,5 +203,5 @@ def test_an_open_loop_target_is_where_the_controller_leads_the_tool(file: str) -
     for row, target in zip(rows, targets(known, rows), strict=True):
         at = list(zip(SIDES, row.reshape(2, 3).tolist(), strict=True))
         ticks = [Tick(k, tuple(sample(side, x, 1 + k) for side, x in at)) for k in range(500)]
-        wanted = of_the_service(known, ticks, ASSUMED)["target"]  # which stage it is it believes in time
+        wanted = of_the_service(known, ticks, ASSUMED)["target"]  # which segment it is it believes in time
         np.testing.assert_allclose(wanted[-1], target, atol=0.51e-6 if file != "soldering.npz" else 0.004)

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from thirdhand.cli.usage import places_in
 from thirdhand.contract import cdr, messages
-from thirdhand.core.skill.stages import NONE
+from thirdhand.core.skill.segments import NONE
 from thirdhand.workbench.learning.division import off_via_point
 from thirdhand_sim import teach
 from thirdhand_sim.scene import Scene

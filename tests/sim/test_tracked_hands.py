@@ -25,8 +25,8 @@ TIMEOUT_S = 40.0
 class Player:
     """A person who moves one hand at a time to the places that the bench shows."""
 
-    def __init__(self, hands: TrackedHands, *, stages: int) -> None:
-        self._hands, self._stages = hands, stages
+    def __init__(self, hands: TrackedHands, *, segments: int) -> None:
+        self._hands, self._stages = hands, segments
         self._at: dict[str, Point] = {"left": SCENE.left_start, "right": SCENE.right_start}
         self.shown: list[str] = []
 
@@ -44,12 +44,12 @@ class Player:
             self._hands.receive(side, PoseStamped(1, BASE, at, HAND_ORIENTATION))
 
 
-def played(*, stages: int) -> tuple[TaskEvents, list[str], TrackedHands]:
+def played(*, segments: int) -> tuple[TaskEvents, list[str], TrackedHands]:
     """The events when a person goes to the first places only, what was shown, and the hands."""
     settings = msgspec.structs.replace(Settings(), rate_hz=100)
     controller = Controller(settings, taught(), urdf=robot_description(settings))
     hands = TrackedHands(SCENE, settings, timeout_s=TIMEOUT_S)
-    player = Player(hands, stages=stages)
+    player = Player(hands, segments=segments)
     with Bench(hands, settings=settings) as bench:
         loop = ClosedLoop(bench, direct=player.direct)
         for tick in loop.ticks():
@@ -58,16 +58,16 @@ def played(*, stages: int) -> tuple[TaskEvents, list[str], TrackedHands]:
 
 
 def test_one_hand_after_the_other_plays_the_whole_task() -> None:
-    events, shown, hands = played(stages=5)
+    events, shown, hands = played(segments=5)
     assert events.success
     assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 5.0
-    assert shown == [f"{side} hand: {task}" for stage in hand_places(SCENE) for side, _, task in stage]
+    assert shown == [f"{side} hand: {task}" for segment in hand_places(SCENE) for side, _, task in segment]
     assert hands.places() == ()
     assert events.carry.time_s < hands.duration_s < TIMEOUT_S
 
 
 def test_a_person_who_stops_after_the_handover_misses_the_rest_at_the_time_out() -> None:
-    events, _, hands = played(stages=1)
+    events, _, hands = played(segments=1)
     assert [event.reached for event in (events.handover, events.grasp, events.carry)] == [True, False, False]
     assert events.grasp.error_mm == math.inf
     assert hands.duration_s == TIMEOUT_S

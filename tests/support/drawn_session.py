@@ -68,8 +68,9 @@ class Played(NamedTuple):
 
 @cache
 def skills() -> dict[str, Skill]:
-    """Skills by name: shipped, with via-points in several places, with random ones, without stages,
-    one of a made task, and two that are followed however far hands are from what was demonstrated.
+    """Skills by name: shipped, with via-points in several places, with random ones, without
+    segments, one of a made task, and two that are followed however far hands are from what was
+    demonstrated.
     """
     random, base = np.random.default_rng(5), shipped_skill()
     paper = RECORDINGS / "experiments" / "as-paper.npz"
@@ -279,7 +280,7 @@ class _Player:
             out.append(order("resume"))
         names = getattr(self.controller.skill.model, "names", ())
         if names and random.random() < 0.0005:
-            out.append(order("stage", str(random.choice(names))))
+            out.append(order("segment", str(random.choice(names))))
         if self.skill_every and number % self.skill_every == 0:
             out.append(Event("skill", b"", skills()[str(random.choice(self.changes_to))]))
         return out

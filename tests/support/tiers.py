@@ -33,7 +33,7 @@ LONGEST_FIRST = (
     "cli/test_view_live.py",
     "daemon/test_start.py",
     "cli/test_doctor.py",
-    "learning/test_staged_tasks.py",
+    "learning/test_segmented_tasks.py",
 )
 
 

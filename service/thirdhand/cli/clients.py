@@ -1,4 +1,4 @@
-"""`thirdhand via-points`, `stage`, `correct`, `hold`, `resume`, `reset`: requests to a daemon."""
+"""`thirdhand via-points`, `segment`, `correct`, `hold`, `resume`, `reset`: requests to a daemon."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def via_points(args: argparse.Namespace) -> int:
             missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
         if point["gripper"]:
             missed += f", gripper {point['gripper']}"
-        if point["stage"]:
-            missed += f", in the stage from {point['stage']} on"
+        if point["segment"]:
+            missed += f", in the segment from {point['segment']} on"
         if point["corrections"]:
             missed += f", corrected {point['corrections']} time{'s' * (point['corrections'] != 1)}"
         print(f"{point['name']:<16} tool {tool}   {missed}")
@@ -72,9 +72,9 @@ def _add(args: argparse.Namespace) -> Any:
     return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
 
 
-def stage(args: argparse.Namespace) -> int:
+def segment(args: argparse.Namespace) -> int:
     """Report the reached via-point and print the resulting mode; exit code 0."""
-    reply = ask(args, "stage", {"name": args.name})
+    reply = ask(args, "segment", {"name": args.name})
     mode, reason = (reply.get(name, "") for name in ("mode", "reason"))
     print(f"at {args.name} since tick {reply['tick']}: {in_brief(mode, reason)}")
     return 0

@@ -96,14 +96,14 @@ def via_points(add: House) -> None:
     reach(described(actions, "clear", "remove all via-points", f"{example} clear"))
 
 
-def stage(add: House) -> None:
-    """Options of `stage`."""
+def segment(add: House) -> None:
+    """Options of `segment`."""
     c = reach(
         add(
-            "stage",
+            "segment",
             "Reports to a running daemon that the task has reached a via-point.",
-            "thirdhand stage handover",
-            run="clients.stage",
+            "thirdhand segment handover",
+            run="clients.segment",
         )
     )
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
@@ -154,4 +154,4 @@ def holding(add: House) -> None:
     reach(add("reset", "Ends a fault.", "thirdhand reset", run="clients.reset"))
 
 
-RUN_TIME = (follow, serve, via_points, stage, correct, status, doctor, holding)
+RUN_TIME = (follow, serve, via_points, segment, correct, status, doctor, holding)

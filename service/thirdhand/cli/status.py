@@ -154,7 +154,7 @@ def rows(now: Status) -> dict[str, str]:
         else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "led by hand": "yes, as the arm's driver reports" if now.guided else "",
         "offer": now.offer,
-        "stage": f"{' -> '.join(now.stage)}, {now.stage_belief:.0%} probable" if now.stage else "",
+        "segment": f"{' -> '.join(now.segment)}, {now.segment_belief:.0%} probable" if now.segment else "",
         "turned": _turned(now),
         "tool's limits": "; ".join(f"{where} {limits.text}" for where, limits in now.tool_limits.items()),
         "limited by": now.binding,

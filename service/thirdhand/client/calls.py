@@ -70,9 +70,9 @@ class Client:
         """End a fault; returns once that is in force."""
         return self._typed("reset", None, Reply)
 
-    def set_stage(self, name: str) -> Reply:
+    def set_segment(self, name: str) -> Reply:
         """Report that the task has reached this via-point; returns once that is in force."""
-        return self._typed("stage", requests.StageRequest(name), Reply)
+        return self._typed("segment", requests.SegmentRequest(name), Reply)
 
     def status(self) -> Status:
         """The daemon's status."""

@@ -130,9 +130,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "joint limits or things around the arm keep the tool from its target",
             "wait while the arm looks for a way out and takes it; if it finds none, move the hands: it tries again "
             "with another target"),
-        Incident(Reason.AMBIGUOUS, Mode.HOLD, "stage of the task unclear",
-            "the hands fit two stages of the task, with the tool at different positions",
-            "continue, as the hands will show which stage it is; or name it by `thirdhand stage NAME`"),
+        Incident(Reason.AMBIGUOUS, Mode.HOLD, "segment of the task unclear",
+            "the hands fit two segments of the task, with the tool at different positions",
+            "continue, as the hands will show which segment it is; or name it by `thirdhand segment NAME`"),
         Incident(Condition.HANDS_TOO_RARE, None, "hands arrive too rarely",
             "more than {hands.stale_ms ms}, or `[hands] stale_max_ms` if longer, pass between samples of a hand",
             "publish hands more often, or raise `[hands] stale_ms`; or `[hands] stale_max_ms` if they come in bursts"),

@@ -36,8 +36,8 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `follow`. `orientation` is the tool's, a quaternion x y z w of norm 1; `gripper` opens or closes
     the gripper there. Both apply to the neighbourhood too.
 
-    With a `stage`, the name of a via-point of the task at which a stage begins, the via-point moves
-    the tool in that stage only. `corrections` is the number of corrections that led to it.
+    With a `segment`, the name of a via-point of the task at which a segment begins, the via-point
+    moves the tool in that segment only. `corrections` is the number of corrections that led to it.
     """
 
     name: Name
@@ -49,7 +49,7 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     follow: Literal["none", "left", "right"] = "none"
     orientation: Orientation | None = None
     gripper: Literal["open", "closed"] | None = None
-    stage: Name | None = None
+    segment: Name | None = None
     corrections: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 0
 
     def __post_init__(self) -> None:
@@ -100,7 +100,7 @@ class SkillRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"\A\w[\w .-]*\Z", extra=_NAMES)]
 
 
-class StageRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SegmentRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State that the task has reached the via-point of this name."""
 
     name: Name
@@ -159,17 +159,17 @@ class Correction(msgspec.Struct, frozen=True):
     name: str
     moved_m: float
     reach_m: float
-    stage: tuple[str, ...] = ()  # the via-points at which its stage begins and ends; empty: in the whole skill
+    segment: tuple[str, ...] = ()  # the via-points at which its segment begins and ends; empty: in the whole skill
     corrections: int = 1  # number of corrections at these hands
     undone: bool = False
 
     @property
     def text(self) -> str:
         """The correction in words."""
-        stage = f" in the stage {' -> '.join(self.stage)}" if self.stage else ""
+        segment = f" in the segment {' -> '.join(self.segment)}" if self.segment else ""
         effect = "no longer moves" if self.undone else "moves"
         return (
-            f"it {effect} the tool by {100 * self.moved_m:.1f} cm{stage} at these hands, and by half of that or more "
+            f"it {effect} the tool by {100 * self.moved_m:.1f} cm{segment} at these hands, and by half of that or more "
             f"while a hand is less than {100 * self.reach_m:.0f} cm away"
         )
 
@@ -318,8 +318,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     turn_std_rad: float | None = None  # standard deviation of the target's orientation; None: not learned
     gripper: str = ""  # commanded, `open` or `closed`; empty: the skill has no gripper
     closure: float | None = None  # predicted closure of the gripper, 0 to 1
-    stage: tuple[str, ...] = ()  # the via-points at which the stage begins and ends; empty: unknown
-    stage_belief: float = 0.0  # probability of that stage
+    segment: tuple[str, ...] = ()  # the via-points at which the segment begins and ends; empty: unknown
+    segment_belief: float = 0.0  # probability of that segment
     task_clock_s: float | None = None  # time since the hands began the task; None: the skill has no clock
     error_probability: float | None = None  # probability that the tool belongs more than 10 cm from its target
     deviation_m: float | None = None  # deviation of the hands from what the skill knows

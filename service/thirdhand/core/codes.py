@@ -18,7 +18,7 @@ class Condition(enum.IntFlag):
     RIGHT_UNSEEN = 32  # the right hand is out of sight for a moment; the left hand is seen
     ARM_INSIDE = 64  # a part of the arm is inside of a thing, or of another part
     ONE_HAND = 128  # the leading hand is seen; the second hand was never seen, or has disappeared
-    STAGE_AMBIGUOUS = 256  # the stage of the task is not known
+    SEGMENT_AMBIGUOUS = 256  # the segment of the task is not known
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
     CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
     ARM_GUIDED = 2048  # the arm's driver reports that the arm is led by hand
@@ -95,7 +95,7 @@ class ClockTrust(enum.IntEnum):
 HANDS_KNOWN, ARM_HEARD, ARM_STILL = int(Condition.HANDS), int(Condition.ARM_HEARD), int(Condition.ARM_STILL)
 CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
 ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
-STAGE_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.STAGE_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
+SEGMENT_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.SEGMENT_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
 CLUTCH_RELEASED, ARM_GUIDED = int(Condition.CLUTCH_RELEASED), int(Condition.ARM_GUIDED)
 SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
 ALTERNATIONS = tuple(int(order) for order in Alternation)

@@ -31,7 +31,7 @@ from thirdhand.core.codes import (
     HANDS_KNOWN,
     ONE_HAND,
     READY,
-    STAGE_AMBIGUOUS,
+    SEGMENT_AMBIGUOUS,
     STARTS_MEASURED,
     UNSEEN,
     UNSEEN_HAND_NEEDED,
@@ -150,7 +150,7 @@ class Controller:
         unseen = UNSEEN.index(side) if (side := conditions & EITHER_UNSEEN) else None
         wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
         if wanted is not None:
-            conditions |= STAGE_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
+            conditions |= SEGMENT_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
         lap("skill")
         here = self._decide(frame, conditions, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
@@ -179,8 +179,8 @@ class Controller:
                 samples.append(event)
             elif event.kind == "skill":
                 self._adopt(event.value)
-            elif event.kind == "stage":
-                self._skill.set_stage(state, cdr.decode_string(event.payload))
+            elif event.kind == "segment":
+                self._skill.set_segment(state, cdr.decode_string(event.payload))
             else:
                 self.decision.take(state, event)
         return self.intake.step(state, frame, tick.index - before, samples)

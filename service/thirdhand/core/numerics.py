@@ -40,4 +40,4 @@ BELIEF_PERIODS = 20  # number of updates after which the belief of hands at rest
 STOP_SECANTS = 8  # largest number of secant steps; in long periods the stopping distance is not linear in jerk
 STOP_SAMPLES = 16  # the tool's speed is checked at 15 times, which divide the stop into 16 parts
 CAPSULE_FITS = 101  # number of lengths that are tried for a capsule
-UNPRIMED_DECIDED = -1.0  # replaces the first probability in `stages.elsewhere` once evidence has shown the stage
+UNPRIMED_DECIDED = -1.0  # replaces the first probability in `segments.elsewhere` once evidence has shown the segment

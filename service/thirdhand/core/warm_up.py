@@ -36,9 +36,9 @@ from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import delayed, moving_features, turning
 from thirdhand.core.skill.model import Target, Wanted
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
+from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.skill import UNTOLD, Skill
 from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.stages import MOST_STAGES
 from thirdhand.core.skill.support import error_table, local_scatter
 from thirdhand.core.skill.unseen import deviation_m
 from thirdhand.core.vectors import norm, times
@@ -63,7 +63,7 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     extended = replace(plain, turn=turn, gripper=gripper)
     for variant in (plain, extended):
         variant.predict(*np.zeros((3, 2, 3)))
-    plain.model.elsewhere(np.zeros((3, 6)), STILL, settings.period_s, *np.zeros((2, MOST_STAGES)))
+    plain.model.elsewhere(np.zeros((3, 6)), STILL, settings.period_s, *np.zeros((2, MOST_SEGMENTS)))
     other = replace(plain, model=HandsKMP(KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)))
     other.predict(*np.zeros((3, 2, 3)))
     other.model.mean(np.zeros((1, 6)))

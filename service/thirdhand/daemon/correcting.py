@@ -1,4 +1,4 @@
-"""Corrections of an operator: their hands, stage and led tool, taken from the loop's state."""
+"""Corrections of an operator: their hands, segment and led tool, taken from the loop's state."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def check_same_hold(held_tick: int, state: Record) -> None:
 
 
 class LedTool(NamedTuple):
-    """The hands (6,) [m] and the stage (-1: none) that a correction belongs to, the tool (3,) [m]
+    """The hands (6,) [m] and the segment (-1: none) that a correction belongs to, the tool (3,) [m]
     with its orientation, and the arm's joints (J,) [rad] now, in the hold since `held_tick`.
     """
 
     held_tick: int
     hands: Vector
-    stage: int
+    segment: int
     tool: Vector
     orientation: Orientation | None
     joints: Vector
@@ -73,10 +73,10 @@ class Corrections:
         """The hands and the tool of a correction that is requested now. Raises RequestError."""
         frame, state = self._moment()
         held_tick = held_since(state)
-        hands, stage = self._hands(request, skill, frame, state)
+        hands, segment = self._hands(request, skill, frame, state)
         joints = np.array(state["joints"][0])
         if request.tool is not None:
-            return LedTool(held_tick, hands, stage, np.array(request.tool), None, joints)
+            return LedTool(held_tick, hands, segment, np.array(request.tool), None, joints)
         settings = self._settings
         if settings.arm.source == "assumed":
             raise RequestError("$.tool: none given; needed, as this daemon does not measure where the arm is")
@@ -95,10 +95,10 @@ class Corrections:
         quaternion_of(here.rotation, quaternion)
         x, y, z, w = (round(value, 6) for value in quaternion.tolist())
         orientation = (x, y, z, w) if request.turned else None
-        return LedTool(held_tick, hands, stage, np.array(here.position), orientation, np.array(state["measured"]))
+        return LedTool(held_tick, hands, segment, np.array(here.position), orientation, np.array(state["measured"]))
 
     def _hands(self, request: Correct, skill: Skill, frame: Frame, state: Record) -> tuple[Vector, int]:
-        """The hands (6,) [m] and the stage of a correction. Raises RequestError."""
+        """The hands (6,) [m] and the segment of a correction. Raises RequestError."""
         sides = (0, 1) if skill.conductor is None else (skill.conductor,)
         if request.hands == "held":
             if state["held"] != HELD_SEEN:
@@ -106,15 +106,15 @@ class Corrections:
                     "the hands were not seen when the hold began; resume, hold again while both are seen, or correct "
                     'for the hands of this moment ($.hands: "now")'
                 )
-            hands, stage = np.array(state["held_hands"]), int(state["held_stage"])
+            hands, segment = np.array(state["held_hands"]), int(state["held_segment"])
         else:
             ages, stale = (frame[name][list(sides)] for name in ("hand_ages", "stale_ticks"))
             if (ages < 0).any() or (ages >= stale).any():
                 raise RequestError("$.hands: 'now' given, but the hands are not seen now")
-            hands, belief = np.array(frame["hands"]), np.array(state["stage_belief"])
-            stage = int(belief.argmax()) if belief.max() > 0.5 else -1
-        if skill.model.names and not 0 <= stage < len(skill.model.names) - 1:
+            hands, belief = np.array(frame["hands"]), np.array(state["segment_belief"])
+            segment = int(belief.argmax()) if belief.max() > 0.5 else -1
+        if skill.model.names and not 0 <= segment < len(skill.model.names) - 1:
             raise RequestError(
-                "the stage of the task was not known; name it by `thirdhand stage NAME`, then hold again"
+                "the segment of the task was not known; name it by `thirdhand segment NAME`, then hold again"
             )
-        return hands.reshape(6), stage if skill.model.names else -1
+        return hands.reshape(6), segment if skill.model.names else -1

@@ -60,7 +60,7 @@ from thirdhand.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
 from thirdhand.daemon.newest_status import MIN_STATUS_INTERVAL_S, NewestStatus
 from thirdhand.daemon.own_answers import OwnAnswers
 from thirdhand.daemon.queryables import Queryables
-from thirdhand.daemon.saved_stage import SavedStage
+from thirdhand.daemon.saved_segment import SavedSegment
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.side_streams import side_streams
 from thirdhand.daemon.skill_worker import SkillWorker, skill_of
@@ -126,9 +126,9 @@ class Daemon:
         self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
         self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
         self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
-        self._saved_stage = SavedStage(settings)
-        if reached := self._saved_stage.read(stored):
-            self._own.append(order("stage", reached))
+        self._saved_segment = SavedSegment(settings)
+        if reached := self._saved_segment.read(stored):
+            self._own.append(order("segment", reached))
             log.info("the task continues at via-point %s, which an earlier run had reached", reached)
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self._note_beside)
         self._task_limits = TaskLimits(settings, skill_worker, self._note_beside)
@@ -355,10 +355,10 @@ class Daemon:
             if is_due or is_published:
                 self._streams.publish("status", payload)
             try:
-                if self._controller.skill is skill:  # else the stage may be that of either
-                    self._saved_stage.keep(skill, status.stage, status.stage_belief)
+                if self._controller.skill is skill:  # else the segment may be that of either
+                    self._saved_segment.keep(skill, status.segment, status.segment_belief)
             except OSError as error:
-                errors.append(f"the stage of the task cannot be saved for a restart: {in_words(error)}")
+                errors.append(f"the segment of the task cannot be saved for a restart: {in_words(error)}")
             self._status.end(payload)
             if self._own_answers is None or not self._own_answers.is_deaf():
                 self._start.systemd.progressed(status.tick)

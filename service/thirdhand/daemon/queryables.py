@@ -30,8 +30,8 @@ from thirdhand.contract.requests import (
     Remove,
     Reply,
     RequestError,
+    SegmentRequest,
     SkillRequest,
-    StageRequest,
     UndoCorrection,
     ViaPoint,
     encode_json,
@@ -62,7 +62,7 @@ from thirdhand.skills.corrections import (
     newest_correction,
     off_m,
     offer_of,
-    stage_of,
+    segment_of,
 )
 from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import SkillError, StoredSkill
@@ -272,8 +272,8 @@ class Queryables:
         match request:
             case SkillRequest(name):
                 return self._load(name)
-            case StageRequest(name):
-                return self._set_stage(name)
+            case SegmentRequest(name):
+                return self._set_segment(name)
             case List():
                 frame, state = self._moment()
                 return Reply(int(frame["tick"]), self._adoptable[state["skill"].tobytes()][1])
@@ -306,11 +306,11 @@ class Queryables:
             note = "resume does not end a fault, reset does"
         return msgspec.structs.replace(reply, note=note)
 
-    def _set_stage(self, name: str) -> Reply:
+    def _set_segment(self, name: str) -> Reply:
         if name not in (names := self._skill.model.names):
             known = ", ".join(names) or "none, as the skill was not learned between via-points"
             raise RequestError(f"$.name: no via-point {name!r} of the task. There are: {known}")
-        return _in_force_since(self.inbox.send(order("stage", name)).wait())
+        return _in_force_since(self.inbox.send(order("segment", name)).wait())
 
     @property
     def _skill(self) -> StoredSkill:
@@ -383,7 +383,7 @@ class Queryables:
     def _correct(self, request: Correct) -> Reply:
         """Correct the tool for the hands of the operator's hold."""
         led, skill = self._corrections.led(request, self._skill), self._skill
-        correcting = correction_at(skill, led.hands, led.stage, led.tool, led.orientation)
+        correcting = correction_at(skill, led.hands, led.segment, led.tool, led.orientation)
         point, moved_m = correcting.point, off_m(skill, correcting)
         if moved_m < LEAST_CORRECTION_M and not request.turned:
             raise RequestError(
@@ -406,10 +406,10 @@ class Queryables:
                 "of things and of itself"
             )
         after, effect = self._skill_worker.correct(skill, correcting.among(skill.via_points), point)
-        # A hand that led the arm may have looked like another stage.
-        has_stage = request.hands == "held" and led.stage >= 0
-        stages = [order("stage", skill.model.names[led.stage])] if has_stage else []
-        reply = self._adopt(after, *stages, check=functools.partial(check_same_hold, led.held_tick))
+        # A hand that led the arm may have looked like another segment.
+        has_segment = request.hands == "held" and led.segment >= 0
+        segments = [order("segment", skill.model.names[led.segment])] if has_segment else []
+        reply = self._adopt(after, *segments, check=functools.partial(check_same_hold, led.held_tick))
         self._corrections.replaced[point] = correcting.replaced
         return self._of_correction(reply, point, effect, undone=False)
 
@@ -425,13 +425,13 @@ class Queryables:
         return self._of_correction(reply, point, effect, undone=True)
 
     def _of_correction(self, reply: Reply, point: ViaPoint, effect: Effect, *, undone: bool) -> Reply:
-        stage, sizes = stage_of(self._skill, point), (round(effect.moved_m, 4), round(effect.reach_m, 3))
-        correction = Correction(point.name, *sizes, stage, point.corrections, undone=undone)
+        segment, sizes = segment_of(self._skill, point), (round(effect.moved_m, 4), round(effect.reach_m, 3))
+        correction = Correction(point.name, *sizes, segment, point.corrections, undone=undone)
         return msgspec.structs.replace(reply, correction=correction, note=offer_of(self._skill))
 
     def _check(self, added: Sequence[ViaPoint], at: str = "") -> None:
         """Raise RequestError for too many via-points, for those outside the skill's workspace, and
-        for stages that the skill does not have. `at` is the place of the tool in the request.
+        for segments that the skill does not have. `at` is the place of the tool in the request.
         """
         all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
         total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
@@ -444,9 +444,11 @@ class Queryables:
         distances_m = self._beyond_m(self._settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
             given = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
-            if point.stage not in (None, *(begins := self._skill.model.names[:-1])):
+            if point.segment not in (None, *(begins := self._skill.model.names[:-1])):
                 known = ", ".join(begins) or "none"
-                raise RequestError(f"$.points[{i}].stage: no stage begins at {point.stage!r}; stages begin at: {known}")
+                raise RequestError(
+                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments begin at: {known}"
+                )
             if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
                 raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")

@@ -31,7 +31,7 @@ HEARTBEAT_S = 0.5  # as in rmw_zenoh: after this time a subscriber notices that 
 DIAGNOSTIC_LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # OK, WARN and ERROR of diagnostic_msgs
 DIAGNOSED = (
     *("mode", "reason", "flags", "tick", "rate_hz", "missed", "realtime", "lateness_us", "work_us", "latency_ms"),
-    *("hand_age_ms", "hand_distance_m", "rejected", "received", "skill", "stage", "version"),
+    *("hand_age_ms", "hand_distance_m", "rejected", "received", "skill", "segment", "version"),
 )
 
 

@@ -113,8 +113,8 @@ class CellStatus(NamedTuple):
             turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
-            stage=skill.model.names[frame["stage"] : frame["stage"] + 2] if frame["stage_belief"] else (),
-            stage_belief=round(float(frame["stage_belief"]), 3),
+            segment=skill.model.names[frame["segment"] : frame["segment"] + 2] if frame["segment_belief"] else (),
+            segment_belief=round(float(frame["segment_belief"]), 3),
             task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
             if skill.model.clock and skill.model.clock.weight
             else None,

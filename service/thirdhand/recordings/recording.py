@@ -54,7 +54,7 @@ from thirdhand.settings.config import Settings, robot_description, without_secre
 
 OBJECTS_NOTE = "objects"
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
-DECISIONS = ("mode", "reason", "flags", "commanded", "stage")  # a frame that changes one of these is kept
+DECISIONS = ("mode", "reason", "flags", "commanded", "segment")  # a frame that changes one of these is kept
 NOTED_US = 1000.0  # the timing of a tick that begins or ends this late is kept
 SHOWN_HZ = 10.0  # rate of what other tools show, in a thin recording; a replay makes it anew
 STATE_EVERY_S = 10.0  # interval of states in a thin recording; each takes 60 kB

@@ -1,9 +1,9 @@
 """Corrections: via-points where an operator led, or dragged, the tool to where it should have been.
 
 They are inserted one by one into the skill in force, as in the interactive incremental learning of
-Knauer et al., RA-L 2025. A correction acts in the stage of the task in which it was made. At hands
-that rest at an end of that stage, it teaches the task's own via-point anew, so that both stages
-that meet there still agree.
+Knauer et al., RA-L 2025. A correction acts in the segment of the task in which it was made. At
+hands that rest at an end of that segment, it teaches the task's own via-point anew, so that both
+segments that meet there still agree.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from thirdhand.contract.requests import MAX_REACH_M, Orientation, ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
-from thirdhand.core.skill.tuning import SEGMENT_END_M
+from thirdhand.core.skill.tuning import PATH_END_M
 from thirdhand.core.skill.via_points import rest_of
 from thirdhand.skills.skill_file import SkillError, StoredSkill
 from thirdhand.skills.via_points import MAX_GAIN, NOTED_M, adapted
@@ -53,22 +53,22 @@ class Effect(NamedTuple):
 
 
 def correction_at(
-    skill: Skill, hands: Vector, stage: int, tool: Vector, orientation: Orientation | None = None
+    skill: Skill, hands: Vector, segment: int, tool: Vector, orientation: Orientation | None = None
 ) -> Correcting:
     """The correction that puts the tool (3,) [m], and its orientation if given, for hands (6,) [m]
-    in a stage of the task (-1 for a skill without stages).
+    in a segment of the task (-1 for a skill without segments).
 
-    It replaces earlier ones of the same stage at hands that are nearer than
-    SEGMENT_END_M, which are at the same place.
+    It replaces earlier ones of the same segment at hands that are nearer than
+    PATH_END_M, which are at the same place.
     """
     left, right, names = _point(hands[:3]), _point(hands[3:]), skill.model.names
-    end = _end_of(skill, hands, stage) if names else ""
-    name_of_stage = None if end or not names else names[stage]
+    end = _end_of(skill, hands, segment) if names else ""
+    name_of_segment = None if end or not names else names[segment]
     if end:
         replaced = [point for point in skill.via_points if point.name == end]
     else:
-        earlier = [p for p in skill.via_points if _NUMBERED.fullmatch(p.name) and p.stage == name_of_stage]
-        replaced = [point for point in earlier if _apart_m(skill, hands, _hands(point)) < SEGMENT_END_M]
+        earlier = [p for p in skill.via_points if _NUMBERED.fullmatch(p.name) and p.segment == name_of_segment]
+        replaced = [point for point in earlier if _apart_m(skill, hands, _hands(point)) < PATH_END_M]
     numbers = [int(found[1]) for point in skill.via_points if (found := _NUMBERED.fullmatch(point.name))]
     before = replaced[-1] if end and replaced else ViaPoint(end, left, right, _point(tool))
     point = msgspec.structs.replace(
@@ -78,7 +78,7 @@ def correction_at(
         right=right,
         tool=_point(tool),
         orientation=orientation or before.orientation,
-        stage=name_of_stage,
+        segment=name_of_segment,
         corrections=1 + max((point.corrections for point in replaced), default=0),
     )
     return Correcting(point, tuple(replaced))
@@ -110,9 +110,11 @@ def offer_of(skill: Skill) -> str:
     )
 
 
-def stage_of(skill: Skill, point: ViaPoint) -> tuple[str, ...]:
-    """The via-points at which the stage of a correction begins and ends; empty if it has none."""
-    return () if point.stage not in skill.model.names[:-1] else (str(point.stage), rest_of(point, skill.model.names))
+def segment_of(skill: Skill, point: ViaPoint) -> tuple[str, ...]:
+    """The via-points at which the segment of a correction begins and ends; empty if it has none."""
+    return (
+        () if point.segment not in skill.model.names[:-1] else (str(point.segment), rest_of(point, skill.model.names))
+    )
 
 
 def corrected(skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
@@ -152,11 +154,11 @@ def effect_of(before: Skill, after: Skill, at: ViaPoint) -> Effect:
     return Effect(moved_m, float(reach_m.min()), float(gain))
 
 
-def _end_of(skill: Skill, hands: Vector, stage: int) -> str:
-    """The via-point at the begin or end of a stage at which hands (6,) are; empty if at neither."""
-    ends = {skill.model.names[k]: _apart_m(skill, hands, skill.model.hands[k]) for k in (stage, stage + 1)}
+def _end_of(skill: Skill, hands: Vector, segment: int) -> str:
+    """The via-point at an end of a segment at which hands (6,) are; empty if at neither."""
+    ends = {skill.model.names[k]: _apart_m(skill, hands, skill.model.hands[k]) for k in (segment, segment + 1)}
     name = min(ends, key=lambda name: ends[name])
-    return name if ends[name] < SEGMENT_END_M else ""
+    return name if ends[name] < PATH_END_M else ""
 
 
 def _apart_m(skill: Skill, hands: Vector, others: Vector) -> float:

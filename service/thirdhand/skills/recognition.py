@@ -1,4 +1,4 @@
-"""Stages of a whole take at once, by the functions with which a cell recognises them."""
+"""Segments of a whole take at once, by the functions with which a cell recognises them."""
 
 from __future__ import annotations
 
@@ -7,41 +7,41 @@ from numpy.typing import NDArray
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.skill.stages import add_followed, along_both, on_way, recognise
-from thirdhand.core.skill.tuning import FIRST_STAGE_ODDS
+from thirdhand.core.skill.segments import add_followed, along_both, on_way, recognise
+from thirdhand.core.skill.tuning import FIRST_SEGMENT_ODDS
 
 
 @compiled
-def recognised(moving: Vector, periods_s: float, stages: Records, out: Vector) -> None:
-    """Write the beliefs (T, K) in the stages for hands that move (T, 3, 6) to `out`."""
+def recognised(moving: Vector, periods_s: float, segments: Records, out: Vector) -> None:
+    """Write the beliefs (T, K) in the segments for hands that move (T, 3, 6) to `out`."""
     for t in range(len(moving)):
         if t:
             out[t] = out[t - 1]
-        recognise(out[t], moving[t], periods_s, stages, FIRST_STAGE_ODDS)
+        recognise(out[t], moving[t], periods_s, segments, FIRST_SEGMENT_ODDS)
 
 
-def covered(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records) -> Vector:
-    """Shares of the stages (T,) that hands (T, 6 or more) with this stillness (T, 2) have covered,
-    and their distances from the segments [m]: (T, 4).
+def covered(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records) -> Vector:
+    """Shares of the segments (T,) that hands (T, 6 or more) with this stillness (T, 2) have
+    covered, and their distances from the paths [m]: (T, 4).
     """
     out = np.empty((len(hands), 4))
-    _cover(np.ascontiguousarray(hands), np.ascontiguousarray(stillness), labels, stages, out)
+    _cover(np.ascontiguousarray(hands), np.ascontiguousarray(stillness), labels, segments, out)
     return out
 
 
 @compiled
-def _cover(hands: Vector, stillness: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
+def _cover(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records, out: Vector) -> None:
     for t in range(len(hands)):
-        stage = stages[labels[t]]
-        out[t, 0], out[t, 1] = along_both(hands[t], stillness[t], stage)
+        segment = segments[labels[t]]
+        out[t, 0], out[t, 1] = along_both(hands[t], stillness[t], segment)
         for side in range(2):
-            _, out[t, 2 + side] = on_way(hands[t, 3 * side : 3 * side + 3], stage, side)
+            _, out[t, 2 + side] = on_way(hands[t, 3 * side : 3 * side + 3], segment, side)
 
 
 @compiled
-def all_followed(hands: Vector, shares: Vector, labels: NDArray[np.int64], stages: Records, out: Vector) -> None:
-    """Add the motion of the followed hands in the stages (T,) to `out` (T, 3), see
+def all_followed(hands: Vector, shares: Vector, labels: NDArray[np.int64], segments: Records, out: Vector) -> None:
+    """Add the motion of the followed hands in the segments (T,) to `out` (T, 3), see
     `add_followed`.
     """
     for t in range(len(hands)):
-        add_followed(hands[t], shares[t], stages[labels[t]], out[t])
+        add_followed(hands[t], shares[t], segments[labels[t]], out[t])

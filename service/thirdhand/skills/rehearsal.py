@@ -10,7 +10,7 @@ from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.memory import along
 from thirdhand.core.skill.model import LEVELS
-from thirdhand.core.skill.stages import MOST_STAGES, STAGE
+from thirdhand.core.skill.segments import MOST_SEGMENTS, SEGMENT
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.support import LocalErrors, error_probabilities
 from thirdhand.core.skill.task_clock import BEGIN_AT, counted
@@ -20,17 +20,17 @@ SAMPLE_PERIOD_S = 0.01
 
 
 def rehearse() -> None:
-    """Compile or load these functions, on two samples of hands that rest in a task of one stage."""
+    """Compile or load these functions, on two samples of resting hands in a task of one segment."""
     hands = np.zeros((2, 6))
     still = stillness_of(hands, SAMPLE_PERIOD_S)
     along(hands, SAMPLE_PERIOD_S, 0.1, ORDER)
     counted(hands, still[:, 0], still[:, 1], SAMPLE_PERIOD_S, np.zeros((1, BEGIN_AT + 6)))
 
     labels = np.zeros(2, np.int64)
-    for stages in (np.ones(1, STAGE), frozen(np.ones(1, STAGE))):  # of a demonstration, of a skill
-        recognised(np.zeros((2, 3, 6)), SAMPLE_PERIOD_S, stages, np.zeros((2, MOST_STAGES)))
-        covered(hands, still, labels, stages)
-        all_followed(hands, still[:, 0].copy(), labels, stages, np.zeros((2, 3)))
+    for segments in (np.ones(1, SEGMENT), frozen(np.ones(1, SEGMENT))):  # of a demonstration, of a skill
+        recognised(np.zeros((2, 3, 6)), SAMPLE_PERIOD_S, segments, np.zeros((2, MOST_SEGMENTS)))
+        covered(hands, still, labels, segments)
+        all_followed(hands, still[:, 0].copy(), labels, segments, np.zeros((2, 3)))
 
     recent(np.zeros(3), SAMPLE_PERIOD_S, np.zeros(3))
     reference = Gaussians(np.zeros((1, 3)), np.eye(3)[None])

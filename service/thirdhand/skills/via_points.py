@@ -36,7 +36,7 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
 
     Via-points between which the tool would move more than MAX_GAIN times as far as the hands
     contradict each other, as the tool would amplify the trembling of resting hands. Via-points of a
-    task do not, as the skill's stages distinguish them.
+    task do not, as the skill's segments distinguish them.
 
     Raises SkillError if the via-points contradict each other, or the tolerance [m] is negative.
     """
@@ -91,10 +91,10 @@ def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) 
 
 def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
     """Return whether each pair (V, V) belongs to two via-points of the skill's task, to via-points
-    of two of its stages, or to one of each.
+    of two of its segments, or to one of each.
     """
     known = skill.model.names
-    names = np.array([p.name if p.name in known else f"{p.stage} ->" if p.stage in known else "" for p in owners])
+    names = np.array([p.name if p.name in known else f"{p.segment} ->" if p.segment in known else "" for p in owners])
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 

@@ -58,7 +58,7 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/error", "Tool to target [mm]", 0, 60),
             PlotView("/turn", "Tool turned from the target [°]", 0, 10),
             PlotView("/gripper", "Gripper closure [%]", 0, 110, True),
-            PlotView("/stage", "Stage of the task: number and probability", 0, 8, True),
+            PlotView("/segment", "Segment of the task: number and probability", 0, 8, True),
             PlotView("/deviation", "Uncertainty, and deviation of the hands [mm]", 0, 250),
             PlotView("/doubt", "Probability that the target is off by more than 10 cm [%]", 0, 110, True),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
@@ -151,7 +151,7 @@ def blueprint(
         views_of = [rrb.Spatial2DView(origin=f"/cameras/{key}", name=key) for key in cameras]
         bench = rrb.Vertical(bench, rrb.Horizontal(*views_of), row_shares=[3, 2])
     curves = rrb.Vertical(
-        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/stage"), active_tab=0),
+        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/segment"), active_tab=0),
         rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),
         rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
         rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),

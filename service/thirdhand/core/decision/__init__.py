@@ -16,7 +16,7 @@ STATE = (
     Field("guided_tick", "int64"),  # the last tick at which the arm was led by hand
     # The begin of the operator's hold that lasts, in which a correction may be made:
     Field("held_tick", "int64"),
-    Field("held_stage", "int64"),  # the most probable stage of the task; -1: not known
+    Field("held_segment", "int64"),  # the most probable segment of the task; -1: not known
     Field("held_hands", "float64", (2, 3)),  # positions of the hands [m]
     Field("stuck_gap", "float64"),  # distance between tool and target at `stuck_tick` [m]
     Field("stuck_target", "float64", (3,)),  # target at `stuck_tick` [m]

@@ -34,7 +34,7 @@ from thirdhand.core.codes import (
     OPERATOR,
     READY,
     RETURNING,
-    STAGE_AMBIGUOUS,
+    SEGMENT_AMBIGUOUS,
     STALE_HAND,
     STARTS_ASSUMED,
     STARTS_MEASURED,
@@ -100,7 +100,7 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
       follow yet.
     * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share
       threshold, or a hand has jumped within the last jumpy_s.
-    * AMBIGUOUS: the stage of the task is not known.
+    * AMBIGUOUS: the segment of the task is not known.
     """
     state = states[0]
     if conditions & CONTESTED:
@@ -125,7 +125,7 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
         is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
         if is_jumpy or gate_m > parameters[0].end_share * threshold:
             return FAR
-    return AMBIGUOUS if conditions & STAGE_AMBIGUOUS else NONE
+    return AMBIGUOUS if conditions & SEGMENT_AMBIGUOUS else NONE
 
 
 @compiled
@@ -189,20 +189,20 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
 
 @compiled
 def _note_hold(states: Records, conditions: int) -> None:
-    """Store hands and stage at the start of an operator's hold; its end clears them.
+    """Store hands and segment at the start of an operator's hold; its end clears them.
 
-    The stage is the most probable one, if its probability is above 1/2.
+    The segment is the most probable one, if its probability is above 1/2.
     """
     state = states[0]
     if state.operator_hold and not state.held:
         state.held = HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
-        state.held_tick, state.held_stage = state.tick, -1
+        state.held_tick, state.held_segment = state.tick, -1
         for side in range(2):
             for axis in range(3):
                 state.held_hands[side, axis] = state.hands[side, 0, axis]
-        for stage in range(len(state.stage_belief)):
-            if state.stage_belief[stage] > 0.5:
-                state.held_stage = stage
+        for segment in range(len(state.segment_belief)):
+            if state.segment_belief[segment] > 0.5:
+                state.held_segment = segment
     elif not state.operator_hold:
         state.held = 0
 

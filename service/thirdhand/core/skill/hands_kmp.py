@@ -30,7 +30,7 @@ from thirdhand.core.skill.model import (
     standard_deviation,
     standard_deviations,
 )
-from thirdhand.core.skill.stages import MOST_STAGES
+from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.support import LocalErrors, local_scatter
 from thirdhand.core.skill.task import check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
@@ -108,7 +108,7 @@ class HandsKMP:
         return None if self.clock is None else self.clock.numbers[None]
 
     def belief(self, hands: Vector) -> Vector:
-        return np.zeros(MOST_STAGES)
+        return np.zeros(MOST_SEGMENTS)
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
         """Motion of the tool: equation (8) of Huang et al. 2019 and its derivatives along the

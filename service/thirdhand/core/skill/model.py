@@ -61,7 +61,7 @@ class Motion(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
     gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: as before
-    ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another stage
+    ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another segment
 
 
 class Seen(NamedTuple):
@@ -73,7 +73,7 @@ class Seen(NamedTuple):
     turns: Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
     turn_lag_s: float  # time constant of these filters
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
-    belief: Vector  # (MOST_STAGES,) probability of each stage; zeros: not yet known
+    belief: Vector  # (MOST_SEGMENTS,) probability of each segment; zeros: not yet known
     period_s: float  # time since the belief was updated; 0: it is not updated
     clock: Vector = NO_CLOCK  # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
 
@@ -90,13 +90,13 @@ class Target(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """Request of the skill to the stages after it: target in the workspace, and orientation."""
+    """Request of the skill to the segments after it: target in the workspace, and orientation."""
 
     target: Target
     orientation: Vector  # (4,) quaternion x y z w
     turning: Vector  # (3,) [rad/s]
     gate_m: float  # [m] distance that is compared with the skill's threshold
-    is_ambiguous: bool  # true if the stage of the task is ambiguous
+    is_ambiguous: bool  # true if the segment of the task is ambiguous
     needs_unseen_hand: bool  # true if a hand that is not seen may move the target far
 
 
@@ -131,7 +131,7 @@ class Model(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the via-points that were learned, in the order of the stages."""
+        """Names of the via-points that were learned, in the order of the segments."""
 
     @property
     def delay_s(self) -> float:
@@ -153,10 +153,10 @@ class Model(Protocol):
 
     @property
     def clock_rows(self) -> Vector | None:
-        """Parameters (K, 13) of the clock in each stage, see `task_clock.count`."""
+        """Parameters (K, 13) of the clock in each segment, see `task_clock.count`."""
 
     def belief(self, hands: Vector) -> Vector:
-        """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
+        """Belief (MOST_SEGMENTS,) in each segment for hands (6,) that have always been at rest."""
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
         """Predict the motion of the tool. A covariance (3, 3) that is `known` is returned as it is,
@@ -165,8 +165,8 @@ class Model(Protocol):
         """
 
     def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
-        """Probability that the task did not begin at its first stage, so that the tool belongs
-        elsewhere, for the hands' motion (3, 6); `unprimed` (MOST_STAGES,) is updated in place.
+        """Probability that the task did not begin at its first segment, so that the tool belongs
+        elsewhere, for the hands' motion (3, 6); `unprimed` (MOST_SEGMENTS,) is updated in place.
         """
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:

@@ -36,7 +36,7 @@ from thirdhand.core.skill.pose import (
     LearnedOrientation,
     Turn,
 )
-from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.settings.config import Reach
 
 NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
@@ -136,7 +136,7 @@ def _without(vector: Vector, normals: list[Vector]) -> Vector:
 
 
 UNTOLD = np.empty((0, 18))  # orientation of hands if it is not known
-MODELS: tuple[type[Model], ...] = (HandsKMP, StagedKMP)
+MODELS: tuple[type[Model], ...] = (HandsKMP, SegmentedKMP)
 """All types of models."""
 Earlier: TypeAlias = tuple[Vector, Vector, float, float]
 """Covariances of position (3, 3) [m²] and orientation (3, 3) [rad²], closure of the gripper, and
@@ -151,7 +151,7 @@ class Prediction(NamedTuple):
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²] of the model, before the calibration by `Regions`
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
-    ambiguity: float  # probability that the tool belongs elsewhere, in another stage
+    ambiguity: float  # probability that the tool belongs elsewhere, in another segment
     turn: Turn
     closure: float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 
@@ -207,8 +207,8 @@ class Skill(Immutable):
           where they are.
         * `turns` (TURNS, 2, 9): filters of the hands' rotation matrices, see `remember`. Without
           it, the orientation is the mean of the demonstrations.
-        * `belief` (MOST_STAGES,): probability of each stage, updated in place if `period_s` > 0.
-          Without it, the hands have always been at rest.
+        * `belief` (MOST_SEGMENTS,): probability of each segment, updated in place if `period_s` >
+          0. Without it, the hands have always been at rest.
         * `clock` (3,) or more: clock of the task [s] and its two derivatives, see `task_clock`.
 
         The result is rounded (1 µm, 1 µm/s, 1 µm/s²), so that machines whose last bits differ agree

@@ -1,4 +1,4 @@
-"""The core's stage of the skill: predict the tool at each sample of a hand."""
+"""The core's segment of the skill: predict the tool at each sample of a hand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from thirdhand.core.skill.step import (
     IS_AMBIGUOUS,
     IS_OUTSIDE,
     conclude,
-    tell_stage,
+    tell_segment,
 )
 from thirdhand.core.skill.task_clock import move
 from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
@@ -75,7 +75,7 @@ class SkillStage:
         memory of the hands if it has the same filters, and the clock if it has the same clock.
         """
         if skill.model.names != self.skill.model.names:
-            state["stage_belief"] = state["unprimed_belief"] = 0.0
+            state["segment_belief"] = state["unprimed_belief"] = 0.0
         before, turn_before_s = self.skill.model, self._turn_lag_s
         if skill.model.clock != before.clock:
             state["task_clock"] = 0.0
@@ -90,11 +90,11 @@ class SkillStage:
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
         """Request of the skill for the hands in the state, which must be known; `unseen` is the
         side of a hand that is not seen now. Covariances and closure are computed at new samples
-        only. The doubt is the probability that the task did not begin at its first stage.
+        only. The doubt is the probability that the task did not begin at its first segment.
         """
         states, frames, rules = as_array(state), as_array(frame), self.rules
         self._count(state)
-        seen = Seen(*self._seen[:6], state["stage_belief"], self._period_s, state["task_clock"])
+        seen = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
         is_new, before, known = recall(states, rules, seen), None, state["covariance"]
         if not is_new:
             before = (
@@ -133,17 +133,17 @@ class SkillStage:
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
         move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
 
-    def set_stage(self, state: Record, name: str) -> None:
-        """Set the belief to the stage that begins at the via-point of this name (at the last
-        via-point, the stage that ends there). Unknown names are ignored.
+    def set_segment(self, state: Record, name: str) -> None:
+        """Set the belief to the segment that begins at the via-point of this name (at the last
+        via-point, the segment that ends there). Unknown names are ignored.
         """
         if name in (names := self.skill.model.names):
-            state["stage_belief"], state["unprimed_belief"] = 0.0, UNPRIMED_DECIDED
-            state["stage_belief"][min(names.index(name), len(names) - 2)] = 1.0
+            state["segment_belief"], state["unprimed_belief"] = 0.0, UNPRIMED_DECIDED
+            state["segment_belief"][min(names.index(name), len(names) - 2)] = 1.0
 
     def nothing(self, state: Record, frame: Record) -> None:
         """Write into the frame that nothing is predicted: the target is the setpoint."""
         state["unsure"], state["sure_tick"] = 0, state["tick"]
         frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
         frame["closure"] = state["closure"]
-        tell_stage(as_array(state), as_array(frame))
+        tell_segment(as_array(state), as_array(frame))

@@ -22,7 +22,7 @@ from thirdhand.core.skill.tuning import (
     UNSURE_M,
 )
 
-NO_STAGE = -1  # stage in a frame while it is not known
+NO_SEGMENT = -1  # segment in a frame while it is not known
 IS_AMBIGUOUS, IS_OUTSIDE = 1, 2  # what `conclude` returns, added
 
 
@@ -76,17 +76,17 @@ def conclude(
     doubt: float,
 ) -> int:
     """Write a prediction into the frame with its calibrated covariance, the probability of an error
-    p and the most probable stage; update the skill's part of the state.
+    p and the most probable segment; update the skill's part of the state.
 
     `motion` are the first parts of a `Prediction`, `turn` its `Turn`; `off` [m] is the possible
     error because a hand is not seen, and `doubt` the probability that the task did not begin at its
-    first stage:
+    first segment:
 
         p = p_C + (1 - p_C) doubt,   p_C = error_probability(C, off² / REGION_95)
 
     The skill is unsure if p is above its alarm, or without an alarm, if its region reaches farther
-    than UNSURE_M. Returns IS_AMBIGUOUS if the stage has been ambiguous for longer than AMBIGUOUS_S,
-    plus IS_OUTSIDE if the position has to be clamped.
+    than UNSURE_M. Returns IS_AMBIGUOUS if the segment has been ambiguous for longer than
+    AMBIGUOUS_S, plus IS_OUTSIDE if the position has to be clamped.
     """
     state, frame, rule = states[0], frames[0], rules[0]
     position, velocity, acceleration, covariance, gate_m, ambiguity = motion
@@ -104,7 +104,7 @@ def conclude(
         state.unsure = frame.error_probability > ease * rule.alarm
     else:
         state.unsure = math.sqrt(reach_m * reach_m + off * off) > ease * UNSURE_M
-    tell_stage(states, frames)
+    tell_segment(states, frames)
     if ambiguity <= AMBIGUOUS_PROBABILITY * (rule.end_share if state.reason == AMBIGUOUS else 1.0):
         state.sure_tick = state.tick
     is_ambiguous = (state.tick - state.sure_tick) * rule.period_s > AMBIGUOUS_S
@@ -113,9 +113,9 @@ def conclude(
 
 
 @compiled
-def tell_stage(states: Records, frames: Records) -> None:
-    """Write the most probable stage and its probability into the frame."""
-    belief, frame = states[0].stage_belief, frames[0]
+def tell_segment(states: Records, frames: Records) -> None:
+    """Write the most probable segment and its probability into the frame."""
+    belief, frame = states[0].segment_belief, frames[0]
     most = belief.argmax()
-    frame.stage_belief = belief[most]
-    frame.stage = most if belief[most] > 0.0 else NO_STAGE
+    frame.segment_belief = belief[most]
+    frame.segment = most if belief[most] > 0.0 else NO_SEGMENT

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from thirdhand.contract.requests import Name, ViaPoint
 from thirdhand.core.frame import Records, Vector, structured
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
-from thirdhand.core.skill.stages import (
-    MOST_STAGES,
+from thirdhand.core.skill.segments import (
+    MOST_SEGMENTS,
     NONE,
     RIGHT,
-    STAGE,
+    SEGMENT,
     STAYS,
 )
-from thirdhand.core.skill.tuning import LEAST_SEGMENT_M
+from thirdhand.core.skill.tuning import LEAST_PATH_M
 
-MOST_NAMES = MOST_STAGES + 1  # largest number of via-points of a task
+MOST_NAMES = MOST_SEGMENTS + 1  # largest number of via-points of a task
 TASK_UNITS = (
-    "inputs: how far along the left and the right hand are, the stage; outputs: how far along the tool is, its "
+    "inputs: how far along the left and the right hand are, the segment; outputs: how far along the tool is, its "
     "deviation x y z [m]; frame base"
 )
 TASK_RANGES = {
@@ -32,7 +32,7 @@ TASK_RANGES = {
     "leads": (NONE, RIGHT, ""),
     "nominal": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "off_ways": (1e-3, MAX_SKILL_DISTANCE_M, "m"),
-    "seen": (-0.001, MOST_STAGES, ""),
+    "seen": (-0.001, MOST_SEGMENTS, ""),
     "errors": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
     "delay": (0.0, 1.0, "s"),
     "levers": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
@@ -44,14 +44,14 @@ Indices = NDArray[np.int64]
 
 
 class Task(NamedTuple):
-    """Order of the N via-points of a task, between which there are N - 1 stages.
+    """Order of the N via-points of a task, between which there are N - 1 segments.
 
     * `corners` (N, 2): index of the position of the left and the right hand at each via-point. A
       hand that returns to a position has the same index.
     * `follow` (N,): the hand that the tool follows at each via-point: NONE, LEFT or RIGHT.
     * `levers` (N, 3) [m]: the tool there in the frame of that hand, with which it turns; None if
       the tool moves with the hand but does not turn with it.
-    * `leads`: the hand whose share alone counts in all stages in which it moves: LEFT, RIGHT, or
+    * `leads`: the hand whose share alone counts in all segments in which it moves: LEFT, RIGHT, or
       NONE if both count.
     """
 
@@ -61,11 +61,11 @@ class Task(NamedTuple):
     levers: Vector | None = None
     leads: int = NONE
 
-    def stages(self, points: NamedViaPoints, off: Vector) -> Records:
-        """Stages (N - 1,) of STAGE between these via-points. `off` (N - 1, 2) [m] is its field.
+    def segments(self, points: NamedViaPoints, off: Vector) -> Records:
+        """Segments (N - 1,) of SEGMENT between these via-points. `off` (N - 1, 2) [m] is its field.
 
         A position that a hand shares between via-points is the mean over those that are known in
-        the scene, or over all if none is. A hand whose via-points are nearer than LEAST_SEGMENT_M
+        the scene, or over all if none is. A hand whose via-points are nearer than LEAST_PATH_M
         rests.
         """
         rows = [points.names.index(name) for name in self.names]
@@ -76,10 +76,10 @@ class Task(NamedTuple):
                 here = self.corners[:, side] == corner
                 told = here & known if (here & known).any() else here
                 hands[here, side] = at[told, 3 * side : 3 * side + 3].mean(axis=0)
-        out = structured(len(rows) - 1, STAGE)
+        out = structured(len(rows) - 1, SEGMENT)
         out["begins"], out["way"] = hands[:-1], np.diff(hands, axis=0)
         square = (out["way"] ** 2).sum(axis=2)
-        out["square"] = np.where(square > LEAST_SEGMENT_M**2, square, STAYS)
+        out["square"] = np.where(square > LEAST_PATH_M**2, square, STAYS)
         out["way"] *= (out["square"] > STAYS)[:, :, None]
         out["off"], out["tool"], out["tool_way"] = off, at[:-1, 6:], np.diff(at[:, 6:], axis=0)
         out["leads"] = NONE if self.leads == NONE else np.where(out["square"][:, self.leads] > STAYS, self.leads, NONE)

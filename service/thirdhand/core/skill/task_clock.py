@@ -1,4 +1,4 @@
-"""Clock of a task, or of each of its stages: how long ago the hands began it.
+"""Clock of a task, or of each of its segments: how long ago the hands began it.
 
 The clock t [s] starts when a hand first moves faster than CLOCK_START_MPS after rest. Over the time
 t' [s] it advances at a rate r, which follows its goal g with the time constant CLOCK_LAG_S:
@@ -13,13 +13,13 @@ t' [s] it advances at a rate r, which follows its goal g with the time constant 
   paused, and the clock continues.
 * t = r = 0 once the hands have rested for `home_s` where demonstrations begin, or have come back to
   where they rested before they began, longer than in any demonstration there. The task begins
-  again: the memory of the hands is that of hands that have always been there, no stage is known,
+  again: the memory of the hands is that of hands that have always been there, no segment is known,
   and the next motion starts the clock.
-* If the task has stages, the clock starts anew in each. When the most probable stage changes, or
-  after a rest of `rest_s` where the stage begins, the clock is set to 0, and starts with the next
-  motion.
+* If the task has segments, the clock starts anew in each. When the most probable segment changes,
+  or after a rest of `rest_s` where the segment begins, the clock is set to 0, and starts with the
+  next motion.
 
-So the clock is continuous within a stage, and constant where nothing was demonstrated.
+So the clock is continuous within a segment, and constant where nothing was demonstrated.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
 from thirdhand.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS, OWN_NEAR_M
 from thirdhand.core.vectors import norm, squared_distance
 
-CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_STAGE, PROGRESS, OWN_BEGIN = range(7)
+CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_SEGMENT, PROGRESS, OWN_BEGIN = range(7)
 CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
 NOT_BEGUN, NEAR_BEGIN, GONE = 0.0, 1.0, 2.0  # progress: hands that rest, that moved, that left where they began
 WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
@@ -50,7 +50,7 @@ class TaskClock(NamedTuple):
     """Parameters of the clock of a skill."""
 
     waits: bool  # true if the clock waits while both hands rest
-    # As an input, a second counts as this length [m], with stages as this share of a segment. With
+    # As an input, a second counts as this length [m], with segments as this share of a path. With
     # 0, the clock is no input, and only tells when a task begins again.
     weight: float
     longest_s: float  # the clock stops at this time
@@ -66,7 +66,7 @@ class TaskClock(NamedTuple):
         return np.array([*self[:-1], *self.begin], np.float64)
 
     def rows(self, begins: Vector) -> Vector:
-        """The parameters (K, 13) in each of K stages that begin with the hands `begins` (K, 6)
+        """The parameters (K, 13) in each of K segments that begin with the hands `begins` (K, 6)
         [m].
         """
         out = np.tile(self.numbers, (len(begins), 1))
@@ -106,21 +106,23 @@ def _have_returned(hands: Vector, numbers: Vector, clock: Vector) -> bool:
 
 
 @compiled
-def count(hands: Vector, speed: float, still: float, period_s: float, stage: int, rows: Vector, clock: Vector) -> bool:
+def count(
+    hands: Vector, speed: float, still: float, period_s: float, segment: int, rows: Vector, clock: Vector
+) -> bool:
     """Advance a clock (12,) by one period `period_s` [s]; see the equations of this module. The
     faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
     `still`. Returns true if the task begins again.
 
     `clock` holds t [s], r, dr/dt' [1/s], the time [s] for which the hands may continue to rest, the
-    stage, the progress (NOT_BEGUN, NEAR_BEGIN or GONE), and where (6,) [m] these hands rested
-    before they began. `rows` (K, 13) are `TaskClock.numbers` of each stage; a task without stages
-    has one row.
+    segment, the progress (NOT_BEGUN, NEAR_BEGIN or GONE), and where (6,) [m] these hands rested
+    before they began. `rows` (K, 13) are `TaskClock.numbers` of each segment; a task without
+    segments has one row.
     """
-    numbers = rows[stage]
+    numbers = rows[segment]
     begins_again = False
-    if clock[CLOCK_STAGE] != stage:
-        clock[:CLOCK_STAGE] = 0.0
-        clock[CLOCK_STAGE] = stage
+    if clock[CLOCK_SEGMENT] != segment:
+        clock[:CLOCK_SEGMENT] = 0.0
+        clock[CLOCK_SEGMENT] = segment
 
     if clock[PROGRESS] == NOT_BEGUN and still > 0.5:
         clock[OWN_BEGIN:] = hands
@@ -138,7 +140,7 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
         has_rested = clock[REST_LEFT_S] <= numbers[REST_AT] - numbers[HOME_AT]
         if before_s > 0.0 and has_rested and _have_returned(hands, rows[0], clock):
             begins_again = True
-            clock[:CLOCK_STAGE] = 0.0
+            clock[:CLOCK_SEGMENT] = 0.0
             clock[PROGRESS] = NOT_BEGUN
         elif before_s > 0.0 and clock[REST_LEFT_S] == 0.0 and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
@@ -154,31 +156,33 @@ def count(hands: Vector, speed: float, still: float, period_s: float, stage: int
 
 @compiled
 def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
-    """Advance the clock in the state by `count`, in the most probable stage; memory and belief end
-    where the task begins again. The speeds are those of the hands `sides` (2,) without their
+    """Advance the clock in the state by `count`, in the most probable segment; memory and belief
+    end where the task begins again. The speeds are those of the hands `sides` (2,) without their
     tremor.
     """
-    state, hands, speed, still, stage = states[0], np.empty(6), 0.0, 1.0, 0
+    state, hands, speed, still, segment = states[0], np.empty(6), 0.0, 1.0, 0
     for i in range(2):
         hands[3 * i : 3 * i + 3] = state.hands[sides[i], 0]
         speed = max(speed, norm(state.hand_velocity_lowpass[sides[i]]))
         still = min(still, state.hand_stillness[sides[i]])
     for k in range(len(rows)):
-        if state.stage_belief[k] > state.stage_belief[stage]:
-            stage = k
-    if count(hands, speed, still, passed_s, stage, rows, state.task_clock):
+        if state.segment_belief[k] > state.segment_belief[segment]:
+            segment = k
+    if count(hands, speed, still, passed_s, segment, rows, state.task_clock):
         state.memory_ticks[:] = -1
-        state.stage_belief[:] = 0.0
+        state.segment_belief[:] = 0.0
         state.unprimed_belief[:] = 0.0
 
 
 @compiled
-def _counted(moving: Vector, stages: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector) -> None:
+def _counted(
+    moving: Vector, segments: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector
+) -> None:
     clock = np.zeros(CLOCK_SIZE)
     for t in range(len(moving)):
         for step in range(steps if t else 0):
             now = moving[t - 1] + (step + 1) / steps * (moving[t] - moving[t - 1])
-            count(now[:6], now[6], now[7], period_s / steps, stages[t], rows, clock)
+            count(now[:6], now[6], now[7], period_s / steps, segments[t], rows, clock)
         out[t] = clock[CLOCK_S]
 
 
@@ -188,14 +192,14 @@ def counted(
     stillness: Vector,
     period_s: float,
     rows: Vector,
-    stages: NDArray[np.int64] | None = None,
+    segments: NDArray[np.int64] | None = None,
 ) -> Vector:
-    """The clock (T,) [s] along hands (T, 6) [m], in the `stages` (T,). `speeds` (T,) [m/s] are
+    """The clock (T,) [s] along hands (T, 6) [m], in the `segments` (T,). `speeds` (T,) [m/s] are
     those of the faster hand, `stillness` (T,) is that of the less still one. `rows` are those of
     `count`.
     """
     out, steps = np.empty(len(hands)), max(1, math.ceil(period_s / MEMORY_STEP_S))
-    if stages is None:
-        stages = np.zeros(len(hands), np.int64)
-    _counted(np.column_stack([hands, speeds, stillness]), stages, period_s, steps, rows, out)
+    if segments is None:
+        segments = np.zeros(len(hands), np.int64)
+    _counted(np.column_stack([hands, speeds, stillness]), segments, period_s, steps, rows, out)
     return out

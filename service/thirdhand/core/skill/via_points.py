@@ -10,7 +10,7 @@ import numpy as np
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.numerics import LEAST_PULL_VARIANCE_SHARE, PULL_DECIMALS
-from thirdhand.core.skill.tuning import LEAST_SEGMENT_M, PULL_SHARPNESS_PER_M2
+from thirdhand.core.skill.tuning import LEAST_PATH_M, PULL_SHARPNESS_PER_M2
 
 NEIGHBOURS = 12  # of a via-point with a radius: two along each coordinate of both hands
 
@@ -36,14 +36,14 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
 
 def rest_of(point: ViaPoint, names: Sequence[str]) -> str:
     """The via-point of the task, of `names` in its order, at which hands rest that are at a
-    via-point: itself, or the end of the stage in which it acts; empty if there is none.
+    via-point: itself, or the end of the segment in which it acts; empty if there is none.
     """
-    return names[names.index(point.stage) + 1] if point.stage in names[:-1] else point.name
+    return names[names.index(point.segment) + 1] if point.segment in names[:-1] else point.name
 
 
 def sharpness_between(ends: Vector, via_points: Sequence[ViaPoint]) -> float:
     """Sharpness k [1/m²] of pulls that leave the tool as it is at the `ends` (E, 6) [m] of their
-    stage:
+    segment:
 
         k = max(PULL_SHARPNESS_PER_M2, ln(2) / d²)
 
@@ -53,7 +53,7 @@ def sharpness_between(ends: Vector, via_points: Sequence[ViaPoint]) -> float:
     """
     hands = neighbourhoods(via_points)[0]
     nearest_m = float(np.linalg.norm(hands[:, None] - ends, axis=2).min())
-    return max(PULL_SHARPNESS_PER_M2, math.log(2.0) / max(nearest_m, LEAST_SEGMENT_M) ** 2)
+    return max(PULL_SHARPNESS_PER_M2, math.log(2.0) / max(nearest_m, LEAST_PATH_M) ** 2)
 
 
 def pulls_through(

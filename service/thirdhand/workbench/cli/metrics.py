@@ -83,9 +83,9 @@ def _figures(now: Status) -> Iterator[Figure]:
     for kind, (words, codes) in (present | {"flag": (now.flags, Flag)}).items():
         for name in filter(None, map(word, codes)):
             yield kind, f"1 for each {kind} that is present.", name in words, {kind: name}
-    if now.stage:
-        stage = dict(zip(("begin", "end"), now.stage, strict=False))
-        yield "stage_probability", "Probability of the stage between two via-points.", now.stage_belief, stage
+    if now.segment:
+        segment = dict(zip(("begin", "end"), now.segment, strict=False))
+        yield "segment_probability", "Probability of the segment between two via-points.", now.segment_belief, segment
     for name in ("lateness_us", "work_us", "latency_ms"):
         unit_s, values = 1e-3 if name.endswith("_ms") else 1e-6, getattr(now, name)
         about = "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over 10 s."

@@ -1,11 +1,11 @@
-"""Division of demonstrations into the stages of their task, each from a via-point to the next.
+"""Division of demonstrations into the segments of their task, each from a via-point to the next.
 
-The stages k(t) are those of least cost (Viterbi 1967):
+The segments k(t) are those of least cost (Viterbi 1967):
 
     Σ_t c(k(t), t) dt / CORRELATED_S + Σ of the costs of changes
     c(k, t) = Σ_i min(d_i² / OFF_M², FARTHEST) / 2 - DIRECTED tanh(u_i / DIRECTION_SPEED_MPS)
 
-with i = left hand, right hand and tool, d_i its distance from its segment, and u_i its speed along
+with i = left hand, right hand and tool, d_i its distance from its path, and u_i its speed along
 it.
 """
 
@@ -24,9 +24,9 @@ from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.memory import along as filtered
 from thirdhand.core.skill.memory import turn_lag_s
-from thirdhand.core.skill.stages import (
+from thirdhand.core.skill.segments import (
     LEFT,
-    MOST_STAGES,
+    MOST_SEGMENTS,
     NONE,
     RIGHT,
 )
@@ -40,11 +40,11 @@ SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
 SAME_M = 0.05  # positions of a hand that are this near to each other in all demonstrations are the same
 OFF_M = 0.06  # unit of the distances d_i
 FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
-DIRECTED = 2.0  # gain of moving along the segment
+DIRECTED = 2.0  # gain of moving along the path
 CORRELATED_S = 0.2  # samples within this time count as one
-NEXT = 2.0  # cost of a change to the next stage
+NEXT = 2.0  # cost of a change to the next segment
 ANOTHER = 12.0  # cost of any other change
-LATER = 3.0  # cost of each stage that is left out at the beginning
+LATER = 3.0  # cost of each segment that is left out at the beginning
 NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
 LEAST_WEIGHT = 1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
@@ -61,8 +61,8 @@ def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
             "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
         )
     names = Counter(named).most_common(1)[0][0]
-    if not 2 <= len(names) <= MOST_STAGES + 1:
-        return None, f"{len(names)} named via-points: 2 to {MOST_STAGES + 1} are learned between"
+    if not 2 <= len(names) <= MOST_SEGMENTS + 1:
+        return None, f"{len(names)} named via-points: 2 to {MOST_SEGMENTS + 1} are learned between"
     at = np.array([[[*p.left, *p.right] for p in ordered(one.places, names)] for one in demonstrations])
     corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
     return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)])), ""
@@ -119,18 +119,18 @@ def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) ->
 
 @dataclass(frozen=True, eq=False)
 class Divided:
-    """A demonstration (T samples), divided into the stages of its task."""
+    """A demonstration (T samples), divided into the segments of its task."""
 
     demonstration: Demonstration
     at: NamedViaPoints
-    stages: Records  # (K,) at the via-points of the demonstration
+    segments: Records  # (K,) at the via-points of the demonstration
     moving: Vector  # (T, 3, 6) position, velocity and acceleration of the hands
     stillness: Vector  # (T, 2) of each hand, 0 to 1
-    labels: Indices  # (T,) numbers of the stages
+    labels: Indices  # (T,) numbers of the segments
 
     @staticmethod
     def of(task: Task, demonstration: Demonstration) -> Divided:
-        """The stages of a demonstration."""
+        """The segments of a demonstration."""
         period_s = demonstration.period_s
         window = round(SMOOTHED_S / period_s)
         hands, smooth_tool = (
@@ -142,9 +142,9 @@ class Divided:
         )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
         at = NamedViaPoints.of(demonstration.places)
-        stages = _stages(task, at)
-        labels = _divided(stages, moving, (smooth_tool, tool_velocities), period_s)
-        return Divided(demonstration, at, stages, moving, stillness_of(velocities, period_s), labels)
+        segments = _segments(task, at)
+        labels = _divided(segments, moving, (smooth_tool, tool_velocities), period_s)
+        return Divided(demonstration, at, segments, moving, stillness_of(velocities, period_s), labels)
 
     @property
     def tool(self) -> Vector:
@@ -157,28 +157,28 @@ class Divided:
         return self.demonstration.period_s
 
     def in_task(self, task: Task) -> Divided:
-        """The same stages of a task in which other hands lead, or the tool follows
+        """The same segments of a task in which other hands lead, or the tool follows
         others, or turns with them."""
-        return replace(self, stages=_stages(task, self.at))
+        return replace(self, segments=_segments(task, self.at))
 
     def turns(self, late_s: float) -> Vector:
         """The entries (T, 18) of the hands' rotation matrices, filtered so that they are `late_s`
         late; (T, 0) if the tool does not turn with the hands.
         """
-        if not self.stages["turned"].any():
+        if not self.segments["turned"].any():
             return np.empty((len(self.labels), 0))
         return filtered(self.demonstration.turns, self.period_s, turn_lag_s(late_s), TURNS)[:, -1]
 
     def late(self, late_s: float) -> Encoded:
-        """The shares of the stages, for a teacher whose tool is late by `late_s`."""
-        steps, labels, stages, tool = round(late_s / self.period_s), self.labels, self.stages, self.tool
+        """The shares of the segments, for a teacher whose tool is late by `late_s`."""
+        steps, labels, segments, tool = round(late_s / self.period_s), self.labels, self.segments, self.tool
         hands, rested = (
             self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
         )
         hands = np.hstack([hands, self.turns(late_s)])
-        found = covered(hands, rested, labels, stages)
+        found = covered(hands, rested, labels, segments)
         along, off = found[:, :2], found[:, 2:]
-        begins, way = stages["tool"][labels], stages["tool_way"][labels]
+        begins, way = segments["tool"][labels], segments["tool_way"][labels]
         square = (way**2).sum(axis=1)
         goes = square > SAME_M**2
         share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
@@ -190,23 +190,23 @@ class Divided:
 
 @dataclass(frozen=True, eq=False)
 class Encoded(Divided):
-    """A divided demonstration in shares of its stages."""
+    """A divided demonstration in shares of its segments."""
 
     hands: Vector  # (T, 6) [m] positions of the hands, delayed as the tool is; (T, 24) with their turns
-    along: Vector  # (T, 2) shares of the stage that the hands have covered
-    off: Vector  # (T, 2) [m] distances of the hands from their segments
-    wanted: Vector  # (T, OUTPUTS) share of the stage that the tool has covered, and its offset (3,) [m]
+    along: Vector  # (T, 2) shares of the segment that the hands have covered
+    off: Vector  # (T, 2) [m] distances of the hands from their paths
+    wanted: Vector  # (T, OUTPUTS) share of the segment that the tool has covered, and its offset (3,) [m]
 
     def tools(self, rows: Indices, outputs: Vector) -> Vector:
         """Tool positions (M, 3) [m] for outputs (M, OUTPUTS) of the primitive at rows (M,)."""
         labels, share = self.labels[rows], outputs[:, 0]
-        out = self.stages["tool"][labels] + share[:, None] * self.stages["tool_way"][labels] + outputs[:, 1:]
-        all_followed(self.hands[rows], share.clip(0.0, 1.0), labels, self.stages, out)
+        out = self.segments["tool"][labels] + share[:, None] * self.segments["tool_way"][labels] + outputs[:, 1:]
+        all_followed(self.hands[rows], share.clip(0.0, 1.0), labels, self.segments, out)
         return np.asarray(out)
 
-    def near(self, corner: tuple[float, float], stages: Sequence[int]) -> NDArray[np.bool_]:
-        """Return whether the hands' shares are near these in one of these stages (T,)."""
-        return np.asarray(np.isin(self.labels, stages) & (np.abs(self.along - corner).max(axis=1) < NEAR))
+    def near(self, corner: tuple[float, float], segments: Sequence[int]) -> NDArray[np.bool_]:
+        """Return whether the hands' shares are near these in one of these segments (T,)."""
+        return np.asarray(np.isin(self.labels, segments) & (np.abs(self.along - corner).max(axis=1) < NEAR))
 
     def rows(self, count: int) -> Indices:
         """About `count` rows, evenly along the path of hands and tool, and a little along time."""
@@ -216,8 +216,8 @@ class Encoded(Divided):
         return np.asarray(np.unique(kept), np.int64)
 
 
-def _stages(task: Task, at: NamedViaPoints) -> Records:
-    return task.stages(at, np.full((len(task.names) - 1, 2), OFF_M))
+def _segments(task: Task, at: NamedViaPoints) -> Records:
+    return task.segments(at, np.full((len(task.names) - 1, 2), OFF_M))
 
 
 def encode(task: Task, shown: Sequence[Divided], late_s: Sequence[float]) -> tuple[Task, list[Encoded]]:
@@ -238,8 +238,8 @@ def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
         l = Σ_t w_t R_tᵀ (x_t - h_t) / Σ_t w_t
 
     with the tool x and the hand's position h and rotation matrix R, delayed as the tool is. With
-    the tool's share s, w = sⁿ in the stage that ends at the via-point and (1 - s)ⁿ in the one that
-    begins there.
+    the tool's share s, w = sⁿ in the segment that ends at the via-point and (1 - s)ⁿ in the one
+    that begins there.
     """
     if side == NONE:
         return np.zeros(3)
@@ -254,13 +254,13 @@ def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
     return np.asarray(total / weight)
 
 
-def _divided(stages: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
-    """The stages (T,) of least cost, for the motion (T, 3, 6) of the hands and the positions and
+def _divided(segments: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
+    """The segments (T,) of least cost, for the motion (T, 3, 6) of the hands and the positions and
     velocities (T, 3) of the tool.
     """
-    count, cost = len(stages), np.zeros((len(moving), len(stages)))
-    ways = [(stages["begins"][:, i], stages["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
-    ways.append((stages["tool"], stages["tool_way"], *tool, 0))
+    count, cost = len(segments), np.zeros((len(moving), len(segments)))
+    ways = [(segments["begins"][:, i], segments["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
+    ways.append((segments["tool"], segments["tool_way"], *tool, 0))
     for begins, way, points, velocities, first in ways:
         at, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
         square = (way**2).sum(axis=1)

@@ -1,5 +1,5 @@
 """Picture of a skill's evidence: errors of held-out demonstrations and their predicted deviations,
-regions, the gate, and the stages of one demonstration.
+regions, the gate, and the segments of one demonstration.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
 GREYS = {"wrong: swapped": "0.7", "wrong: both beside": "0.5", "wrong: one beside": "0.3"}
 BANDS = [palette.written(one) for one in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]
-MOST_NAMED = 12  # stages in the legend
-LEAST_BAND = 0.02  # a stage's band has its number if it lasts for this share of the time
+MOST_NAMED = 12  # segments in the legend
+LEAST_BAND = 0.02  # a segment's band has its number if it lasts for this share of the time
 
 
 def draw(evidence: Evidence, path: Path) -> None:
@@ -35,18 +35,18 @@ def draw(evidence: Evidence, path: Path) -> None:
 
 
 def drawn(evidence: Evidence) -> Figure:
-    """The picture; for a staged skill with the stages of one demonstration."""
+    """The picture; for a segmented skill with the segments of one demonstration."""
     from matplotlib.figure import Figure  # loads slowly, and few need it
     from matplotlib.ticker import LogFormatter
 
     skill, held_out = evidence.skill, evidence.held_out
-    is_staged = held_out[0].belief is not None
-    mosaic = "ae;rg;ss" if is_staged else "ae;rg"
+    is_segmented = held_out[0].belief is not None
+    mosaic = "ae;rg;ss" if is_segmented else "ae;rg"
     figure = Figure(figsize=(11, 3.75 * len(mosaic.split(";"))), layout="constrained", dpi=110)
     parts = figure.subplot_mosaic(mosaic)
     above, errors, regions, gate = (parts[name] for name in "aerg")
-    if is_staged:
-        _draw_stages(evidence, parts["s"])
+    if is_segmented:
+        _draw_segments(evidence, parts["s"])
 
     above.set(title="the tool from above", xlabel="x [m]", ylabel="y [m]")
     for i, one in enumerate(held_out):
@@ -101,9 +101,9 @@ def drawn(evidence: Evidence) -> Figure:
     return figure
 
 
-def _draw_stages(evidence: Evidence, axes: Axes) -> None:
-    """Draw the held-out demonstration with the median error over time: its most probable stages as
-    bands, and the tool's error.
+def _draw_segments(evidence: Evidence, axes: Axes) -> None:
+    """Draw the held-out demonstration with the median error over time: its most probable segments
+    as bands, and the tool's error.
     """
     names, rows = evidence.skill.model.names, evidence.figures.demonstrations
     h = int(np.argsort([row.error_mm for row in rows])[len(rows) // 2])
@@ -126,7 +126,7 @@ def _draw_stages(evidence: Evidence, axes: Axes) -> None:
     axes.plot(times, off_mm, color=TOOL, lw=2, label="error of the predicted tool")
     axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration")
     highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))  # the first predictions are uncertain
-    axes.set(title=f"{rows[h].name}, held out: its most probable stage, and the error", xlabel="[s]", ylabel="[mm]")
+    axes.set(title=f"{rows[h].name}, held out: its most probable segment, and the error", xlabel="[s]", ylabel="[mm]")
     axes.set(xlim=(0, times[-1]), ylim=(0, 1.15 * highest_mm))
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=4)
 

@@ -145,7 +145,7 @@ class HeldOut(NamedTuple):
     gate_m: Vector
     inputs: Vector
     known: Vector
-    belief: Vector | None = None  # (T, K) probability of each of K stages; None if there are no stages
+    belief: Vector | None = None  # (T, K) probability of each of K segments; None if there are no segments
     timed: TimedErrors | None = None  # None: they follow from the errors
 
 

@@ -24,7 +24,7 @@ from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import of_one
 from thirdhand.workbench.learning.ambiguity import same_hands_m
 from thirdhand.workbench.learning.methods import Method, method_of
-from thirdhand.workbench.learning.methods.staged import Staged
+from thirdhand.workbench.learning.methods.segmented import Segmented
 from thirdhand.workbench.learning.records import (
     Fitted,
     HeldOut,
@@ -104,7 +104,7 @@ def divided(
             for some in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
-    if options.delay_s is not None and not isinstance(method, Staged):
+    if options.delay_s is not None and not isinstance(method, Segmented):
         raise SkillError("a delay goes with via-points that all demonstrations name; without them it is learned too")
     if before:
         _check_alike(demonstrations, names, before)

@@ -34,7 +34,7 @@ KEPT = (
     *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
     *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
     "stale_ticks",
-    *("rejected", "mode", "reason", "flags", "commanded", "stage", "stage_belief", "error_probability", "closure"),
+    *("rejected", "mode", "reason", "flags", "commanded", "segment", "segment_belief", "error_probability", "closure"),
 )
 MOTION = (
     "setpoint",

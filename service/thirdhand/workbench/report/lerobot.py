@@ -1,5 +1,5 @@
-"""Recordings as a data set of LeRobot, version 3.0: joints and hands seen, images, the stage of the
-task, joints and gripper commanded.
+"""Recordings as a data set of LeRobot, version 3.0: joints and hands seen, images, the segment of
+the task, joints and gripper commanded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
     """The parts of a recording without gaps in which commands were sent and both hands had been
     seen: the `FEATURES` by name, a row every 1/fps s, from the newest tick. With them `times_ns`
     (N,), `action.gripper` (N,), the predicted closure, -1 if the skill has no gripper, and
-    `observation.stage` (N,), the number of the most probable stage, -1 without one.
+    `observation.segment` (N,), the number of the most probable segment, -1 without one.
 
     Joints are those of the newest joint state; before the first one, the previous command.
     """
@@ -58,7 +58,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             values = (seen, frames["hands"][rows].reshape(-1, len(HANDS)), frames["joints"][rows])
             part: Episode = {name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)}
             part["action.gripper"] = frames["closure"][rows].astype(np.float32)
-            part["observation.stage"] = np.where(frames["stage_belief"][rows] > 0, frames["stage"][rows], -1)
+            part["observation.segment"] = np.where(frames["segment_belief"][rows] > 0, frames["segment"][rows], -1)
             yield part | {"times_ns": found.times_ns[found.ticks.searchsorted(frames["tick"][rows])]}
 
 

@@ -27,7 +27,7 @@ from thirdhand.recordings.recording import Recording
 from thirdhand.skills.corrections import offer_of
 from thirdhand.workbench.report.causes import before, why
 from thirdhand.workbench.report.columns import Columns, read, runs
-from thirdhand.workbench.report.stages import stages
+from thirdhand.workbench.report.segments import segments
 from thirdhand.workbench.report.visits import places
 
 SHARES = (50, 99, 100)
@@ -181,7 +181,7 @@ class Report:
         self.lag_mm = Percentiles.of(lag_mm[reached:][~engaging])  # tool to target afterwards, once it has engaged
         self.approach = _approach(columns, self.spans)
         self.places = tuple(places(columns))
-        self.stages = tuple(stages(columns))
+        self.segments = tuple(segments(columns))
         self.limits = tuple(_limits(columns))
         self.binding = tuple(_binding(columns))
         self.tool_limits = _tool_limits(columns, following)

@@ -65,10 +65,10 @@ def _tables(report: Report) -> Iterator[Table]:
         numbers=0,
     )
     yield Table(
-        "stages",
-        "Stages of the task",
-        ("from [s]", "for [s]", "stage", "probability [%]"),
-        tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.stages),
+        "segments",
+        "Segments of the task",
+        ("from [s]", "for [s]", "segment", "probability [%]"),
+        tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.segments),
         numbers=0,
     )
     yield Table(

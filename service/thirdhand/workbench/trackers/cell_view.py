@@ -24,7 +24,7 @@ from thirdhand.contract.requests import Reply, Status
 MAX_STATUS_BYTES = 262_144  # a daemon's has 3 to 10 kB, and more with many via-points
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 SHOWN_FIELDS = (
-    *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "stage", "stage_belief"),
+    *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "segment", "segment_belief"),
     *("demonstrated_m", "hands_at_m", "trackers"),
 )
 

@@ -11,7 +11,7 @@ from typing import Protocol, Self
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.methods.inputs import HandInputs
 from thirdhand.workbench.learning.methods.mixture import Mixture
-from thirdhand.workbench.learning.methods.staged import Staged
+from thirdhand.workbench.learning.methods.segmented import Segmented
 from thirdhand.workbench.learning.records import (
     Fitted,
     Options,
@@ -34,7 +34,7 @@ class Method(Protocol):
         """
 
 
-METHODS: tuple[type[Method], ...] = (Mixture, Staged, HandInputs)  # the last one applies to all demonstrations
+METHODS: tuple[type[Method], ...] = (Mixture, Segmented, HandInputs)  # the last one applies to all demonstrations
 
 
 def method_of(demonstrations: Sequence[Demonstration], options: Options) -> Method:

@@ -18,7 +18,7 @@ from thirdhand.core.frame import (
 )
 from thirdhand.core.intake.stage import Intake
 from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
-from thirdhand.core.skill.tuning import CLOCK_START_MPS, LEAST_SEGMENT_M, OWN_NEAR_M
+from thirdhand.core.skill.tuning import CLOCK_START_MPS, LEAST_PATH_M, OWN_NEAR_M
 from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.regions import blocks_of
@@ -26,7 +26,7 @@ from thirdhand.workbench.learning.regions import blocks_of
 LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
 LEAST_REST_S = 1.0  # a shorter rest is no pause
 LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
-HALF_WAY = 0.5  # on this share of the way to the end, or to another stage's begin, hands are not at the begin
+HALF_WAY = 0.5  # on this share of the way to the end, or to another segment's begin, hands are not at the begin
 LEAST_NEAR_M = 2.0 * OWN_NEAR_M  # hands within this distance of where demonstrations begin have returned there
 NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of their begins from the mean
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
@@ -78,9 +78,9 @@ class Tempo(NamedTuple):
             clock.numbers[None],
         )
 
-    def in_stages(self, rows: Vector, stages: NDArray[np.int64]) -> Vector:
-        """The clock (T,) [s] in these stages (T,), with the parameters `rows` of the clock."""
-        return counted(self.hands, self.speeds.max(axis=1), self.stillness.min(axis=1), self.period_s, rows, stages)
+    def in_segments(self, rows: Vector, segments: NDArray[np.int64]) -> Vector:
+        """The clock (T,) [s] in these segments (T,), with the parameters `rows` of the clock."""
+        return counted(self.hands, self.speeds.max(axis=1), self.stillness.min(axis=1), self.period_s, rows, segments)
 
     def rested_s(self, alone: int | None) -> Vector:
         """Times (T,) [s] since the hands moved; 0 before their first motion."""
@@ -136,33 +136,33 @@ def _endless(
     return TaskClock(waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6)
 
 
-def stage_clock_of(
+def segment_clock_of(
     tempos: Sequence[Tempo], placed: Sequence[Records], labels: Sequence[NDArray[np.int64]], *, waits: bool
 ) -> TaskClock:
-    """The clock of the stages (K,) of demonstrations with these tempos and labels (T,), with a
-    weight of 1. Only where a stage begins does a rest start it anew.
+    """The clock of the segments (K,) of demonstrations with these tempos and labels (T,), with a
+    weight of 1. Only where a segment begins does a rest start it anew.
     """
-    begins = [begins_of(stages) for stages in placed]
+    begins = [begins_of(segments) for segments in placed]
     near_m = min(LEAST_NEAR_M, *(HALF_WAY * _nearest_m(hands) for hands in begins))
     free = _endless(tempos, [hands[0] for hands in begins], near_m, None, waits=waits)
     ends_s = [
-        float(tempo.in_stages(free.rows(hands), label).max())
+        float(tempo.in_segments(free.rows(hands), label).max())
         for tempo, hands, label in zip(tempos, begins, labels, strict=True)
     ]
     return free._replace(longest_s=max(ends_s))
 
 
-def begins_of(stages: Records) -> Vector:
-    """The hands (K, 6) [m] with which each of K stages begins."""
-    return np.asarray(stages["begins"].reshape(-1, 6))
+def begins_of(segments: Records) -> Vector:
+    """The hands (K, 6) [m] with which each of K segments begins."""
+    return np.asarray(segments["begins"].reshape(-1, 6))
 
 
 def _nearest_m(begins: Vector) -> float:
     """The distance [m] of the hand that moves farther, from where the task begins (K, 6) to the
-    nearest begin of another stage at which the hands are elsewhere.
+    nearest begin of another segment at which the hands are elsewhere.
     """
     distances_m = np.linalg.norm((begins[1:] - begins[0]).reshape(-1, 2, 3), axis=2).max(axis=1)
-    return float(distances_m[distances_m > LEAST_SEGMENT_M].min(initial=math.inf))
+    return float(distances_m[distances_m > LEAST_PATH_M].min(initial=math.inf))
 
 
 def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:

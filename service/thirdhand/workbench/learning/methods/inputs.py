@@ -102,7 +102,7 @@ class HandInputs:
     """The method with its options."""
 
     options: Options
-    why_not_staged: str  # empty if no demonstration names via-points
+    why_not_segmented: str  # empty if no demonstration names via-points
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], options: Options) -> Self:
@@ -115,7 +115,7 @@ class HandInputs:
         If a skill is refined, the weight of the new takes is chosen with the kind.
         """
         takes, earlier = taught.new, taught.earlier
-        remarks = [self.why_not_staged] if self.why_not_staged else []
+        remarks = [self.why_not_segmented] if self.why_not_segmented else []
         points, ell = self.options.points, self.options.ell
         tempos = [Tempo.of(take.demonstration) for take in taught.all]
         found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)

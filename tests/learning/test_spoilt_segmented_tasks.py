@@ -14,7 +14,7 @@ from support import spoiled
 from support.cell import told
 from support.paths import RECORDINGS
 from support.skills import figures_of
-from thirdhand.core.skill.staged import StagedKMP
+from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
@@ -27,9 +27,9 @@ SIDES = ("left", "right", "tool")
 
 
 class Learned(NamedTuple):
-    """What is compared of a staged skill."""
+    """What is compared of a segmented skill."""
 
-    stages: int
+    segments: int
     gate_mm: float
     held_out_mm: float  # root mean square of its own figures
     others_mm: float  # of people who taught nothing, with their takes as they were
@@ -55,15 +55,15 @@ def learned(folder: Path, spoil: spoiled.Spoil | None) -> Learned:
     done = told("learn", *map(str, files), "--output", str(out))
     assert done.returncode == 0, done.stderr
     skill = decoded(out.read_bytes(), origin="a file")
-    assert isinstance(skill.model, StagedKMP)
+    assert isinstance(skill.model, SegmentedKMP)
     figures, squares, samples = figures_of(skill), 0.0, 0
     for number in HELD_OUT:
         other = read_demonstration(RECORDINGS / f"people/demonstration-{number}.mcap")
         seen = left_out("", "", other)
         one = judged(seen, predicted(adapted(skill, other.places, tolerance=0.05), seen))
         squares, samples = squares + one.squares, samples + one.samples
-    stages = len(skill.model.task.corners)
-    return Learned(stages, figures.gate_mm, figures.all.error_mm, 1000 * float(np.sqrt(squares / samples)))
+    segments = len(skill.model.task.corners)
+    return Learned(segments, figures.gate_mm, figures.all.error_mm, 1000 * float(np.sqrt(squares / samples)))
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +72,14 @@ def unspoilt(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 
 
 @pytest.mark.parametrize("spoil", [*spoiled.SPOILS, *spoiled.SUBTLE], ids=lambda spoil: str(spoil.__name__))
-def test_a_staged_skill_of_spoilt_takes_is_that_of_the_takes_as_they_were(
+def test_a_segmented_skill_of_spoilt_takes_is_that_of_the_takes_as_they_were(
     spoil: spoiled.Spoil, unspoilt: Learned, tmp_path: Path
 ) -> None:
-    """Its stages, its gate and its error on other people are the same. The error of the skill's own
-    figures is of fewer seconds of six takes, between 12 and 81 mm each: it differs more.
+    """Its segments, its gate and its error on other people are the same. The error of the skill's
+    own figures is of fewer seconds of six takes, between 12 and 81 mm each: it differs more.
     """
     got = learned(tmp_path, spoil)
-    assert got.stages == unspoilt.stages
+    assert got.segments == unspoilt.segments
     assert got.gate_mm == pytest.approx(unspoilt.gate_mm, rel=0.05)
     assert got.others_mm == pytest.approx(unspoilt.others_mm, rel=0.1)
     assert got.held_out_mm < 1.6 * unspoilt.held_out_mm

@@ -17,9 +17,9 @@ from support.skills import STILL, at_rest, figures_of, file_with, made, turns_of
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.memory import turn_lag_s
+from thirdhand.core.skill.segmented import SegmentedKMP
+from thirdhand.core.skill.segments import LEFT, NONE
 from thirdhand.core.skill.skill import Skill
-from thirdhand.core.skill.staged import StagedKMP
-from thirdhand.core.skill.stages import LEFT, NONE
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import (
     SkillError,
@@ -62,7 +62,7 @@ def moved(places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]
 
 @pytest.mark.thorough
 def test_places_of_a_hand_that_are_one_are_found(between: Skill) -> None:
-    assert isinstance(between.model, StagedKMP)
+    assert isinstance(between.model, SegmentedKMP)
     task = between.model.task
     assert task.names == ("start", "handover", "glass", "soldering")
     assert task.corners.tolist() == [[0, 0], [1, 0], [2, 1], [2, 2]]
@@ -83,10 +83,10 @@ def test_the_tool_goes_to_the_places_that_are_told_and_with_the_hand_where_it_fo
 
 
 def test_a_moving_hand_is_on_its_way_and_a_trembling_one_moves_nothing(between: Skill) -> None:
-    assert isinstance(between.model, StagedKMP)
-    stage, belief = between.model.placed.stages[1], np.zeros(64)
+    assert isinstance(between.model, SegmentedKMP)
+    segment, belief = between.model.placed.segments[1], np.zeros(64)
     belief[1] = 1.0
-    half, way = stage["begins"] + 0.5 * stage["way"], stage["way"] / np.linalg.norm(stage["way"])
+    half, way = segment["begins"] + 0.5 * segment["way"], segment["way"] / np.linalg.norm(segment["way"])
     going = np.zeros(2)
 
     def at(hands: np.ndarray) -> np.ndarray:
@@ -156,9 +156,9 @@ def test_its_file_holds_it_exactly_and_what_does_not_fit_is_refused(between: Ski
     assert "no skill has" in refusal(more=np.zeros(3))
 
 
-def test_places_near_each_other_are_taught_as_stages_tell_them_apart(between: Skill) -> None:
+def test_places_near_each_other_are_taught_as_segments_tell_them_apart(between: Skill) -> None:
     model = between.model
-    assert isinstance(model, StagedKMP)
+    assert isinstance(model, SegmentedKMP)
     at = model.nominal.at.copy()
     one, other = 1, 2
     corners = model.task.corners
@@ -241,7 +241,7 @@ def on_path() -> list[Demonstration]:
 
 def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
     skill = learn(shown, name="path")
-    assert isinstance(skill.model, StagedKMP)
+    assert isinstance(skill.model, SegmentedKMP)
     assert decoded(skill.file, origin="memory").model.task.leads == skill.model.task.leads
     return skill.model.task.leads, figures_of(skill)
 
@@ -285,7 +285,7 @@ def test_a_tool_that_is_fixed_to_what_a_hand_carries_turns_with_that_hand(carrie
     figures = figures_of(carried)
     assert figures.taken == "orientation of the left hand"
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
-    assert isinstance(carried.model, StagedKMP)
+    assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
     assert rms_mm("heading", carried) < 22.0  # without the orientation: 39; a Gaussian process told the places: 80
     again = decoded(carried.file, origin="a file")

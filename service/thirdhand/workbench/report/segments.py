@@ -1,4 +1,4 @@
-"""The most probable stages of the task during a session."""
+"""The most probable segments of the task during a session."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thirdhand.core.skill.stages import MOST_STAGES
+from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.workbench.report.columns import Columns, runs
 
-LEAST_S = 0.3  # a shorter stage is taken for hesitation, and merged with the one before
+LEAST_S = 0.3  # a shorter segment is taken for hesitation, and merged with the one before
 
 
-class Stage(NamedTuple):
-    """A stage from one via-point to the next: start since the first tick and duration [s], and the
-    median of its probability.
+class Segment(NamedTuple):
+    """A segment from one via-point to the next: start since the first tick and duration [s], and
+    the median of its probability.
     """
 
     start_s: float
@@ -25,16 +25,16 @@ class Stage(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The via-points at which the stage begins and ends."""
+        """The via-points at which the segment begins and ends."""
         return f"{self.begins} to {self.ends}"
 
 
-def stages(columns: Columns) -> list[Stage]:
-    """The stages, in order; none if the skill has no via-points."""
-    frames, times, found = columns.frames, columns.times, list[Stage]()
-    numbers = np.where(frames["stage_belief"] > 0, frames["stage"], -1)
+def segments(columns: Columns) -> list[Segment]:
+    """The segments, in order; none if the skill has no via-points."""
+    frames, times, found = columns.frames, columns.times, list[Segment]()
+    numbers = np.where(frames["segment_belief"] > 0, frames["segment"], -1)
     in_force = np.searchsorted([one.tick for one in columns.skills], frames["tick"], side="right") - 1
-    for begin, end in runs(in_force * (MOST_STAGES + 1) + numbers):
+    for begin, end in runs(in_force * (MOST_SEGMENTS + 1) + numbers):
         names = columns.skills[in_force[begin]].skill.model.names if in_force[begin] >= 0 else ()
         if not 0 <= numbers[begin] < len(names) - 1:
             continue
@@ -44,6 +44,6 @@ def stages(columns: Columns) -> list[Stage]:
         if before is not None and ((begins, ends) == (before.begins, before.ends) or lasts_s < LEAST_S):
             found[-1] = before._replace(lasts_s=float(times[end - 1]) + columns.period_s - before.start_s)
         else:
-            probable = float(np.median(frames["stage_belief"][begin:end]))
-            found.append(Stage(float(times[begin]), lasts_s, begins, ends, probable))
+            probable = float(np.median(frames["segment_belief"][begin:end]))
+            found.append(Segment(float(times[begin]), lasts_s, begins, ends, probable))
     return found

@@ -1,4 +1,4 @@
-"""`python docs/segment_picture.py` draws segment.png: the share of its segment that a hand has
+"""`python docs/path_picture.py` draws path.png: the share of its path that a hand has
 covered, as the skill between via-points computes it.
 """
 
@@ -15,24 +15,24 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from thirdhand.core.frame import structured
-from thirdhand.core.skill.stages import STAGE, along_way, on_way
+from thirdhand.core.skill.segments import SEGMENT, along_way, on_way
 
-PICTURE = Path(__file__).with_name("segment.png")
+PICTURE = Path(__file__).with_name("path.png")
 DPI = 90
-LONG_M, SHORT_M = 0.5, 0.2  # lengths of two segments
-HAND = np.array([0.22, 0.09, 0.0])  # beside a segment along the first axis
+LONG_M, SHORT_M = 0.5, 0.2  # lengths of two paths
+HAND = np.array([0.22, 0.09, 0.0])  # beside a path along the first axis
 
 
-def stage_of(length_m: float) -> np.record:
-    """A stage in which the left hand moves straight along the first axis."""
-    stage = structured(1, STAGE)
-    stage["way"][0, 0, 0], stage["square"][0, 0] = length_m, length_m**2
-    return stage[0]
+def segment_of(length_m: float) -> np.record:
+    """A segment in which the left hand moves straight along the first axis."""
+    segment = structured(1, SEGMENT)
+    segment["way"][0, 0, 0], segment["square"][0, 0] = length_m, length_m**2
+    return segment[0]
 
 
-def draw_segment(axes: Axes) -> None:
-    """A hand beside its segment, with λ and d."""
-    share, off_m = on_way(HAND, stage_of(LONG_M), 0)
+def draw_path(axes: Axes) -> None:
+    """A hand beside its path, with λ and d."""
+    share, off_m = on_way(HAND, segment_of(LONG_M), 0)
     foot = share * LONG_M
     axes.annotate("", (LONG_M, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 2})
     axes.plot([0.0, LONG_M], [0.0, 0.0], "o", color="tab:blue")
@@ -44,8 +44,8 @@ def draw_segment(axes: Axes) -> None:
     axes.text(0.5 * foot, -0.055, f"λ w, λ = {share:g}", ha="center", color="0.3")
     axes.text(0.0, -0.055, "via-point b", ha="center")
     axes.text(LONG_M, -0.055, "next via-point", ha="center")
-    axes.text(0.75 * LONG_M, 0.012, "segment w", ha="center", color="tab:blue")
-    axes.set(xlim=(-0.08, LONG_M + 0.12), ylim=(-0.09, 0.15), title="Where a hand is in a stage")
+    axes.text(0.75 * LONG_M, 0.012, "path w", ha="center", color="tab:blue")
+    axes.set(xlim=(-0.08, LONG_M + 0.12), ylim=(-0.09, 0.15), title="Where a hand is in a segment")
     axes.set_aspect("equal")
     axes.axis("off")
 
@@ -55,10 +55,10 @@ def draw_shares(axes: Axes) -> None:
     covered = np.linspace(0.0, 1.0, 201)
     axes.plot(covered, covered, color="0.5", label="the hand moves")
     for length_m, style in ((LONG_M, "-"), (SHORT_M, "--")):
-        stage = stage_of(length_m)
-        shares = [along_way(np.array([x * length_m, 0.0, 0.0]), 1.0, stage, 0) for x in covered]
-        axes.plot(covered, shares, style, color="tab:orange", label=f"it rests, segment of {length_m:g} m")
-    axes.set(xlabel="λ", ylabel="share of the segment", title="Resting hands are drawn to the ends")
+        segment = segment_of(length_m)
+        shares = [along_way(np.array([x * length_m, 0.0, 0.0]), 1.0, segment, 0) for x in covered]
+        axes.plot(covered, shares, style, color="tab:orange", label=f"it rests, path of {length_m:g} m")
+    axes.set(xlabel="λ", ylabel="share of the path", title="Resting hands are drawn to the ends")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
 
@@ -66,7 +66,7 @@ def draw_shares(axes: Axes) -> None:
 def main() -> None:
     """Draw the picture beside this file."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), width_ratios=(1.3, 1.0), layout="constrained")
-    draw_segment(left)
+    draw_path(left)
     draw_shares(right)
     figure.savefig(PICTURE, dpi=DPI)
 

@@ -1,10 +1,10 @@
-"""Learning of a task with named via-points: a KMP from the share of a stage that each hand has
+"""Learning of a task with named via-points: a KMP from the share of a segment that each hand has
 covered to the share that the tool covers, with the teacher's delay and the errors of held-out
 demonstrations.
 
-A stage lies between two via-points. The skill estimates the present stage by the belief b (K,) over
-the K stages. This is the forward filter of a hidden Markov model with transition rates A and
-likelihoods l, see `thirdhand.core.skill.stages.recognise`:
+A segment lies between two via-points. The skill estimates the present segment by the belief b (K,)
+over the K segments. This is the forward filter of a hidden Markov model with transition rates A and
+likelihoods l, see `thirdhand.core.skill.segments.recognise`:
 
     b(t) ~ l(t) ∘ (I + dt A)ᵀ b(t - dt)
 
@@ -27,15 +27,15 @@ from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.memory import along
-from thirdhand.core.skill.staged import (
+from thirdhand.core.skill.segmented import (
     NO_ERRORS,
     Placed,
-    StagedKMP,
+    SegmentedKMP,
     Unknown,
 )
-from thirdhand.core.skill.stages import (
+from thirdhand.core.skill.segments import (
     LEFT,
-    MOST_STAGES,
+    MOST_SEGMENTS,
     NONE,
     OUTPUTS,
     RIGHT,
@@ -43,7 +43,7 @@ from thirdhand.core.skill.stages import (
 )
 from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
 from thirdhand.core.skill.task_clock import TaskClock
-from thirdhand.core.skill.tuning import STAGE_DISTANCE, STAGE_DISTANCE_BESIDE, TURN_WEIGHT_M
+from thirdhand.core.skill.tuning import SEGMENT_DISTANCE, SEGMENT_DISTANCE_BESIDE, TURN_WEIGHT_M
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.recognition import covered, recognised
 from thirdhand.workbench.learning.choice import shared_counts
@@ -68,7 +68,7 @@ from thirdhand.workbench.learning.methods.clock import (
     begins_of,
     paired,
     remark_on,
-    stage_clock_of,
+    segment_clock_of,
 )
 from thirdhand.workbench.learning.methods.held_out import held_out_takes
 from thirdhand.workbench.learning.methods.inputs import (
@@ -98,9 +98,9 @@ SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
 SAMPLES_TRIED = 200  # delays and inputs are compared with about this number of samples of a demonstration
-LEAST_OFF_M = 0.03  # lower limit of the hands' distance from a segment, root mean square; few takes may show less
+LEAST_OFF_M = 0.03  # lower limit of the hands' distance from a path, root mean square; few takes may show less
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
-CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its segment, the other still at the start
+CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its path, the other still at the start
 SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the path to a corner that was demonstrated
 UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
 KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the longest clock at which the tool's share is known
@@ -110,7 +110,7 @@ HOLD_SHARE = 0.005  # share of the time that the gate may hold: the tool follows
 OWN_DELAY_SHARE = 0.75  # the new takes get a delay of their own if it reduces their error to this share
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
 WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
-PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the segment, no offset
+PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the path, no offset
 
 
 class Hyperparameters(NamedTuple):
@@ -141,7 +141,7 @@ class Samples(NamedTuple):
     @classmethod
     def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
         """The samples of demonstrations, of which the first `new` are new, without a clock."""
-        count = len(encoded[0].stages)
+        count = len(encoded[0].segments)
         counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
         each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
         shares, labels, outputs = (
@@ -154,7 +154,7 @@ class Samples(NamedTuple):
     def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The samples with a clock as the last input."""
         times = [
-            tempo.in_stages(clock.rows(begins_of(one.stages)), one.labels)[rows]
+            tempo.in_segments(clock.rows(begins_of(one.segments)), one.labels)[rows]
             for tempo, one, rows in zip(tempos, self.encoded, self.rows, strict=True)
         ]
         inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
@@ -215,11 +215,11 @@ class Samples(NamedTuple):
         """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
 
         If the clock runs while the hands rest, the tool may still be moving when the hands are at
-        the end of a stage. So it is known there only when the clock ends, and at the start of a
-        stage only when the clock starts. All other shares are known at any time.
+        the end of a segment. So it is known there only when the clock ends, and at the start of a
+        segment only when the clock starts. All other shares are known at any time.
         """
-        stages = self.encoded[0].stages[at[:, 2:].argmax(axis=1)]
-        moves = (stages["square"] > STAYS) | (stages["leads"] != NONE)[:, None]
+        segments = self.encoded[0].segments[at[:, 2:].argmax(axis=1)]
+        moves = (segments["square"] > STAYS) | (segments["leads"] != NONE)[:, None]
         ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
         found = [
             (row, share, time)
@@ -234,10 +234,10 @@ class Samples(NamedTuple):
     def _known(shown: Sequence[Encoded]) -> tuple[Vector, Vector]:
         """Inputs (V, 2 + K) at which the tool's share (V,) is known.
 
-        The share is 1 at the end of a stage and 0 at its start. At a corner it is 0 or 1 if the
+        The share is 1 at the end of a segment and 0 at its start. At a corner it is 0 or 1 if the
         tool usually was at that end, and 0 if no demonstration has the corner.
         """
-        squares, leads = shown[0].stages["square"], shown[0].stages["leads"]
+        squares, leads = shown[0].segments["square"], shown[0].segments["leads"]
         both = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
         known: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
         begins = np.where((squares > STAYS) | (leads != NONE)[:, None], 0.0, 1.0)
@@ -256,16 +256,16 @@ class Samples(NamedTuple):
         return inputs_of(found[:, :2], found[:, 2].astype(np.int64), len(squares)), found[:, 3]
 
 
-def _seen(shown: Sequence[Encoded], corner: tuple[float, float], stages: Sequence[int]) -> tuple[float, Vector]:
-    """The time [s] that hands were near a corner of these stages, and the tool's shares then."""
-    rows = [one.near(corner, stages) for one in shown]
+def _seen(shown: Sequence[Encoded], corner: tuple[float, float], segments: Sequence[int]) -> tuple[float, Vector]:
+    """The time [s] that hands were near a corner of these segments, and the tool's shares then."""
+    rows = [one.near(corner, segments) for one in shown]
     lasts_s = sum(float(its.sum()) * one.period_s for one, its in zip(shown, rows, strict=True))
     return lasts_s, np.concatenate([one.wanted[its, 0] for one, its in zip(shown, rows, strict=True)])
 
 
 def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
-    """The inputs (T, 2 + K) for shares (T, 2) of both hands in the stages (T,) of K."""
-    return np.hstack([shares, STAGE_DISTANCE * np.eye(count)[labels]])
+    """The inputs (T, 2 + K) for shares (T, 2) of both hands in the segments (T,) of K."""
+    return np.hstack([shares, SEGMENT_DISTANCE * np.eye(count)[labels]])
 
 
 def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
@@ -275,7 +275,7 @@ def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
     """
     if any(one.demonstration.conducts != "both" for one in shown):
         return {}
-    both = np.flatnonzero((shown[0].stages["square"] > STAYS).all(axis=1)).tolist()
+    both = np.flatnonzero((shown[0].segments["square"] > STAYS).all(axis=1)).tolist()
     followed = set(task.follow.tolist()) - {NONE}
     sides = [
         side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], both)[0] >= LEAST_SEEN_S
@@ -302,7 +302,7 @@ def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[s
 
 class _Prediction(NamedTuple):
     """A take's mean prediction, learned without its block: the delayed hands (T, 6) [m], or (T, 24)
-    with their turns, the belief (T, MOST_STAGES), errors (T, 3) [m], and inputs (T, 2 + K) of the
+    with their turns, the belief (T, MOST_SEGMENTS), errors (T, 3) [m], and inputs (T, 2 + K) of the
     primitives of orientation and gripper.
     """
 
@@ -317,32 +317,32 @@ class _Prediction(NamedTuple):
         cls, one: Encoded, placed: Placed, delay_s: float, tempo: Tempo | None, clock: TaskClock | None, step: int
     ) -> Self:
         """The prediction at one of every `step` samples."""
-        belief = np.zeros((len(one.tool), MOST_STAGES))
-        recognised(one.moving, one.period_s, placed.stages, belief)
+        belief = np.zeros((len(one.tool), MOST_SEGMENTS))
+        recognised(one.moving, one.period_s, placed.segments, belief)
         hands = one.moving[:, 0]
         if delay_s > 0.0:
             hands = np.ascontiguousarray(along(hands, one.period_s, delay_s / ORDER, ORDER)[:, -1])
         times = np.zeros(len(hands))
         if clock is not None and tempo is not None:
-            times = tempo.in_stages(clock.rows(begins_of(placed.stages)), belief.argmax(axis=1))
+            times = tempo.in_segments(clock.rows(begins_of(placed.segments)), belief.argmax(axis=1))
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
         belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
         errors = one.tool[::step] - placed.mean(hands, belief, tempos)
-        found = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.stages)
-        beside = STAGE_DISTANCE_BESIDE * belief[:, : len(one.stages)]
+        found = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.segments)
+        beside = SEGMENT_DISTANCE_BESIDE * belief[:, : len(one.segments)]
         inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
-        """Errors (M, 6) at up to `count` samples: shares (2,), stage, and error (3,) [m]."""
+        """Errors (M, 6) at up to `count` samples: shares (2,), segment, and error (3,) [m]."""
         rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
-        stages = self.belief[rows].argmax(axis=1)
-        return np.column_stack([self.inputs[rows, :2], stages, self.errors[rows]])
+        segments = self.belief[rows].argmax(axis=1)
+        return np.column_stack([self.inputs[rows, :2], segments, self.errors[rows]])
 
 
 class Candidate(NamedTuple):
     """A task and a teacher's delay that are tried, with the encoded demonstrations, the samples,
-    the hands' distances (K, 2) [m] from their segments, and hyper-parameters.
+    the hands' distances (K, 2) [m] from their paths, and hyper-parameters.
 
     The delay is that of the new demonstrations, see `Samples`.
     """
@@ -437,7 +437,7 @@ def with_delay(
 
 
 @dataclass(frozen=True)
-class Staged:
+class Segmented:
     """The method with its options, for a task."""
 
     options: Options
@@ -452,7 +452,7 @@ class Staged:
         return None if task is None else cls(options, task)
 
     def fit(self, taught: Taught, progress: Progress) -> Fitted:
-        """The model of the task, its gate on the hands' distance from their segments, and its
+        """The model of the task, its gate on the hands' distance from their paths, and its
         predictions of held-out takes.
 
         Raises SkillError if the tool never came near a via-point.
@@ -465,10 +465,10 @@ class Staged:
         best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
         task, encoded, off = best.task, best.encoded, best.off
         if best.samples.clock is not None:
-            remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each stage")
+            remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each segment")
         tempos, shown = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
-        untimed = stage_clock_of(
-            tempos, [one.stages for one in shown], [one.labels for one in shown], waits=False
+        untimed = segment_clock_of(
+            tempos, [one.segments for one in shown], [one.labels for one in shown], waits=False
         )._replace(weight=0.0)
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
@@ -479,7 +479,7 @@ class Staged:
         unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
         known = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
         progress(f"learning from all {len(takes)}")
-        model = StagedKMP(
+        model = SegmentedKMP(
             best.samples.fitted(best.parameters),
             task,
             self._nominal(takes),
@@ -604,10 +604,10 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
 
     tempos = [Tempo.of(take.demonstration) for take in taught.new]
     limit_m, out = clock_limit_m(error_m(best.samples)), dict[str, Candidate]()
-    stages, labels = [one.stages for one in best.encoded], [one.labels for one in best.encoded]
+    segments, labels = [one.segments for one in best.encoded], [one.labels for one in best.encoded]
     for waits, name in CLOCKS.items():
         progress(f"trying {POSITIONS.name}{name}")
-        clock = stage_clock_of(tempos, stages, labels, waits=waits)
+        clock = segment_clock_of(tempos, segments, labels, waits=waits)
         tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
         errors_m = [error_m(best.samples.clocked(tempos, one)) for one in tried]
         if min(errors_m) < limit_m:
@@ -629,12 +629,12 @@ def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
 
 
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
-    """The distances (K, 2) [m] of the hands from their segments in each stage, root mean square. A
-    stage that no demonstration has gets those of all stages.
+    """The distances (K, 2) [m] of the hands from their paths in each segment, root mean square. A
+    segment that no demonstration has gets those of all segments.
     """
     labels, off = np.concatenate([one.labels for one in encoded]), np.concatenate([one.off for one in encoded])
-    by_stage = [off[labels == k] if (labels == k).any() else off for k in range(len(encoded[0].stages))]
-    return np.array([np.maximum(np.sqrt((one**2).mean(axis=0)), LEAST_OFF_M) for one in by_stage])
+    by_segment = [off[labels == k] if (labels == k).any() else off for k in range(len(encoded[0].segments))]
+    return np.array([np.maximum(np.sqrt((one**2).mean(axis=0)), LEAST_OFF_M) for one in by_segment])
 
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
@@ -647,5 +647,5 @@ def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> H
         placed.gates_m(hands),
         found.inputs,
         known=np.hstack([hands, TURN_WEIGHT_M * found.hands[:, 6:], found.inputs[:, 2:]]),
-        belief=found.belief[:, : len(one.stages)],
+        belief=found.belief[:, : len(one.segments)],
     )

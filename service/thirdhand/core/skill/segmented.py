@@ -1,5 +1,5 @@
-"""Skill between named via-points, which moves with them: a KMP from the share of a stage that each
-hand has covered to the share that the tool covers.
+"""Skill between named via-points, which moves with them: a KMP from the share of a segment that
+each hand has covered to the share that the tool covers.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from thirdhand.core.skill.model import (
     Motion,
     Seen,
 )
-from thirdhand.core.skill.stages import (
-    MOST_STAGES,
+from thirdhand.core.skill.segments import (
+    MOST_SEGMENTS,
     OUTPUTS,
     PLACED,
     along_both,
@@ -49,10 +49,10 @@ from thirdhand.core.skill.task import (
 )
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import (
-    ERROR_STAGE_DISTANCE,
-    FIRST_STAGE_ODDS,
+    ERROR_SEGMENT_DISTANCE,
+    FIRST_SEGMENT_ODDS,
     PULL_SHARPNESS_PER_M2,
-    STAGE_DISTANCE_BESIDE,
+    SEGMENT_DISTANCE_BESIDE,
 )
 from thirdhand.core.skill.via_points import pulls_through, sharpness_between
 
@@ -75,12 +75,12 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placed(Immutable):
-    """Stages of a task at their via-points in a scene, with the primitive as plain arrays: K
-    stages, R centres, M errors, X pulls.
+    """Segments of a task at their via-points in a scene, with the primitive as plain arrays: K
+    segments, R centres, M errors, X pulls.
 
     * `centres`: the primitive's centres and weights as a table of `kmp.loops.mean`, see
-      `stages.tools_at`.
-    * `errors`: the tool's errors in held-out demonstrations as a table, see `stages.scatter`.
+      `segments.tools_at`.
+    * `errors`: the tool's errors in held-out demonstrations as a table, see `segments.scatter`.
     * `pulls` (X, 9): hands (6,) [m] and weight (3,) [m] of the kernels by which other via-points
       move the tool, see `via_points.pulls_through`.
 
@@ -88,14 +88,14 @@ class Placed(Immutable):
     while the loop runs.
     """
 
-    stages: Records  # (K,) of STAGE
+    segments: Records  # (K,) of SEGMENT
     sizes: Records  # (1,) of PLACED
     centres: Vector
     errors: Vector
     pulls: Vector
 
     def __post_init__(self) -> None:
-        for part in (self.stages, self.sizes, self.centres, self.errors, self.pulls):
+        for part in (self.segments, self.sizes, self.centres, self.errors, self.pulls):
             frozen(part)
 
     @classmethod
@@ -109,15 +109,15 @@ class Placed(Immutable):
         clock: TaskClock | None = None,
         unknown: Unknown | None = None,
     ) -> Placed:
-        """Stages of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
-        from their segments, root mean square; `errors` (M, 3 + 3) the tool's errors [m], after
-        the hands' shares and the stage. The primitive's last input is the `clock`, if there is one.
+        """Segments of a task at these via-points. `off` (K, 2) [m] are the distances of the hands
+        from their paths, root mean square; `errors` (M, 3 + 3) the tool's errors [m], after the
+        hands' shares and the segment. The primitive's last input is the `clock`, if there is one.
         """
-        sizes, stages = structured(1, PLACED), task.stages(at, off)
+        sizes, segments = structured(1, PLACED), task.segments(at, off)
         if unknown is not None:
             sizes["unknown_std"] = unknown.std_m
             scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
-            stages["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
+            segments["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
         sizes["scale"], _ = primitive.kernel.coordinates(1)
         sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
         inputs, count = primitive.centres, len(off)
@@ -126,42 +126,42 @@ class Placed(Immutable):
         else:
             sizes["clock_weight"] = clock.weight
         centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
-        apart = ERROR_STAGE_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
+        apart = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
         wrong = error_table(np.hstack([errors[:, :2], apart]), errors[:, 3:]) if len(errors) else NO_ERRORS
-        return cls(stages, sizes, centres, wrong, NO_PULLS)
+        return cls(segments, sizes, centres, wrong, NO_PULLS)
 
     def pulled(self, pulls: Vector) -> Placed:
-        """These stages with pulls (X, 9) that act in all of them."""
+        """These segments with pulls (X, 9) that act in all of them."""
         sizes = self.sizes.copy()
         sizes["pulls"] = len(pulls)
         return replace(self, sizes=sizes, pulls=pulls)
 
-    def pulled_in(self, stage: int, ends: Vector, via_points: Sequence[ViaPoint]) -> Placed:
-        """These stages with pulls through via-points in one stage, which leave the tool as it is at
-        the hands `ends` (2, 6) of the stage.
+    def pulled_in(self, segment: int, ends: Vector, via_points: Sequence[ViaPoint]) -> Placed:
+        """These segments with pulls through via-points in one segment, which leave the tool as it
+        is at the hands `ends` (2, 6) of the segment.
         """
-        belief = np.zeros(MOST_STAGES)
-        belief[stage] = 1.0
-        sharpness, stages = sharpness_between(ends, via_points), self.stages.copy()
+        belief = np.zeros(MOST_SEGMENTS)
+        belief[segment] = 1.0
+        sharpness, segments = sharpness_between(ends, via_points), self.segments.copy()
         more = np.hstack(
             pulls_through(lambda hands: self.mean(hands, np.tile(belief, (len(hands), 1))), ends, via_points, sharpness)
         )
-        stages["pulled"][stage] = len(self.pulls), len(self.pulls) + len(more)
-        stages["sharpness"][stage] = sharpness
-        return replace(self, stages=stages, pulls=np.concatenate([self.pulls, more]))
+        segments["pulled"][segment] = len(self.pulls), len(self.pulls) + len(more)
+        segments["sharpness"][segment] = sharpness
+        return replace(self, segments=segments, pulls=np.concatenate([self.pulls, more]))
 
     def belief(self, hands: Vector) -> Vector:
-        """Belief (MOST_STAGES,) in each stage for hands (6,) that have always been at rest."""
-        out, moving = np.zeros(MOST_STAGES), np.zeros((3, 6))
-        out[: len(self.stages)] = 1.0 / len(self.stages)
+        """Belief (MOST_SEGMENTS,) in each segment for hands (6,) that have always been at rest."""
+        out, moving = np.zeros(MOST_SEGMENTS), np.zeros((3, 6))
+        out[: len(self.segments)] = 1.0 / len(self.segments)
         moving[0] = hands
         for _ in range(BELIEF_PERIODS):
-            recognise(out, moving, 0.1, self.stages, FIRST_STAGE_ODDS)
+            recognise(out, moving, 0.1, self.segments, FIRST_SEGMENT_ODDS)
         return out
 
     def mean(self, hands: Vector, beliefs: Vector, tempos: Vector | None = None) -> Vector:
         """Expected tool positions (T, 3) [m] for hands (T, 6), or with their rotation matrices (T,
-        24), with these beliefs (T, K or more) and tempos (T, 3), as in `stages.tools_at`; without
+        24), with these beliefs (T, K or more) and tempos (T, 3), as in `segments.tools_at`; without
         tempos, the hands are at rest.
         """
         out = np.empty((len(hands), 3))
@@ -171,40 +171,40 @@ class Placed(Immutable):
         return out
 
     def _tools(self, hands: Vector, tempo: Vector, belief: Vector, pulls: Vector) -> Vector:
-        """Tool positions (K, 3) [m] for hands (6 or 24,) in all stages with at least
-        LEAST_STAGE_PROBABILITY.
+        """Tool positions (K, 3) [m] for hands (6 or 24,) in all segments with at least
+        LEAST_SEGMENT_PROBABILITY.
         """
-        out = np.empty((1, len(self.stages), 3))
+        out = np.empty((1, len(self.segments), 3))
         now, at = np.array(hands[None], order="C"), np.array(tempo[None], order="C")
-        tools_at(now, at, belief, self.stages, self.sizes, self.centres, pulls, out)
+        tools_at(now, at, belief, self.segments, self.sizes, self.centres, pulls, out)
         return np.asarray(out[0])
 
     def gates_m(self, hands: Vector) -> Vector:
-        """Distances (T,) [m] of hands (T, 6) from the task, see `stages.off_all`."""
-        return np.array([off_all(np.ascontiguousarray(one), self.stages) for one in hands])
+        """Distances (T,) [m] of hands (T, 6) from the task, see `segments.off_all`."""
+        return np.array([off_all(np.ascontiguousarray(one), self.segments) for one in hands])
 
     def covariance(self, hands: Vector, belief: Vector, tempo: Vector = RESTING_TEMPO) -> Vector:
         """Covariance (3, 3) [m²] of the tool, rounded, for hands (6 or 24,), a belief and a tempo
-        (3,), see `stages.scatter`: errors near these hands, spread of the stages' tools, and the
-        via-points' variance.
+        (3,), see `segments.scatter`: errors near these hands, spread of the segments' tools, and
+        the via-points' variance.
         """
         out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
         tools = self._tools(hands, tempo, belief, NO_PULLS)
-        scatter(hands, tempo, belief, self.stages, tools, self.errors, self.sizes[0], out)
+        scatter(hands, tempo, belief, self.segments, tools, self.errors, self.sizes[0], out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
 
 
 @dataclass(frozen=True, eq=False)
-class StagedKMP:
-    """Model with the inputs share of a stage that the left and the right hand have covered, the
-    stage and, if there is a clock, that of the stage times its weight (2 + K or 2 + K + 1); and the
-    outputs share that the tool covers, and its offset [m] (4). See `Model`.
+class SegmentedKMP:
+    """Model with the inputs share of a segment that the left and the right hand have covered, the
+    segment and, if there is a clock, that of the segment times its weight (2 + K or 2 + K + 1); and
+    the outputs share that the tool covers, and its offset [m] (4). See `Model`.
 
     * `nominal`: mean via-points of the demonstrations.
-    * `off` (K, 2) [m]: distances of the hands from their segments, root mean square.
+    * `off` (K, 2) [m]: distances of the hands from their paths, root mean square.
     * `errors` (M, 6): inputs and the tool's errors [m] in held-out demonstrations, see `Placed`.
     * `delay_s`: delay of the demonstrated tool behind the hands.
-    * `clock`: of each stage, if it is an input.
+    * `clock`: of each segment, if it is an input.
     * `unknown`: scatter of what was not shown; None: as where it was shown.
 
     Where the hands' orientation is unknown, a tool that turns with them only moves with them.
@@ -220,7 +220,7 @@ class StagedKMP:
     clock: TaskClock | None = None
     unknown: Unknown | None = None
 
-    measure: ClassVar[str] = "the distance of a hand from its segments"
+    measure: ClassVar[str] = "the distance of a hand from its paths"
     units: ClassVar[str] = TASK_UNITS
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = TASK_RANGES
     gripper_ell: ClassVar[float] = 20.0
@@ -237,7 +237,7 @@ class StagedKMP:
 
     @cached_property
     def clock_rows(self) -> Vector | None:
-        return None if self.clock is None else self.clock.rows(self._unpulled.stages["begins"].reshape(-1, 6))
+        return None if self.clock is None else self.clock.rows(self._unpulled.segments["begins"].reshape(-1, 6))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -250,24 +250,24 @@ class StagedKMP:
     @cached_property
     def hands(self) -> Vector:
         """Hands (K + 1, 6) [m] at the via-points."""
-        begins, way = (self._unpulled.stages[name].reshape(-1, 6) for name in ("begins", "way"))
+        begins, way = (self._unpulled.segments[name].reshape(-1, 6) for name in ("begins", "way"))
         return np.concatenate([begins, begins[-1:] + way[-1:]])
 
     @cached_property
     def placed(self) -> Placed:
-        """Stages between the via-points in force; via-points of other names pull the tool."""
+        """Segments between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
-        everywhere = [point for point in others if point.stage not in self.names[:-1]]
+        everywhere = [point for point in others if point.segment not in self.names[:-1]]
         pulls = np.hstack(pulls_through(self._resting, self.hands, everywhere, PULL_SHARPNESS_PER_M2))
         placed = self._unpulled.pulled(pulls)
         for k, name in enumerate(self.names[:-1]):
-            if of_stage := [point for point in others if point.stage == name]:
-                placed = placed.pulled_in(k, self.hands[k : k + 2], of_stage)
+            if of_segment := [point for point in others if point.segment == name]:
+                placed = placed.pulled_in(k, self.hands[k : k + 2], of_segment)
         return placed
 
     @cached_property
     def _unpulled(self) -> Placed:
-        """Stages between the via-points in force, without pulls."""
+        """Segments between the via-points in force, without pulls."""
         at = self.nominal.moved(self.via_points)
         return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.clock, self.unknown)
 
@@ -280,16 +280,16 @@ class StagedKMP:
 
     def predict(self, seen: Seen, known: Vector | None) -> Motion:
         """Motion of the tool: equation (8) of Huang et al. 2019, differences along the hands'
-        motion, and the covariance of errors in held-out demonstrations, see `stages.predicted`.
+        motion, and the covariance of errors in held-out demonstrations, see `segments.predicted`.
         """
         at, out = self.placed, np.empty((6, 3))
         errors = at.errors if known is None else NO_ERRORS
-        gate_m, ambiguity = predicted(seen, self.turned, at.stages, at.sizes, at.centres, at.pulls, errors, out)
+        gate_m, ambiguity = predicted(seen, self.turned, at.segments, at.sizes, at.centres, at.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
         at = self.placed
-        return elsewhere(now, stillness, period_s, belief, unprimed, at.stages, at.sizes, at.centres)
+        return elsewhere(now, stillness, period_s, belief, unprimed, at.segments, at.sizes, at.centres)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
@@ -302,10 +302,10 @@ class StagedKMP:
         return self.placed.gates_m(hands)
 
     def _beliefs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        """Beliefs (T, MOST_STAGES) for hands (T, 6) at rest. At a via-point named in `names`, the
-        belief is the stage that ends there; at the first one, the stage that begins there.
+        """Beliefs (T, MOST_SEGMENTS) for hands (T, 6) at rest. At a via-point named in `names`, the
+        belief is the segment that ends there; at the first one, the segment that begins there.
         """
-        out = np.array([self.placed.belief(one) for one in hands]).reshape(-1, MOST_STAGES)
+        out = np.array([self.placed.belief(one) for one in hands]).reshape(-1, MOST_SEGMENTS)
         for row, name in zip(out, names, strict=bool(names)):
             if name in self.names:
                 row[:] = 0.0
@@ -337,22 +337,22 @@ class StagedKMP:
         return now, (ahead - behind) / (2.0 * MOTION_STEP_S)
 
     def _input(self, hands: Vector, belief: Vector, still: Vector = STILL, clock_s: float = 0.0) -> Vector:
-        """Input (2 + K,) of orientation and gripper: shares of the most probable stage, and the
-        belief times STAGE_DISTANCE_BESIDE; with a clock, also that times its weight.
+        """Input (2 + K,) of orientation and gripper: shares of the most probable segment, and the
+        belief times SEGMENT_DISTANCE_BESIDE; with a clock, also that times its weight.
         """
         most = int(belief.argmax())
-        stage, hands = self.placed.stages[most], np.ascontiguousarray(hands)
-        along = along_both(hands, still, stage)
+        segment, hands = self.placed.segments[most], np.ascontiguousarray(hands)
+        along = along_both(hands, still, segment)
         time = [self.clock.weight * clock_s] if self.clock is not None and self.clock.weight else []
-        return np.array([*along, *(STAGE_DISTANCE_BESIDE * belief[: len(self.off)]), *time])
+        return np.array([*along, *(SEGMENT_DISTANCE_BESIDE * belief[: len(self.off)]), *time])
 
-    def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> StagedKMP:
+    def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> SegmentedKMP:
         """Model in a scene with these via-points. Nothing is solved: those of a known name move the
-        stages, the others pull the tool.
+        segments, the others pull the tool.
         """
         return replace(self, via_points=tuple(via_points))
 
-    def unadapted(self) -> StagedKMP:
+    def unadapted(self) -> SegmentedKMP:
         return replace(self, via_points=())
 
     def own_arrays(self) -> dict[str, NDArray[Any]]:
@@ -370,7 +370,7 @@ class StagedKMP:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> StagedKMP:
+    def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> SegmentedKMP:
         task = Task.from_arrays(arrays)
         count = len(task.names)
         shapes = {
