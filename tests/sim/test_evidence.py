@@ -132,7 +132,6 @@ class TestDigests:
         done = thirdhand("learn", *map(str, takes), "--output", str(again))
         assert done.returncode == 0, done.stderr
         with np.load(recordings() / "soldering.npz") as shipped, np.load(again) as learned:
-            assert tree()["learning"] == str(shipped["checksum"])
             assert set(shipped) == set(learned)
             for name in set(shipped) - {"checksum", "figures"}:
                 if shipped[name].dtype.kind == "f":

@@ -1,7 +1,7 @@
 """The origin of each experiment's result, and whether it still belongs to this tree.
 
 A result depends on up to three things, each named by a digest: `core`, the frames of the golden
-session; `learning`, the shipped skill, which is what `learn` makes of the shipped demonstrations;
+session; `learning`, the numbers of the shipped skill, which `learn` makes of the shipped takes;
 `kmp`, what the library computes for two small problems. A result whose digests are not the tree's
 is stale.
 """
@@ -22,10 +22,12 @@ from typing import Any
 import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
+from kmp.storage import checksum
 from thirdhand.core.frame import encode
 from thirdhand.recordings.mcap_file import machine
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.shipped import SHIPPED_SKILL, recordings
+from thirdhand.skills.skill_file import DEMONSTRATIONS
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.results import Array, ExperimentError, Options
 
@@ -59,9 +61,10 @@ def core_digest(golden: Path) -> str:
 
 
 def _skill_digest() -> str:
-    """The checksum of the shipped skill's arrays, which its file keeps."""
-    with np.load(recordings() / SHIPPED_SKILL, allow_pickle=False) as arrays:
-        return str(arrays["checksum"])
+    """The checksum of the shipped skill's numbers, without texts and without its demonstrations."""
+    with np.load(recordings() / SHIPPED_SKILL, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files if name != DEMONSTRATIONS}
+    return checksum({name: array for name, array in arrays.items() if array.dtype.kind != "U"})
 
 
 @functools.cache
