@@ -98,6 +98,30 @@ def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
     assert report["rate_hz"] == pytest.approx(1000, rel=0.05)
 
 
+BROWSER = """import sys, urllib.request as web
+page = web.urlopen(sys.argv[1]).read().decode()
+viewer = page.split('frame.src = live ? "', 1)[1].split("?", 1)[0]
+status = web.urlopen(sys.argv[1] + "status").read().decode()
+open(sys.argv[2], "a").write(f"{web.urlopen(viewer).status} {status}\\n")
+"""
+
+
+@timed
+@pytest.mark.thorough
+@pytest.mark.timeout(330)
+def test_the_live_view_of_a_demo_is_open_in_the_browser_before_the_arm_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "browser.py").write_text(BROWSER)
+    monkeypatch.setenv("BROWSER", f"{sys.executable} {tmp_path / 'browser.py'} %s {tmp_path / 'opened'}")
+    report = demonstrated("--open", "--output", str(tmp_path / "out"))
+    assert report["rate_hz"] == pytest.approx(SLOW_RATE_HZ, rel=0.05)
+    for line in (tmp_path / "opened").read_text().splitlines():
+        code, _, status = line.partition(" ")
+        assert code == "200"
+        assert json.loads(status)["mode"] == "hold"
+
+
 @timed
 def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")

@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from support.circling import circling
 from support.paths import ROOT
+from thirdhand.command_line import parser
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import POSE
 from thirdhand.contract.explain import ExplainedError
@@ -30,6 +31,8 @@ from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import skill_in
+from thirdhand.workbench.cli.hands import hands
+from thirdhand.workbench.cli.view import view
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
 from thirdhand.workbench.takes.pose_streams import PoseTopic
 
@@ -201,6 +204,7 @@ def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demo
 
 
 POINTERS = ["a.mcap", "a.csv", "a.c3d", "a.bag", "a.db3", "bag/a.db3", "a.npz", "a.urdf", "a.stl"]
+POINTERS += ["a.rrd", "a.task", "a.whl", "a.mp4"]
 
 
 @pytest.mark.parametrize("name", POINTERS)
@@ -214,11 +218,20 @@ def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_pa
         ".npz": lambda: skill_in(path),
         ".urdf": lambda: description(path),
         ".stl": lambda: description(tmp_path / "b.urdf"),
+        ".rrd": lambda: run("view", str(path)),
+        ".task": lambda: run("hands", "--camera", "--model", str(path)),
+        ".whl": lambda: run("hands", "--camera", "--model", str(path)),
+        ".mp4": lambda: run("hands", "--camera", str(path)),
     }.get(path.suffix, lambda: read_demonstration(path.parent if "/" in name else path))
     with pytest.raises(
         ExplainedError, match="it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches"
     ):
         read()
+
+
+def run(*arguments: str) -> object:
+    args = parser().parse_args(arguments)
+    return {"view": view, "hands": hands}[args.command](args)
 
 
 def lerobot(path: Path) -> None:

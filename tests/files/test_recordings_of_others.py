@@ -9,21 +9,25 @@ import dataclasses
 import re
 import shutil
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from support.paths import RECORDINGS
+from thirdhand.contract.channels import POSE
 from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.recordings.recording import Recording
 from thirdhand.settings.config import HandSettings, Settings
-from thirdhand.workbench.takes.demonstration_reader import read_demonstration
-from thirdhand.workbench.takes.pose_streams import PoseTopic
+from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
+from thirdhand.workbench.takes.pose_streams import POSE_TYPES, TAKE_KEYS, PoseTopic
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STAMPS = np.arange(40) * 10_000_000 + 1_000_000_000
@@ -122,7 +126,10 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
             {"left": PoseTopic("/nowhere")},
             r"--left /nowhere: no topic there; its topics: .*topics with poses: /mocap",
         ),
-        ({}, r"no topic ending in hands/left .*; --left TOPIC\[:PART\] names another"),
+        (
+            {},
+            r"hands/left .*: /mocap/hands \(geometry_msgs/msg/PoseArray\), .* read: .*; --left TOPIC",
+        ),
     ):
         with pytest.raises(RecordingError, match=words):
             read_demonstration(path, topics=given)
@@ -138,6 +145,28 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
         pose=made("geometry_msgs/msg/PoseWithCovariance", pose=pose(*at), covariance=np.zeros(36)),
         twist=made("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36)),
     )
+
+
+@pytest.mark.parametrize("read", [read_demonstration, hand_samples, Recording.open])
+@pytest.mark.parametrize(
+    ("kind", "encoding"),
+    [("geometry_msgs/msg/Pose", "cdr"), ("geometry_msgs/msg/PointStamped", "cdr"), (POSE.type, "json")],
+)
+def test_hands_of_a_type_that_is_not_read_are_refused_with_it_and_with_the_types_accepted(
+    kind: str, encoding: str, read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        schema = writer.register_schema(kind, "", b"")
+        for topic in TAKE_KEYS.values():
+            writer.add_message(writer.register_channel(topic, encoding, schema), 0, b"", 0)
+        writer.finish()
+    given = kind if encoding == "cdr" else f"{kind} in {encoding}"
+    accepted = POSE.type if read is hand_samples else ", ".join(POSE_TYPES)
+    with pytest.raises(RecordingError, match=re.escape(f"hands/left ({given})")) as refusal:
+        read(tmp_path / "a.mcap")
+    assert accepted in str(refusal.value)
 
 
 def test_odometry_of_a_tracker_is_read_as_poses(tmp_path: Path) -> None:

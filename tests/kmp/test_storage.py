@@ -29,6 +29,9 @@ def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
     np.savez(tmp_path / "object.npz", a=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match=r"object\.npz: not an \.npz file"):
         kmp.load(tmp_path / "object.npz")
+    (tmp_path / "pointer.npz").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284\n")
+    with pytest.raises(ValueError, match=r"pointer\.npz: a pointer of Git LFS .*; `git lfs pull` fetches that"):
+        kmp.load(tmp_path / "pointer.npz")
     half = {"kmp_format": np.array(1)}
     np.savez(tmp_path / "half.npz", **half, checksum=np.array(checksum(half)))
     with pytest.raises(ValueError, match=r"half\.npz: The primitive's arrays lack base_inputs"):

@@ -27,6 +27,7 @@ from thirdhand.contract.requests import (
     ViaPoint,
     encode_json,
 )
+from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import (
     STAGES,
@@ -178,6 +179,29 @@ def test_the_initial_approach_of_the_tool_is_no_error_of_following(
     else:
         assert found.lag_mm is None
         assert "did not reach the target" in verdict(found)
+
+
+def test_the_distance_of_a_stop_is_that_of_the_measured_tool_and_is_compared_with_people(golden: Path) -> None:
+    columns = read(Recording.open(golden))
+    report = Report(columns)
+    assert report.stop_mm is not None
+    assert report.stop_mm.samples == sum(span.mode is Mode.HOLD for span in report.spans[1:])
+    for begin, end in runs(columns.frames["mode"]):
+        if columns.frames["mode"][begin] == Mode.HOLD:
+            tool_m = columns.frames["tool"][begin:end]
+            moved_mm = 1000 * np.linalg.norm(tool_m - tool_m[0], axis=1).max()
+            assert moved_mm < report.stop_mm.largest + 0.5
+    tick = next(iter(columns.stops))
+    begin, end = np.zeros((2, 7))
+    end[1] = 0.1
+    columns.stops = {tick: [begin, end]}
+    columns.frames["setpoint_velocity"][columns.frames["tick"] == tick] = (0.0, 0.8, 0.0)
+    arm = Arm(SETTINGS, URDF)
+    distance_mm = 1000 * float(np.linalg.norm(arm.at(end).position - arm.at(begin).position))
+    assumed_mm = 0.8 * SETTINGS.people.reaction_ms + 1000 * 0.8**2 / (2 * SETTINGS.people.brake)
+    (prompt,) = (table for table in tables(Report(columns)) if table.name == "times")
+    shown_mm = {row[0]: row[3] for row in prompt.rows if row[0].startswith("distance of a stop")}
+    assert list(shown_mm.values()) == [f"{distance_mm:.1f}", f"{distance_mm - assumed_mm:.1f}"]
 
 
 def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:

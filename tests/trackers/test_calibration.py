@@ -650,6 +650,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     assert_refused(
         1, f"{words} wam/base_yaw_joint", "calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam"
     )
+    words = "hands/left (geometry_msgs/msg/PoseStamped), "
     assert_refused(1, words, "calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
 
 

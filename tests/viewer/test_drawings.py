@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,17 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
     corner = "".join(f"  vertex {x} {y} 0\n" for x, y in ((0, 0), (1, 0), (0, 1)))
     solid = f"solid a\nfacet normal 0 0 1\n outer loop\n{corner} endloop\nendfacet\nendsolid a\n"
     (found / "meshes" / "link.stl").write_text(solid, encoding="utf-8")
-    for folder, is_drawn in ((tmp_path / "nowhere", True), (tmp_path / "packages", False)):
+    shutil.copytree(tmp_path / "packages", tmp_path / "unfetched")
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n"
+    (tmp_path / "unfetched" / "wam_description" / "meshes" / "link.stl").write_bytes(pointer)
+    cases = {
+        "nowhere": "ROS_PACKAGE_PATH names more",
+        "unfetched": r"link\.stl: it is a pointer of Git LFS",
+        "packages": "",
+    }
+    for name, words in cases.items():
+        folder = tmp_path / name
+        is_drawn = bool(words)
         monkeypatch.setenv("ROS_PACKAGE_PATH", str(folder))
         one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
         for tick, frame, timing in ticks(30):
@@ -90,8 +101,9 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         rows = drawn(tmp_path / "a.rrd")
         radii = [len(values(rows[path], "Capsules3D:radii")[0]) for path in rows if path.startswith("/arm/capsules/")]
         assert sum(radii) == (len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0)
-        said = [text for (text,) in values(rows["/log"], TEXT) if "ROS_PACKAGE_PATH" in text]
+        said = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
         assert len(said) == is_drawn
+        assert re.search(words, "".join(said))
         assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
 
 

@@ -20,7 +20,8 @@ from threadpoolctl import threadpool_info
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.ros2msg import schema
 from thirdhand.core.frame import definitions
-from thirdhand.settings.file_content import LFS_POINTER, UnusableError, check_fetched
+from thirdhand.settings import file_content
+from thirdhand.settings.file_content import UnusableError
 from thirdhand.settings.whole_file import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
@@ -223,13 +224,10 @@ def begin_of(path: Path) -> bytes:
     """The first bytes of a recording, as many as MCAP0_MAGIC has. Raises RecordingError for a
     pointer of Git LFS.
     """
-    with path.open("rb") as stream:
-        begin = stream.read(len(LFS_POINTER))
     try:
-        check_fetched(begin)
+        return file_content.begin_of(path)[: len(MCAP0_MAGIC)]
     except UnusableError as error:
-        raise RecordingError(f"{path} is not a recording: {error}") from None
-    return begin[: len(MCAP0_MAGIC)]
+        raise RecordingError(str(error)) from None
 
 
 def ends_early(path: Path) -> bool:

@@ -19,6 +19,7 @@ else:
 
 LARGEST_CONFIGURATION = 1_000_000  # [bytes]
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # begin of a file that stands for one of Git LFS
+NOT_FETCHED = "it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches that"
 MOST_DOTS = 1000  # in a line of TOML
 
 
@@ -49,14 +50,21 @@ def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> b
         data = file.read(largest_bytes + 1)
     if len(data) > largest_bytes:
         raise UnusableError(f"it has more than {largest_bytes} bytes")
-    check_fetched(data)
+    if data.startswith(LFS_POINTER):
+        raise UnusableError(NOT_FETCHED)
     return data
 
 
-def check_fetched(begin: bytes) -> None:
-    """Raise UnusableError if a file begins as a pointer of Git LFS does."""
-    if begin.startswith(LFS_POINTER):
-        raise UnusableError("it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches that")
+def begin_of(path: Path) -> bytes:
+    """The first bytes of a file, which show its kind.
+
+    Raises OSError, and UnusableError for a pointer of Git LFS, with the path.
+    """
+    with path.open("rb") as file:
+        begin = file.read(len(LFS_POINTER))
+    if begin == LFS_POINTER:
+        raise UnusableError(f"{path}: {NOT_FETCHED}")
+    return begin
 
 
 def text_in(path: Path, *, accepts_pipes: bool = False) -> str:

@@ -18,6 +18,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import title, word
 from thirdhand.contract.records import SIDES, Mode, Reason
 from thirdhand.core.frame import STAGES
@@ -29,6 +30,7 @@ from thirdhand.settings.config import (
     robot_description,
     urdf_path,
 )
+from thirdhand.settings.file_content import UnusableError, begin_of
 from thirdhand.settings.mesh_cover import found_meshes, unfound
 from thirdhand.settings.robot_xml import element_of
 from thirdhand.settings.urdf import Urdf
@@ -83,8 +85,8 @@ class ArmModels:
 
 def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     """Write the URDF that Rerun reads: in UTF-8, with full paths of meshes, and without masses,
-    prefixes and collision shapes, which are not drawn. Visual shapes without their mesh are left
-    out; return a remark about them, or an empty text.
+    prefixes and collision shapes, which are not drawn. Visual shapes whose mesh is not found or not
+    readable are left out; return a remark about them, or an empty text.
     """
     robot, origin = element_of(urdf), urdf_path(settings)
     for link in robot.findall("link"):
@@ -93,7 +95,14 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     packages = (*settings.arm.packages, *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)))
     packages += tuple(f"{one}/share" for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one)
     lost = unfound(robot, origin, packages, "visual")
-    files = dict(found_meshes(robot, origin, packages))
+    cause = f"{lost}; ROS_PACKAGE_PATH names more" if lost else ""
+    files: dict[ElementTree.Element, Path] = {}
+    for mesh, file in found_meshes(robot, origin, packages):
+        try:
+            begin_of(file)
+            files[mesh] = file
+        except (OSError, UnusableError) as error:
+            cause = cause or f"a visual mesh is not readable: {in_words(error)}"
     for link in robot.findall("link"):
         for visual in link.findall("visual"):
             for mesh in visual.iter("mesh"):
@@ -103,7 +112,7 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
                     link.remove(visual)
                     break
     ElementTree.ElementTree(robot).write(path, encoding="utf-8")
-    return f"the arm is drawn by its capsules: {lost}; ROS_PACKAGE_PATH names more" if lost else ""
+    return f"the arm is drawn by its capsules: {cause}" if cause else ""
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:

@@ -12,13 +12,12 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from thirdhand.cli.usage import UsageError
 from thirdhand.client import (
     Client,
     Tracker,
@@ -65,11 +64,9 @@ class DemoError(ExplainedError):
 
 def demo(args: argparse.Namespace) -> int:
     """Run the demo, print its report and return its exit code."""
-    if args.open and args.mouse is None:
-        raise UsageError("--open opens the page of --mouse; --mouse needed with it")
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
     busy_rate_hz = SLOW_RATE_HZ if args.rate is None and args.arm in ARMS else args.rate
-    rate_hz = busy_rate_hz if page else args.rate
+    rate_hz = busy_rate_hz if page or args.open else args.rate
     for left in reversed(range(DEMO_ATTEMPTS)):
         before = set(args.output.glob("*.mcap"))
         try:
@@ -124,7 +121,8 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
     out.mkdir(parents=True, exist_ok=True)
     request = _output("thirdhand_sim.scene", "--arm", args.arm, *scene)
     add = decode_request(request.encode(), Add)
-    with launched(out, "--joints", "state", settings=settings, record=out, say=say) as service:
+    live = ("--live", "0") if args.open and not page else ()
+    with launched(out, "--joints", "state", *live, settings=settings, record=out, say=say) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
@@ -141,11 +139,30 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
             if page:
                 report = _played_on_page(session, client, play, page, browser=args.open)
             else:
-                report = json.loads(play(say=say))
+                with _live_view(session, client) if live else contextlib.nullcontext():
+                    report = json.loads(play(say=say))
         ((status, code),), missing = ends, service.missing()
         if code != 0 and not missing:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
     return _report(report, status) | {"missing": missing}
+
+
+@contextlib.contextmanager
+def _live_view(session: zenoh.Session, client: Client) -> Iterator[None]:
+    """Show the live view in this machine's browser while the context lasts. Raises UsageError,
+    ViewerError.
+    """
+    from thirdhand.workbench.cli.live_page import live_page, live_url  # their import is slow
+
+    stream = live_url(lambda: client.status().scribe)
+    with (
+        live_page(session, client, DEMO_CELL, stream) as page,
+        page_served(page.server, "--open", Address("127.0.0.1", 0)) as address,
+    ):
+        url = f"http://{address}/"
+        say(f"  {url}")
+        invite(url, address, browser=True, to_do="watch the arm")
+        yield
 
 
 def _played_on_page(

@@ -9,11 +9,13 @@ import re
 import secrets
 import string
 import webbrowser
+from pathlib import Path
 
 from thirdhand.cli.usage import UsageError, reached
 from thirdhand.client import Client, Tracker
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.process.progress import say
+from thirdhand.settings.file_content import begin_of
 from thirdhand.settings.network import is_local
 from thirdhand.settings.user_folder import user_folder
 from thirdhand.workbench.cli.web_address import serve_page, web_address
@@ -42,6 +44,9 @@ def _camera(args: argparse.Namespace) -> int:
     )
     from thirdhand.workbench.trackers.hand_model import hand_model
 
+    for file in (args.model, Path(args.camera)):
+        if file is not None and file.is_file():
+            begin_of(file)
     mediapipe()  # before the model is downloaded
     with (
         HandCamera(hand_model(args.model, say), view_deg=args.view, hand_length=args.hand_length) as camera,
@@ -92,14 +97,14 @@ def _web(args: argparse.Namespace) -> int:
     return 0
 
 
-def invite(url: str, address: Address, *, browser: bool) -> None:
-    """Print what to do with the page for a mouse, and open it if `browser`."""
+def invite(url: str, address: Address, *, browser: bool, to_do: str = "drag both hands") -> None:
+    """Print what to do on a page, and open it if `browser`."""
     if not is_local(f"tcp/{address}"):
         say("everyone who has this address with its token, and reaches it, can move the arm")
     if browser and webbrowser.open(url):
-        say("the page opens in your browser: drag both hands there; Ctrl-C ends it")
+        say(f"the page opens in your browser: {to_do} there; Ctrl-C ends it")
     else:
-        say("open this address in a browser, and drag both hands there; Ctrl-C ends it")
+        say(f"open this address in a browser, and {to_do} there; Ctrl-C ends it")
 
 
 def _token() -> str:

@@ -21,7 +21,7 @@ def demo(add: House) -> None:
         "demo",
         "Runs the soldering scenario once, without a window: simulated bench, service and recording. Then reports how "
         "the task went.",
-        "thirdhand demo --scene my-scene.toml\n  thirdhand demo --mouse --open",
+        "thirdhand demo --open\n  thirdhand demo --scene my-scene.toml\n  thirdhand demo --mouse --open",
     )
     output = "write the recording, the drawing and the service's log to this folder"
     option(c, "--output", "DIR", output, Path("thirdhand-demo"))
@@ -36,7 +36,7 @@ def demo(add: House) -> None:
         "port of this machine)"
     )
     option(c, "--mouse", "[HOST:]PORT", mouse, nargs="?", const="127.0.0.1:0")
-    flag(c, "--open", "open the page of --mouse in this machine's browser")
+    flag(c, "--open", "open the live view, or the page of --mouse, in this machine's browser")
     flag(c, "--json", "print the report as one JSON object")
 
 

@@ -39,9 +39,8 @@ from thirdhand.settings.whole_file import whole
 from thirdhand.viewer import vulkan
 from thirdhand.viewer.blueprint import TABS, TIMELINE
 from thirdhand.viewer.stream import Viewer, ViewerError, rerun_program
-from thirdhand.workbench.cli.live_page import LivePage, web_viewer
+from thirdhand.workbench.cli.live_page import live_page, live_url
 from thirdhand.workbench.cli.web_address import serve_page, web_address
-from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.web_server import Address
 
 RRD_MAGIC = b"RRF2"
@@ -52,7 +51,6 @@ BAR_TINT = 40  # maximum difference of colour channels in the grey title bar
 NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
 FRESH_S = 1.0  # the age of a live view's picture is printed if it is larger
 FRESH_TIMEOUT_S = 10.0
-STARTING_POLL_S = 0.2
 
 
 def view(args: argparse.Namespace) -> int:
@@ -86,14 +84,7 @@ def _live(args: argparse.Namespace) -> str:
     """
     now = ask(args, "status")
     say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
-    with progress("the live view is starting"):
-        while now["scribe"].get("live") == "":
-            clock.sleep(STARTING_POLL_S)
-            now = ask(args, "status")
-    if url := now["scribe"].get("live"):
-        return str(url)
-    errors = "; ".join(error for error in now["scribe"]["errors"] if "live view" in error)
-    raise UsageError(errors or "this daemon serves no live view; start it with --live PORT")
+    return live_url(lambda: ask(args, "status")["scribe"])
 
 
 def _kind(path: Path) -> bytes:
@@ -134,10 +125,7 @@ def check_usage(args: argparse.Namespace) -> None:
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serve the page until Ctrl-C."""
     listen = web_address("--web", args.web)
-    with reached(args) as session, web_viewer(url) as viewer:
-        client = Client(session, args.cell)
-        latest = Latest(session, args.cell, client.status())
-        page = LivePage(client=client, latest=latest, cell=args.cell, viewer=viewer)
+    with reached(args) as session, live_page(session, Client(session, args.cell), args.cell, url) as page:
 
         def listening(address: Address) -> None:
             print(f"http://{address}/", flush=True)

@@ -217,6 +217,10 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         f"jerk = {list(settings.joints.jerk)}  # {jerk}\n"
         "\n"
         f"{tool}"
+        "[people]\n"
+        "# Lower it while `thirdhand report` shows a distance of a stop beyond [people] above 1 mm.\n"
+        f"brake = {settings.people.brake:g}  # [m/s²]\n"
+        "\n"
         f"# [reach] follows from the kinematics: {proposal.shell.inner:g} to {proposal.shell.outer:g} m from "
         f"{list(proposal.shell.centre)}; the arm is {proposal.workspace.extent:.2f} m long.\n"
     )

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from thirdhand.contract import cdr
 from thirdhand.contract.incidents import ORDERS
+from thirdhand.contract.joint_states import measured
+from thirdhand.contract.messages import WireError
 from thirdhand.contract.printable import printable, printable_values
+from thirdhand.contract.records import Mode
 from thirdhand.contract.requests import Source
 from thirdhand.core.frame import (
     TIMING,
@@ -93,6 +96,7 @@ class Columns:
     orders: list[Order] = field(default_factory=list)
     skills: list[InForce] = field(default_factory=list)
     statuses: list[Said] = field(default_factory=list)
+    stops: dict[int, list[Any]] = field(default_factory=dict)  # measured joints by the last tick before
     samples: Counter[str] = field(default_factory=Counter)  # events by kind
     remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
 
@@ -133,6 +137,8 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
     timing: list[Record] = []
     ticks: list[int] = []  # of all frames, recorded or left out
     times_ns: list[int] = []
+    followed = -(1 << 62)  # newest tick in which the arm followed
+    mode = Mode.HOLD
 
     def kept() -> Records:
         return repack_fields(np.array(block, layout)[list(KEPT)])
@@ -144,7 +150,10 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
         last = step.tick
         if step.frame is None and step.checksum is None:
             continue
-        _take_events(found, step)
+        if step.frame is not None:
+            mode = step.frame["mode"]
+        followed = step.tick if mode == Mode.FOLLOW else followed
+        _take_events(found, step, followed)
         if step.lost or step.damage:
             found.breaks.append(len(ticks))
         ticks.append(step.tick)
@@ -199,8 +208,10 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
     found.frames["tick"] = ticks
 
 
-def _take_events(found: Columns, step: Step) -> None:
-    """Count the events of a step; keep its requests and skills."""
+def _take_events(found: Columns, step: Step, followed: int) -> None:
+    """Count the events of a step; keep its requests, skills and joints that stop."""
+    settings = found.recording.settings
+    is_stopping = 0 < step.tick - followed <= settings.rate_hz  # for 1 s
     if step.skill:
         _take_skill(found, step.skill, step.tick)
     for kind, payload in step.events:
@@ -209,6 +220,11 @@ def _take_events(found: Columns, step: Step) -> None:
             _take_skill(found, payload, step.tick)
         elif kind in ORDERS or kind == "fault":
             found.orders.append(Order(step.tick, kind, printable(cdr.decode_string(payload))))
+        elif kind == "joints/state" and is_stopping:
+            with contextlib.suppress(WireError):
+                joints, _ = measured(cdr.decode_joints(payload), settings.joints.names)
+                if np.isfinite(joints).all():
+                    found.stops.setdefault(followed, []).append(joints)
 
 
 def _take_skill(found: Columns, file: bytes, tick: int) -> None:

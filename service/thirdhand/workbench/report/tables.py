@@ -187,6 +187,8 @@ def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]
     yield "work of a tick", report.work_us, "µs", 0
     yield "tool from its target, initial approach", report.initial_mm, "mm", 1
     yield "tool from its target, following", report.lag_mm, "mm", 1
+    yield "distance of a stop", report.stop_mm, "mm", 1
+    yield "distance of a stop beyond [people]", report.stop_excess_mm, "mm", 1
 
 
 def verdict(report: Report) -> str:

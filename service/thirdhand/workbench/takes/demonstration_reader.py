@@ -37,7 +37,7 @@ from thirdhand.recordings.mcap_file import (
     ends_early,
     existing,
 )
-from thirdhand.recordings.mcap_reader import Messages, full_name
+from thirdhand.recordings.mcap_reader import Messages
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.hands_and_tool import chosen
@@ -46,6 +46,8 @@ from thirdhand.workbench.takes.pose_streams import (
     PLACES_TOPIC,
     PoseRecording,
     PoseTopic,
+    type_of,
+    with_types,
 )
 from thirdhand.workbench.takes.track import Track
 from thirdhand.workbench.takes.track_check import (
@@ -375,13 +377,15 @@ def hand_samples(
     path = existing(path)
     messages = Messages(path)
     topics: dict[str, str] = {}  # by stream
-    seen: set[str] = set()
+    types: dict[str, str] = {}  # by topic
     samples: list[tuple[int, str, PoseStamped]] = []
     causes: list[str] = []
     for schema, channel, message in messages:
-        seen.add(topic := channel.topic)
+        topic = channel.topic
+        kind = type_of(schema, channel)
+        types.setdefault(topic, kind)
         name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
-        if not name or full_name(schema) != POSE.type or channel.message_encoding != "cdr":
+        if not name or kind != POSE.type:
             continue
         if topics.setdefault(name, topic) != topic:
             raise RecordingError(f"{path} has two streams of {name}: {topics[name]} and {topic}")
@@ -393,7 +397,7 @@ def hand_samples(
         raise RecordingError(f"{path} is damaged: {messages.faults[0]}")
     if not topics:
         lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
-        raise RecordingError(f"{path} has {lacks}; its topics: {', '.join(sorted(seen)) or 'none'}")
+        raise RecordingError(f"{path} has {lacks}; its topics: {with_types(types)}")
     if causes:
         remark = f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: {causes[0]}"
         if not samples:

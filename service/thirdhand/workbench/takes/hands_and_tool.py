@@ -17,6 +17,7 @@ from thirdhand.workbench.takes.pose_streams import (
     TRACK_NAMES,
     PoseRecording,
     PoseTopic,
+    with_types,
 )
 from thirdhand.workbench.takes.track import Track
 
@@ -46,7 +47,7 @@ def chosen(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Se
     for name in TRACK_NAMES[:2]:
         if conducts not in ("both", name):
             continue
-        source = _given(recorded, name, given[name]) if name in given else _by_ending(recorded, name)
+        source = _given(recorded, name, given[name]) if name in given else by_ending(recorded, name)
         if source is None and (source := _by_words(recorded, name)):
             guessed.append(f"{name} is {source}")
         if source is not None:
@@ -79,7 +80,7 @@ def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, Po
 
 def _tool(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]) -> Track:
     """The tool's track; a remark on a guess is appended to `guessed`. Raises RecordingError."""
-    source = _given(recorded, "tool", given["tool"]) if "tool" in given else _by_ending(recorded, "tool")
+    source = _given(recorded, "tool", given["tool"]) if "tool" in given else by_ending(recorded, "tool")
     joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
     joints = recorded.joint_topic(settings) if source is None else joints
     if joints:
@@ -111,7 +112,7 @@ def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
     raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
 
 
-def _by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
+def by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
     """The stream of PoseStamped with the name of the service's own topic, in any cell. Raises
     RecordingError.
     """
@@ -122,7 +123,8 @@ def _by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
     ]
     if len(found) > 1:
         raise RecordingError(
-            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {found[0]} and {found[1]}; choose one by --{name}"
+            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {found[0]} and {found[1]}; one needed, as --{name} "
+            "of `thirdhand learn` names it"
         )
     return PoseTopic(found[0]) if found else None
 
@@ -158,4 +160,7 @@ def _words(text: str) -> set[str]:
 
 def _poses_in(recorded: PoseRecording) -> str:
     poses = ", ".join(f"{source} ({count})" for source, count in recorded.streams())
-    return f"its topics: {', '.join(sorted(recorded.topics)) or 'none'}; topics with poses: {poses or 'none'}"
+    return (
+        f"its topics: {with_types(recorded.topics)}; topics with poses: {poses or 'none'}; types with poses that are "
+        f"read: {', '.join(POSE_TYPES)}"
+    )

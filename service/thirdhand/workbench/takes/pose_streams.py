@@ -8,13 +8,14 @@ import contextlib
 import functools
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 import numpy as np
 import zstandard
+from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from thirdhand.contract import cdr
@@ -153,8 +154,8 @@ class PoseRecording:
         messages = Messages(existing(self.path))
         for schema, channel, message in messages:
             kind = full_name(schema)
-            self.topics.setdefault(channel.topic, kind)
-            if channel.message_encoding in ("cdr", "ros1") and kind in (*POSE_TYPES, JOINTS.type):
+            self.topics.setdefault(channel.topic, type_of(schema, channel, ("cdr", "ros1")))
+            if self.topics[channel.topic] in (*POSE_TYPES, JOINTS.type):
                 if channel.message_encoding == "ros1":
                     self._ros_1_topics.add(channel.topic)
                 self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
@@ -359,6 +360,17 @@ class PoseRecording:
                 with contextlib.suppress(RecordingError):  # other topics may be readable
                     for part, (stamps, *_) in self.tracks(topic).items():
                         yield PoseTopic(topic, part), len(stamps)
+
+
+def type_of(schema: Schema | None, channel: Channel, read: Sequence[str] = ("cdr",)) -> str:
+    """The type of a channel's messages, with their encoding unless that is `read`."""
+    kind = full_name(schema)
+    return kind if channel.message_encoding in read else f"{kind} in {channel.message_encoding}"
+
+
+def with_types(topics: Mapping[str, str]) -> str:
+    """The topics of a recording in words, each with its type."""
+    return ", ".join(f"{topic} ({topics[topic] or 'no type'})" for topic in sorted(topics)) or "none"
 
 
 def _whole(data: bytes) -> bytes:

@@ -19,10 +19,11 @@ from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import HandSettings, Settings, robot_description
 from thirdhand.workbench.takes.demonstration_reader import in_metres, is_by_tracker
+from thirdhand.workbench.takes.hands_and_tool import by_ending
 from thirdhand.workbench.takes.pose_streams import (
     JOINT_STATES,
     PoseRecording,
-    PoseTopic,
+    with_types,
 )
 from thirdhand.workbench.takes.track import Track
 from thirdhand.workbench.trackers.calibration.solver import (
@@ -84,16 +85,17 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
     if not joints:
         raise CalibrationError(
             f"{path} has no {JOINT_STATES} of the joints {', '.join(settings.joints.names)}: give the arm by --config, "
-            f"or record them; its topics: {', '.join(sorted(recorded.topics)) or 'none'}"
+            f"or record them; its topics: {with_types(recorded.topics)}"
         )
     hands: dict[str, Track] = {}
     for side in SIDES:
-        for topic in recorded.topics:
-            is_hand = f"/{topic}".endswith(f"/{TAKE_KEYS[side]}") and recorded.topics[topic] == channels.POSE.type
-            if is_hand and "" in recorded.tracks(topic):
-                hands[side] = recorded.track(TAKE_KEYS[side], PoseTopic(topic), settings)
+        if source := by_ending(recorded, side):
+            hands[side] = recorded.track(TAKE_KEYS[side], source, settings)
     if not hands:
-        raise CalibrationError(f"{path} has no hands: a topic ending in hands/left or hands/right needed")
+        raise CalibrationError(
+            f"{path} has no hands: a topic ending in hands/left or hands/right with {channels.POSE.type} needed; its "
+            f"topics: {with_types(recorded.topics)}"
+        )
     tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
     return LedTracks(hands, tool), settings
 
