@@ -34,9 +34,8 @@ def rejected(loop: Loop) -> dict[Cause, int]:
 
 @pytest.mark.parametrize("ahead_ns", [10**9, HOUR_NS])
 @pytest.mark.parametrize("posture", [POSTURE, ELSEWHERE])
-def test_one_state_stamped_ahead_neither_faults_nor_moves_nor_locks_out(
-    skill: Skill, ahead_ns: int, posture: tuple[float, ...]
-) -> None:
+def test_one_state_ahead_changes_nothing(skill: Skill, ahead_ns: int, posture: tuple[float, ...]) -> None:
+    """One state stamped ahead neither faults nor moves nor locks out."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     seen = loop.run(1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5)
@@ -45,7 +44,7 @@ def test_one_state_stamped_ahead_neither_faults_nor_moves_nor_locks_out(
     assert_limits_hold(loop.frames)
 
 
-def test_a_state_stamped_an_hour_ahead_before_a_reset_is_not_started_from(skill: Skill) -> None:
+def test_state_ahead_is_no_start_after_reset(skill: Skill) -> None:
     """The attack: fault, then a stranger's posture an hour ahead, then `reset`."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
@@ -60,7 +59,8 @@ def test_a_state_stamped_an_hour_ahead_before_a_reset_is_not_started_from(skill:
 
 
 @pytest.mark.parametrize("every", [5, 2])
-def test_two_arms_that_take_turns_are_not_believed_to_be_ready(skill: Skill, every: int) -> None:
+def test_two_arms_in_turns_are_not_ready(skill: Skill, every: int) -> None:
+    """Two arms that take turns are not believed to be ready."""
     loop = Loop(SETTINGS, skill)
     seen = loop.run(2000, {k: arm(ELSEWHERE, stamp_ns(k) + 1) for k in range(0, 2000, every)}, every=5)
     assert not seen["commanded"].any()
@@ -68,7 +68,8 @@ def test_two_arms_that_take_turns_are_not_believed_to_be_ready(skill: Skill, eve
     assert rejected(loop)[Cause.JUMPED] > 300
 
 
-def test_a_second_arm_while_following_is_refused_and_holds_until_it_ends(skill: Skill) -> None:
+def test_second_arm_is_refused_while_following(skill: Skill) -> None:
+    """A second arm while following is refused and holds until it ends."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     seen = loop.run(1500, {k: arm(ELSEWHERE, stamp_ns(500 + k) + 1) for k in range(0, 1500, 5)}, every=5)
@@ -80,7 +81,8 @@ def test_a_second_arm_while_following_is_refused_and_holds_until_it_ends(skill: 
     assert_limits_hold(loop.frames)
 
 
-def test_a_joint_that_jumps_is_refused_until_its_arm_would_be_silent_and_then_a_fault(skill: Skill) -> None:
+def test_joint_that_jumps_is_refused_then_faults(skill: Skill) -> None:
+    """A joint that jumps is refused until its arm would be silent and then a fault."""
     loop = Loop(SETTINGS, skill)
     loop.run(1000, every=5)
     other = (loop.joints[0] - 1.2, *loop.joints[1:])
@@ -92,9 +94,8 @@ def test_a_joint_that_jumps_is_refused_until_its_arm_would_be_silent_and_then_a_
 
 
 @pytest.mark.parametrize(("joint", "value"), [(0, 2.6 + 0.15), (3, -0.9 - 0.05), (5, 1.5707 + 1e-4)])
-def test_an_arm_a_little_outside_its_limits_is_brought_back_and_then_followed(
-    skill: Skill, joint: int, value: float
-) -> None:
+def test_arm_outside_limits_is_brought_back(skill: Skill, joint: int, value: float) -> None:
+    """An arm a little outside its limits is brought back and then followed."""
     start = list(POSTURE)
     start[joint] = value
     loop = Loop(SETTINGS, skill, tuple(start))
@@ -109,7 +110,8 @@ def test_an_arm_a_little_outside_its_limits_is_brought_back_and_then_followed(
     assert seen["mode"][-1] == Mode.FOLLOW
 
 
-def test_an_operators_hold_stops_the_way_back_and_lets_it_go_on(skill: Skill) -> None:
+def test_hold_stops_the_return(skill: Skill) -> None:
+    """An operators hold stops the way back and lets it go on."""
     loop = Loop(SETTINGS, skill, (2.75, *POSTURE[1:]))
     loop.run(300, every=5)
     held = loop.run(500, {0: order("hold")}, every=5)
@@ -121,7 +123,8 @@ def test_an_operators_hold_stops_the_way_back_and_lets_it_go_on(skill: Skill) ->
 
 
 @pytest.mark.parametrize("value", [2.81, -2.81, 6.0])
-def test_an_arm_far_outside_its_limits_is_never_commanded(skill: Skill, value: float) -> None:
+def test_arm_far_outside_is_never_commanded(skill: Skill, value: float) -> None:
+    """An arm far outside its limits is never commanded."""
     loop = Loop(SETTINGS, skill, (value, *POSTURE[1:]))
     seen = loop.run(400, every=5)
     assert not seen["commanded"].any()
@@ -129,7 +132,8 @@ def test_an_arm_far_outside_its_limits_is_never_commanded(skill: Skill, value: f
     assert rejected(loop) == {Cause.OUT_OF_RANGE: 80}
 
 
-def test_an_arm_that_moves_is_not_ready_before_it_rests(skill: Skill) -> None:
+def test_moving_arm_is_not_ready(skill: Skill) -> None:
+    """An arm that moves is not ready before it rests."""
     loop = Loop(SETTINGS, skill)
     moving = {k: arm((POSTURE[0] + 0.001 * k, *POSTURE[1:]), stamp_ns(k)) for k in range(0, 400, 5)}
     assert not loop.run(400, moving, every=0)["commanded"].any()

@@ -9,19 +9,14 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-import coal
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from support import bounds
-from support.arm_geometry import ArmGeometry, between_segments, points_to_box, segments_to_box
 from support.bounds import Bound, Session, broken
-from support.coal_shapes import capsule, distance
-from support.drawn_cells import ARMS, drawn_cell
+from support.drawn_cells import ARMS
 from support.drawn_session import play
 from thirdhand.contract.records import Flag, Mode, Reason
-from thirdhand.settings.config import robot_description
 
 SEEDS: tuple[int, ...] = (0, 1, *range(3, 20), 23)
 LENGTH = {"wild_ticks": 1000, "quiet_s": 8.0, "most_quiet_ticks": 2700}
@@ -43,53 +38,17 @@ def assert_every_bound_is_kept(seed: int, arm: str, *, engages: bool) -> None:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], seed) for seed in SEEDS])
 @pytest.mark.one_case
-def test_every_bound_is_kept_whatever_comes_in(arm: str, seed: int) -> None:
+def test_bounds_hold_in_drawn_sessions(arm: str, seed: int) -> None:
+    """Every bound is kept whatever comes in."""
     assert_every_bound_is_kept(seed, arm, engages=False)
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], 500 + seed) for seed in SEEDS[:9]])
 @pytest.mark.one_case
-def test_every_bound_is_kept_while_the_setpoint_engages_and_a_clutch_chatters(arm: str, seed: int) -> None:
+def test_bounds_hold_with_engaging_and_clutch(arm: str, seed: int) -> None:
+    """Every bound is kept while the setpoint engages and a clutch chatters."""
     assert_every_bound_is_kept(seed, arm, engages=True)
-
-
-@pytest.mark.parametrize("arm", dict.fromkeys(ARMS))
-def test_parts_and_tool_are_where_pinocchio_has_them(arm: str) -> None:
-    random = np.random.default_rng(1)
-    settings = drawn_cell(random, arm)
-    urdf, tool = robot_description(settings), np.array(settings.tool.plate_from_tool[:3])
-    geometry, model = ArmGeometry(settings, urdf), pin.buildModelFromXML(urdf)
-    data, plate = model.createData(), model.getFrameId(settings.arm.plate)
-    joints = [model.getJointId(name) for name in settings.joints.names]
-    postures = random.uniform(settings.joints.lower, settings.joints.upper, (50, len(joints)))
-    capsules, tools = geometry.place(postures)
-    at_zero, _ = geometry.place(np.zeros((1, len(joints))))
-    pin.framesForwardKinematics(model, data, pin.neutral(model))
-    zero = [data.oMi[joint].copy() for joint in joints]
-    for q, ends, at in zip(postures, capsules, tools, strict=True):
-        full = pin.neutral(model)
-        full[[model.joints[joint].idx_q for joint in joints]] = q
-        pin.framesForwardKinematics(model, data, full)
-        np.testing.assert_allclose(at, data.oMf[plate].act(tool), atol=1e-9)
-        for link, moved, still in zip(geometry.links, ends, at_zero[0], strict=True):
-            place = data.oMi[joints[link - 1]] * zero[link - 1].inverse() if link else pin.SE3.Identity()
-            np.testing.assert_allclose(moved, [place.act(end) for end in still], atol=1e-9)
-
-
-def test_distances_are_those_of_coal() -> None:
-    random = np.random.default_rng(2)
-    first, second = random.uniform(-0.5, 0.5, (2, 300, 2, 3))
-    second[:30, 1] = second[:30, 0] + first[:30, 1] - first[:30, 0]  # parallel
-    first[30:60, 1] = first[30:60, 0]  # a point
-    box = np.array([[-0.2, -0.3, -0.1], [0.2, 0.3, 0.1]])
-    shape = coal.Box(*(box[1] - box[0])), coal.Transform3s.Identity()
-    between, to_box = between_segments(first, second), segments_to_box(first, box)
-    for one, other, apart, off in zip(first, second, between, to_box, strict=True):
-        assert apart == pytest.approx(distance(capsule(one), capsule(other)) + 0.02, abs=1e-5)
-        expected = distance(capsule(one), shape) + 0.01
-        assert off == pytest.approx(expected, abs=1e-5) if expected > 0.02 else off < 0.02
-    assert points_to_box(np.array([[0.0, 0.0, 0.07]]), box) == pytest.approx(-0.03)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +92,8 @@ def test_a_bound_that_is_passed_is_found(kept: Session, bound: Bound) -> None:
     assert bound(replace(kept, frames=frames, arm_follows=True)).max() > 0.0
 
 
-def test_a_part_in_a_clearance_and_a_setpoint_that_leaves_are_found(kept: Session) -> None:
+def test_entered_clearance_is_found(kept: Session) -> None:
+    """A part in a clearance and a setpoint that leaves are found."""
     low, folded, frames = kept.placed.copy(), kept.placed.copy(), kept.frames.copy()
     low[-100:, :, :, 2] -= 1.0
     folded[-100:] = folded[-100:, :1]

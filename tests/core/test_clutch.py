@@ -45,7 +45,8 @@ def reasons(settings: Settings, skill: Skill, ticks: list[Tick]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
-def test_the_arm_holds_from_the_tick_in_which_the_release_arrives(taught: Skill, rate_hz: int) -> None:
+def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
+    """The arm holds from the tick in which the release arrives."""
     release = rate_hz
     ticks = resting(0, 2 * rate_hz, at({release: clutch(False)}, every=rate_hz // SENT_HZ), every=rate_hz // 100)
     found = reasons(cell(rate_hz=rate_hz), taught, ticks)
@@ -54,7 +55,8 @@ def test_the_arm_holds_from_the_tick_in_which_the_release_arrives(taught: Skill,
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
-def test_a_clutch_that_falls_silent_is_released(taught: Skill, rate_hz: int) -> None:
+def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
+    """A clutch that falls silent is released."""
     pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
     found = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
     silent = 10 + round(STALE_S * rate_hz)
@@ -70,20 +72,15 @@ def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
     assert (found[21:] == Reason.CLUTCH).all()
 
 
-def test_without_a_clutch_in_the_settings_its_messages_change_nothing(taught: Skill) -> None:
+def test_without_a_clutch_messages_change_nothing(taught: Skill) -> None:
+    """Without a clutch in the settings its messages change nothing."""
     plain = followed(taught, resting(0, 300))
     chattered = followed(taught, resting(0, 300, lambda k: (clutch(k % 3 == 0), wish(1))))
     assert plain.tobytes() == chattered.tobytes()
 
 
-def test_the_last_message_of_a_tick_counts(taught: Skill) -> None:
-    both = lambda k: (clutch(k < 100), clutch(k >= 100))  # noqa: E731
-    found = reasons(cell(), taught, resting(0, 200, both))
-    assert (found[:100] == Reason.CLUTCH).all()
-    assert (found[100:] == Reason.NONE).all()
-
-
-def test_an_operator_and_an_arm_that_is_not_ready_are_named_before_the_clutch(taught: Skill) -> None:
+def test_reasons_before_the_clutch(taught: Skill) -> None:
+    """An operator and an arm that is not ready are named before the clutch."""
     loop = Loop(cell(Settings()), taught)
     not_ready = loop.run(20)
     assert (not_ready["reason"] == Reason.ARM_NOT_READY).all()
@@ -93,7 +90,8 @@ def test_an_operator_and_an_arm_that_is_not_ready_are_named_before_the_clutch(ta
     assert (loop.run(50, {0: clutch(True)})["reason"] == Reason.NONE).all()
 
 
-def test_an_arm_outside_its_limits_returns_only_while_the_clutch_is_pressed(taught: Skill) -> None:
+def test_return_needs_a_pressed_clutch(taught: Skill) -> None:
+    """An arm outside its limits returns only while the clutch is pressed."""
     settings = cell(Settings())
     start = np.array(settings.arm.posture)
     start[3] = settings.joints.upper[3] + 0.02
@@ -110,7 +108,7 @@ def gripper(settings: Settings, skill: Skill, events: Mapping[int, Event]) -> li
     return followed(skill, resting(0, 900, at(events)), settings)["gripper"].tolist()
 
 
-def test_a_wish_decides_the_gripper_where_the_skill_does_not(taught: Skill) -> None:
+def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
     """With hysteresis and pause as where a skill decides it, and not while the arm holds."""
     wishes = cell(gripper="key")
     events = {50: wish(0.2), 350: wish(0.7), 400: wish(0.95), 420: wish(0.0)}
@@ -122,7 +120,8 @@ def test_a_wish_decides_the_gripper_where_the_skill_does_not(taught: Skill) -> N
     assert held[500:] == [CLOSED] * 400
 
 
-def test_a_skill_with_a_gripper_decides_it_alone(skill: Skill) -> None:
+def test_skill_decides_its_gripper_alone(skill: Skill) -> None:
+    """A skill with a gripper decides it alone."""
     first, *more = Scene().via_points()
     there = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
     closing = adapted(skill, (there, *more), tolerance=0.05)

@@ -14,12 +14,9 @@ import pytest
 from support.in_process import Loop, assert_limits_hold, script_hands
 from support.turning import CONTINUOUS, NEAR_SEAM, continuous_cell
 from thirdhand.contract.records import Cause, Mode, Reason
-from thirdhand.core.arm.stage import Arm
 from thirdhand.core.frame import Vector, order
-from thirdhand.core.geometry import quaternion_of
 from thirdhand.core.skill.skill import Skill
-from thirdhand.core.way_out import WayOut
-from thirdhand.settings.config import Settings, load, robot_description
+from thirdhand.settings.config import Settings, load
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -68,7 +65,8 @@ def reference(cell: Settings, skill: Skill) -> Vector:
     return commands(frames)
 
 
-def test_the_task_takes_a_joint_over_the_seam(reference: Vector) -> None:
+def test_task_crosses_the_seam(reference: Vector) -> None:
+    """The task takes a joint over the seam."""
     assert reference[:, 0].min() < math.pi - 0.05
     assert reference[:, 0].max() > math.pi + 0.05
 
@@ -78,9 +76,10 @@ def test_the_task_takes_a_joint_over_the_seam(reference: Vector) -> None:
     [(0, "counted"), (1, "counted"), (-3, "counted"), (-900, "counted"), (0, "wrapped"), (40, "wrapped")],
 )
 @pytest.mark.one_case
-def test_an_arm_in_any_turn_is_commanded_in_its_own_and_goes_as_from_the_first(
+def test_any_turn_is_followed_alike(
     cell: Settings, skill: Skill, turns_on: Vector, reference: Vector, turns: int, how: str
 ) -> None:
+    """An arm in any turn is commanded in its own and goes as from the first."""
     start = np.array(cell.arm.posture) + TURN * turns * turns_on
     counts = counted if how == "counted" else wrapped(turns_on)
     frames = session(cell, skill, counts, start).run(TICKS)
@@ -93,9 +92,8 @@ def test_an_arm_in_any_turn_is_commanded_in_its_own_and_goes_as_from_the_first(
     assert not frames["rejected"][-1].any()
 
 
-def test_after_a_silence_an_arm_is_commanded_in_the_turn_that_it_reports_then(
-    cell: Settings, skill: Skill, turns_on: Vector
-) -> None:
+def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_on: Vector) -> None:
+    """After a silence an arm is commanded in the turn that it reports then."""
     loop = session(cell, skill, counted, np.array(cell.arm.posture) + TURN * turns_on)
     loop.run(600)
     loop.run(201, {200: order("reset")}, every=0)
@@ -107,7 +105,8 @@ def test_after_a_silence_an_arm_is_commanded_in_the_turn_that_it_reports_then(
     assert (np.abs(np.diff(sent, axis=0)) < 0.01).all()
 
 
-def test_a_silence_of_just_as_long_as_is_allowed_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
+def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
+    """A silence of just as long as is allowed turns nothing."""
     loop = session(cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05)  # beyond the seam
     loop.joints[0] = math.pi + 0.01
     for k in range(1500):
@@ -116,15 +115,8 @@ def test_a_silence_of_just_as_long_as_is_allowed_turns_nothing(cell: Settings, s
     assert (np.abs(np.diff(commands(loop.frames), axis=0)) < 0.01).all()
 
 
-def test_half_a_turn_from_the_posture_no_joint_swings(cell: Settings, skill: Skill, turns_on: Vector) -> None:
-    start = np.array(cell.arm.posture)
-    start[5] += math.pi  # the flange's turn is free
-    speeds = session(cell, skill, counted, start).run(700)["joint_velocities"][300:, 5]
-    assert np.abs(np.diff(np.sign(speeds))).sum() <= 4.0
-    assert np.abs(speeds).max() < 0.5
-
-
-def test_a_jump_of_a_turn_is_none_and_one_of_half_a_turn_is(cell: Settings, skill: Skill, turns_on: Vector) -> None:
+def test_jump_of_a_turn_is_none(cell: Settings, skill: Skill, turns_on: Vector) -> None:
+    """A jump of a turn is none and one of half a turn is."""
     loop = session(cell, skill, counted, np.array(cell.arm.posture))
     loop.run(200)
     before = loop.controller.state["measured"].copy()
@@ -136,9 +128,8 @@ def test_a_jump_of_a_turn_is_none_and_one_of_half_a_turn_is(cell: Settings, skil
         np.testing.assert_allclose(found["measured"], before, atol=0.01)
 
 
-def test_narrower_limits_of_a_continuous_joint_hold_in_the_turn_that_they_are_given_for(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_narrow_limits_hold_in_their_turn(tmp_path: Path, skill: Skill) -> None:
+    """Narrower limits of a continuous joint hold in the turn that they are given for."""
     cell = continuous_cell(tmp_path)
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     limits = "lower = [2.0, -6.0, -3.0, -6.0, -6.0, -6.0]\nupper = [4.0, 6.0, 3.0, 6.0, 6.0, 6.0]"
@@ -153,16 +144,3 @@ def test_narrower_limits_of_a_continuous_joint_hold_in_the_turn_that_they_are_gi
     other = session(narrow, skill, counted, posture - [TURN, 0, 0, 0, 0, 0]).run(200)
     assert int(other["reason"][-1]) == Reason.ARM_NOT_READY
     assert int(other["rejected"][-1][Cause.OUT_OF_RANGE]) > 0
-
-
-def test_a_way_out_stays_within_half_a_turn(cell: Settings, turns_on: Vector) -> None:
-    finder = WayOut(cell, robot_description(cell))
-    arm, hands = Arm(cell, robot_description(cell)), np.full((2, 3), 5.0)
-    for turns in (0, 7, -500):
-        start = np.array(cell.arm.posture) + TURN * turns * turns_on
-        target = arm.at(start + np.array([0.8, 0.1, 0.1, 0.0, 0.0, 0.0]))
-        turned = np.empty(4)
-        quaternion_of(target.rotation, turned)
-        path = finder.find(start, target.position, turned, hands)
-        assert path
-        assert np.abs(np.array(path) - start).max() <= math.pi + 1e-9

@@ -35,7 +35,8 @@ def lead(loop: Loop, ticks: int, by: float = LED_RAD, *, is_reported: bool = Tru
 
 
 @pytest.mark.parametrize("first", ["a hold", "nothing"])
-def test_an_arm_that_is_led_holds_and_starts_again_where_it_was_left(taught: Skill, tmp_path: Path, first: str) -> None:
+def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, first: str) -> None:
+    """An arm that is led holds and starts again where it was left."""
     loop = Loop(CELL, taught)
     assert loop.run(1500)["mode"][-1] == Mode.FOLLOW
     if first == "a hold":
@@ -64,22 +65,14 @@ def test_an_arm_that_is_led_holds_and_starts_again_where_it_was_left(taught: Ski
     assert_replays(tmp_path / "led.mcap", CELL, taught, loop.steps)
 
 
-def test_an_arm_that_is_led_without_a_report_is_at_fault(taught: Skill) -> None:
+def test_led_arm_without_report_is_a_fault(taught: Skill) -> None:
+    """An arm that is led without a report is at fault."""
     loop = Loop(CELL, taught)
     loop.run(700, {500: order("hold")})
     assert lead(loop, 800, is_reported=False)["reason"][-1] == Reason.ARM_ERROR
 
 
-def test_guiding_ends_when_its_reports_cease(taught: Skill) -> None:
-    loop = Loop(CELL, taught)
-    loop.run(500)
-    lead(loop, 100, 0.05)
-    silent = loop.run(200)
-    assert (silent["reason"][:49] == Reason.GUIDED).all()  # 100 ms after the last report
-    assert silent["reason"][-1] == Reason.OPERATOR
-
-
-def test_a_hold_without_hands_knows_none_and_the_next_one_knows_them(taught: Skill) -> None:
+def test_hold_knows_hands_that_were_seen(taught: Skill) -> None:
     loop = Loop(CELL, taught)
     loop.hands = None
     loop.run(100, {50: order("hold")})
@@ -91,7 +84,17 @@ def test_a_hold_without_hands_knows_none_and_the_next_one_knows_them(taught: Ski
     assert loop.controller.state["held"] == HELD_SEEN
 
 
-def test_a_report_of_guiding_changes_nothing_for_an_arm_that_is_assumed(taught: Skill) -> None:
+def test_guiding_ends_when_its_reports_cease(taught: Skill) -> None:
+    loop = Loop(CELL, taught)
+    loop.run(500)
+    lead(loop, 100, 0.05)
+    silent = loop.run(200)
+    assert (silent["reason"][:49] == Reason.GUIDED).all()  # 100 ms after the last report
+    assert silent["reason"][-1] == Reason.OPERATOR
+
+
+def test_report_of_guiding_for_assumed_arm(taught: Skill) -> None:
+    """A report of guiding changes nothing for an arm that is assumed."""
     loop = Loop(ASSUMED, taught)
     loop.run(200)
     assert (loop.run(100, {k: guided(True) for k in range(100)})["mode"] == Mode.FOLLOW).all()

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from support.tracked import LEFT, PERIOD_S, Hands, follow
-from thirdhand.core.frame import Vector, parameters
-from thirdhand.core.intake import MODES, STATES, mode_filter
+from thirdhand.core.frame import Vector
 from thirdhand.core.intake.hand_estimator import stillness_of
-from thirdhand.core.intake.motion_model import REST, model
-from thirdhand.core.intake.stage import Intake
+from thirdhand.core.intake.motion_model import REST
 from thirdhand.core.tuning import TUNING
-from thirdhand.settings.config import Settings
 
 LEAST_NOISE_M = TUNING.intake.least_noise_m
 
@@ -26,7 +23,8 @@ def reach(t: float) -> Vector:
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
-def test_a_reach_is_known_to_a_millimetre_between_the_samples_too(rate_hz: int) -> None:
+def test_reach_is_known_between_samples(rate_hz: int) -> None:
+    """A reach is known to a millimetre between the samples too."""
     states = follow(Hands(), reach, until_s=3.0, rate_hz=rate_hz)
     truth = np.array([reach(k * PERIOD_S) for k in range(len(states))])
     error = np.linalg.norm(states[100:, 0] - truth[100:], axis=1)
@@ -35,14 +33,7 @@ def test_a_reach_is_known_to_a_millimetre_between_the_samples_too(rate_hz: int) 
     assert np.abs(states[100:, 1] - velocity[100:]).max() < (0.25 if rate_hz < 100 else 0.1)
 
 
-def test_a_hand_moves_in_each_tick_between_its_samples() -> None:
-    states = follow(Hands(), reach, until_s=3.0, rate_hz=30)
-    steps = np.linalg.norm(np.diff(states[:, 0], axis=0), axis=1)
-    moving = steps[round(1.2 / PERIOD_S) : round(1.8 / PERIOD_S)]
-    assert (moving > 0).all()
-
-
-def test_a_hand_that_goes_evenly_is_not_taken_to_slow_down_where_a_sample_is_late() -> None:
+def test_even_motion_survives_a_late_sample() -> None:
     """In the 60 ms after the newest one: as one that is about to end it would lose a third."""
     hands = Hands()
     follow(hands, lambda t: np.array([0.3 * t, 0.0, 0.2]), until_s=1.0)
@@ -54,7 +45,8 @@ def test_a_hand_that_goes_evenly_is_not_taken_to_slow_down_where_a_sample_is_lat
 
 
 @pytest.mark.parametrize("noise_m", [0.0005, 0.002, 0.005])
-def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
+def test_noise_is_reduced_and_measured(noise_m: float) -> None:
+    """Noise is made smaller and its size is found."""
     noise = np.random.default_rng(1).normal(0.0, noise_m, (600, 3))
     still = np.array([0.5, 0.0, 0.2])
     hands = Hands()
@@ -64,18 +56,8 @@ def test_noise_is_made_smaller_and_its_size_is_found(noise_m: float) -> None:
     assert max(noise_m, LEAST_NOISE_M) * 0.7 < found < max(noise_m, LEAST_NOISE_M) * 1.4
 
 
-def test_the_noise_at_the_start_makes_no_difference_after_a_second_and_a_half() -> None:
-    noise = np.random.default_rng(2).normal(0.0, 0.002, (400, 3))
-    told = []
-    for std_m in (0.0002, TUNING.intake.noise_std_m, 0.01):
-        hands = Hands()
-        hands.state["noise_variance"] = std_m**2
-        told.append(follow(hands, reach, until_s=3.0, noise=noise))
-    for other in told[1:]:
-        assert np.linalg.norm(other[750:, 0] - told[0][750:, 0], axis=1).max() < 0.0005
-
-
-def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
+def test_jump_over_ticks_equals_single_ticks() -> None:
+    """A jump over missed ticks predicts as single ticks do."""
     one, many = Hands(), Hands()
     for hands in (one, many):
         follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
@@ -87,7 +69,7 @@ def test_a_jump_over_missed_ticks_predicts_as_single_ticks_do() -> None:
     np.testing.assert_allclose(many.state["mode_covariances"], one.state["mode_covariances"], rtol=1e-9, atol=1e-15)
 
 
-def test_a_hand_stands_where_it_was_after_a_pause_of_minutes() -> None:
+def test_pause_of_minutes_keeps_position() -> None:
     """Over which the covariance of the motion model overflows."""
     hands = Hands()
     follow(hands, reach, until_s=1.5)
@@ -96,7 +78,8 @@ def test_a_hand_stands_where_it_was_after_a_pause_of_minutes() -> None:
     np.testing.assert_array_equal(hands.state["hands"][LEFT], [before, np.zeros(3), np.zeros(3)])
 
 
-def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() -> None:
+def test_covariances_stay_positive() -> None:
+    """Covariances stay symmetric and positive and probabilities sum to one."""
     hands = Hands()
     random = np.random.default_rng(3)
     for tick in range(3000):
@@ -113,41 +96,6 @@ def test_covariances_stay_symmetric_and_positive_and_probabilities_sum_to_one() 
     assert (state["mode_probabilities"][LEFT] > 0).all()
     assert LEAST_NOISE_M**2 <= state["noise_variance"][LEFT] < math.inf
     assert np.isfinite(state["hands"]).all()
-
-
-def trembling(seconds: float, size_m: float, random: np.random.Generator) -> Vector:
-    """A tremor (N, 3) [m] of 8 to 12 Hz and a tracker's noise, at 100 Hz."""
-    rates = np.interp(
-        np.arange(0.0, seconds, 0.01), np.arange(seconds + 1.0), random.uniform(8.0, 12.0, int(seconds) + 1)
-    )
-    way = random.normal(size=3)
-    tremor = size_m * np.sin(0.02 * np.pi * np.cumsum(rates))[:, None] * way / np.linalg.norm(way)
-    return np.asarray(tremor + random.normal(0.0, 0.0005, (len(rates), 3)))
-
-
-@pytest.mark.parametrize("size_m", [0.0003, 0.001, 0.002])
-def test_a_tremor_is_no_part_of_the_motion_of_a_hand_at_rest(size_m: float) -> None:
-    noise = trembling(8.0, size_m, np.random.default_rng(5))
-    found = follow(Hands(), lambda t: np.zeros(3), until_s=8.0, noise=noise)[1000:]
-    assert np.sqrt(np.mean(np.sum(found[:, 0] ** 2, axis=1))) < 0.0003
-    assert np.sqrt(np.mean(np.sum(found[:, 1] ** 2, axis=1))) < 0.003
-
-
-def test_a_hand_that_trembles_is_known_at_once_where_it_goes() -> None:
-    noise = trembling(3.0, 0.001, np.random.default_rng(6))
-    found = follow(Hands(), lambda t: reach(t - 0.5), until_s=3.0, noise=noise)
-    wanted = np.array([reach(PERIOD_S * tick - 0.5) for tick in range(len(found))])
-    assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < 0.004
-
-
-@pytest.mark.parametrize("size_m", [0.002, 0.003, 0.004])
-def test_a_tremor_is_little_of_the_motion_of_a_hand_on_its_way(size_m: float) -> None:
-    """Its velocity is off by 29 mm/s without tremor, and would be by 60, 89 and 117 of an unknown
-    one.
-    """
-    noise = trembling(4.0, size_m, np.random.default_rng(8))
-    found = follow(Hands(), lambda t: np.array([0.2 * t, 0.0, 0.0]), until_s=4.0, noise=noise)[1000:]
-    assert np.sqrt(np.mean(np.sum((found[:, 1] - [0.2, 0.0, 0.0]) ** 2, axis=1))) < 0.055
 
 
 def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
@@ -171,7 +119,8 @@ def part_at(hz: float, deviation: Vector) -> float:
 
 
 @pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 8.0, 10.0, 12.0])
-def test_a_slow_tremor_is_no_part_of_the_motion_of_a_hand_at_rest(hz: float) -> None:
+def test_slow_tremor_at_rest_is_removed(hz: float) -> None:
+    """A slow tremor is no part of the motion of a hand at rest."""
     position, velocity = shaking(hz, 0.002, 0.0)
     assert part_at(hz, position) < 0.0002
     assert np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < 0.003
@@ -179,31 +128,16 @@ def test_a_slow_tremor_is_no_part_of_the_motion_of_a_hand_at_rest(hz: float) -> 
 
 @pytest.mark.parametrize(("size_m", "speed"), [(0.003, 0.1), (0.002, 0.25)])
 @pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 9.1, 13.0])
-def test_a_tremor_hardly_ripples_the_velocity_of_a_hand_on_its_way(hz: float, size_m: float, speed: float) -> None:
+def test_tremor_hardly_ripples_velocity(hz: float, size_m: float, speed: float) -> None:
+    """A tremor hardly ripples the velocity of a hand on its way."""
     _, velocity = shaking(hz, size_m, speed)
     assert part_at(hz, velocity) < 0.15 * 2 * np.pi * hz * size_m
 
 
-def test_a_hand_that_trembled_and_reaches_again_has_no_tremor_left() -> None:
-    """Covariances stay positive, although the tremor of the mode CHANGE begins and ends."""
-    hands = Hands()
-    follow(
-        hands,
-        lambda t: reach(t - 3.0) + (0.003 * np.sin(10 * np.pi * t) if t < 3.0 else 0.0) * np.ones(3),
-        until_s=7.0,
-        noise=np.random.default_rng(12).normal(0.0, 0.0005, (701, 3)),
-    )
-    assert hands.state["trembles"][LEFT] == 0
-    assert np.linalg.norm(hands.state["hands"][LEFT, 0] - reach(5.0)) < 0.002
-    for covariance in hands.state["mode_covariances"][LEFT, :, :3, :3]:
-        assert np.linalg.eigvalsh(covariance).min() > 0
-
-
 @pytest.mark.parametrize(("rate_hz", "noise_m"), [(30, 0.002), (100, 0.0005)])
 @pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
-def test_a_hand_at_rest_that_is_not_seen_for_a_moment_does_not_dart(
-    rate_hz: int, noise_m: float, unseen_s: float
-) -> None:
+def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_s: float) -> None:
+    """A hand at rest that is not seen for a moment does not dart."""
     hands, still, random = Hands(), np.array([0.5, 0.0, 0.2]), np.random.default_rng(9)
     follow(hands, lambda t: still, until_s=4.0, rate_hz=rate_hz, noise=random.normal(0.0, noise_m, (4 * rate_hz, 3)))
     hands.advance(round(unseen_s / PERIOD_S))
@@ -216,17 +150,6 @@ def test_a_hand_at_rest_that_is_not_seen_for_a_moment_does_not_dart(
     assert fastest < 0.01
 
 
-def test_a_hand_that_comes_again_elsewhere_is_there_at_once() -> None:
-    hands, there = Hands(), np.array([0.8, 0.0, 0.2])
-    follow(hands, lambda t: np.array([0.5, 0.0, 0.2]), until_s=2.0)
-    hands.advance(round(0.2 / PERIOD_S))
-    for k in range(10):
-        hands.hand(3_200_000_000 + 10_000_000 * k, tuple(there.tolist()))
-        hands.advance(5)
-    assert np.linalg.norm(hands.state["hands"][LEFT, 0] - there) < 0.002
-    assert np.linalg.norm(hands.state["hands"][LEFT, 1]) < 0.02
-
-
 @pytest.mark.parametrize("speed", [0.0, 0.002, 0.005, 0.02])
 @pytest.mark.parametrize("rate_hz", [30, 100, 240])
 def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
@@ -237,7 +160,7 @@ def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [100, 334, 500])
-def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None:
+def test_quickest_reaches_are_not_lost(rate_hz: int) -> None:
     """There and back at 1.5 m/s, in a third of a second each way: none of the modes moves so."""
 
     def hand(t: float) -> Vector:
@@ -248,41 +171,6 @@ def test_the_quickest_reaches_and_their_stops_are_not_lost(rate_hz: int) -> None
     found = follow(Hands(), hand, until_s=2.0, rate_hz=rate_hz)
     wanted = np.array([hand(PERIOD_S * tick) for tick in range(len(found))])
     assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < (0.02 if rate_hz == 100 else 0.014)
-
-
-def test_the_model_over_many_ticks_is_that_of_single_ones() -> None:
-    short, long = model(0.002), model(0.05)
-    for name, of_noise in (("transition", "noise"), ("tremor", "tremor_noise")):
-        once, noise = short[name], short[of_noise]
-        transition, total = np.broadcast_to(np.eye(once.shape[-1]), once.shape), np.zeros(once.shape)
-        for _ in range(25):
-            transition, total = once @ transition, once @ total @ once.transpose(0, 2, 1) + noise
-        np.testing.assert_allclose(long[name], transition, rtol=1e-9, atol=1e-11)
-        np.testing.assert_allclose(long[of_noise], total, rtol=1e-7, atol=1e-15)
-
-
-@pytest.mark.parametrize("change_m", [0.0, 0.002])
-@pytest.mark.one_case
-def test_compiled_and_plain_functions_agree(change_m: float) -> None:
-    random = np.random.default_rng(4)
-    root = random.normal(size=(MODES, STATES, STATES))
-    means, covariances = random.normal(size=(MODES, STATES, 3)), root @ root.transpose(0, 2, 1)
-    for mode in range(MODES):
-        if mode != REST:
-            means[mode, 3:] = covariances[mode, 3:] = covariances[mode, :, 3:] = 0.0
-    modes, position = np.array([0.5, 0.3, 0.2]), random.normal(size=3)
-    intake = Intake(Settings()).parameters
-    overs, tremor = parameters(**model(0.002)), np.array([40.0, 2e-7, 1e-7, change_m**2])
-    results = []
-    for plain in (False, True):
-        parts = [means.copy(), covariances.copy(), modes.copy()]
-        for name, more in (("advance", (overs, 3, tremor)), ("update", (0.01, position, 0.03, tremor))):
-            function = getattr(mode_filter, name)
-            arrays = parts[:2] if name == "advance" else [intake.view(np.recarray), *parts]
-            (function.py_func if plain else function)(*arrays, *more)
-        results.append(parts)
-    for compiled, plain in zip(*results, strict=True):
-        np.testing.assert_allclose(compiled, plain, rtol=1e-12)
 
 
 # --- hands that rest ---
@@ -309,7 +197,8 @@ def test_a_hand_that_trembles_rests(tremor_m: float) -> None:
 
 
 @pytest.mark.parametrize("hz", [25, 125, 500])
-def test_rest_is_left_at_once_and_comes_slowly_at_any_rate(hz: int) -> None:
+def test_rest_ends_at_once_and_begins_slowly(hz: int) -> None:
+    """Rest is left at once and comes slowly at any rate."""
     speed = np.concatenate([np.zeros(hz), np.full(hz, 0.3), np.zeros(hz)])
     found = rest_of(speed, hz)
     assert found[hz - 1] == 1.0
@@ -317,14 +206,3 @@ def test_rest_is_left_at_once_and_comes_slowly_at_any_rate(hz: int) -> None:
     assert found[2 * hz + round(0.1 * hz)] < 0.1
     assert 0.3 < found[2 * hz + round(0.4 * hz)] < 0.8
     assert found[-1] > 0.9
-
-
-def test_a_turn_on_the_way_is_no_rest() -> None:
-    t = np.arange(0.0, 2.0, 1.0 / HZ)
-    speed = 0.2 * np.clip((1.0 - t) / 0.15, -1.0, 1.0)  # turns within 0.3 s
-    assert rest_of(speed)[HZ // 2 :].max() < 0.5
-
-
-def test_a_hand_that_is_carried_slowly_is_on_its_way() -> None:
-    assert rest_of(np.full(2 * HZ, 0.08))[-1] < 0.01
-    assert rest_of(np.full(2 * HZ, 0.015))[-1] > 0.98

@@ -8,7 +8,6 @@ from scipy.optimize import lsq_linear, minimize
 
 from thirdhand.core.arm.least_squares import keep_under, least_squares
 from thirdhand.core.arm.stage import Arm
-from thirdhand.core.arm.step import describe
 from thirdhand.core.decision.step import measured_error
 from thirdhand.core.frame import Vector, parameters
 from thirdhand.core.kinematics import tool_speed_after, tool_speeds
@@ -17,14 +16,13 @@ from thirdhand.core.tuning import TUNING
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import robot_description
 
-DAMPING_M2 = TUNING.arm.damping_m2
-TURN_LEVER_M = TUNING.arm.turn_lever_m
 GAP_FREE_M = TUNING.setpoint.gap_free_m
 GAP_SLOW_M = TUNING.setpoint.gap_slow_m
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> None:
+def test_bounded_least_squares(seed: int) -> None:
+    """The bounded least squares are those of another solver."""
     random = np.random.default_rng(seed)
     tasks, wanted, posture = random.normal(size=(6, 7)), random.normal(size=6), 0.1 * random.normal(size=7)
     damping, width = 10 ** random.uniform(-4, -1), 10 ** random.uniform(-1.5, 0.5)
@@ -38,24 +36,8 @@ def test_the_bounded_least_squares_are_those_of_another_solver(seed: int) -> Non
     np.testing.assert_allclose(found, best, atol=1e-7)
 
 
-@pytest.mark.parametrize("count", [5, 6])
-def test_tasks_are_the_tool_s_velocity_and_what_turns_it(count: int) -> None:
-    random = np.random.default_rng(1)
-    jacobian, rotation = random.normal(size=(6, 7)), np.linalg.qr(random.normal(size=(3, 3)))[0]
-    arm = parameters(turn_lever=TURN_LEVER_M, damping=DAMPING_M2, singular_damping=2e-3, singular_volume=0.04)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, random.normal(size=3)
-    parts = {"jacobian": np.empty((6, 7)), "position": np.empty(3), "rotation": np.empty((3, 3))}
-    here = parameters(tasks=np.empty((count, 7)), damping=0.0, **parts)
-    describe(arm, here, jacobian, pose)
-    expected = np.vstack([jacobian[:3], TURN_LEVER_M * rotation.T @ jacobian[3:]])[:count]
-    np.testing.assert_allclose(here["tasks"][0], expected, rtol=1e-12, atol=1e-15)
-    np.testing.assert_array_equal(here["position"][0], pose[:3, 3])
-    np.testing.assert_array_equal(here["rotation"][0], rotation)
-    assert here["damping"][0] == DAMPING_M2  # far from singular
-
-
 def test_speeds_and_errors_are_those_of_numpy() -> None:
+    """Tool speeds now, to come and in total, and the error of the measured joints."""
     random = np.random.default_rng(2)
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
@@ -74,7 +56,8 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
 
 
 @pytest.mark.parametrize("name", ["wam", "franka", "ur5"])
-def test_the_tool_s_speed_after_a_way_of_the_joints_is_that_of_pinocchio(name: str) -> None:
+def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
+    """The tool's speed after a way of the joints is that of pinocchio."""
     random, settings = np.random.default_rng(3), cell_of(name)
     arm, joints = Arm(settings, robot_description(settings)), len(settings.joints.names)
     for _ in range(20):
@@ -83,7 +66,8 @@ def test_the_tool_s_speed_after_a_way_of_the_joints_is_that_of_pinocchio(name: s
         assert speed == pytest.approx(np.linalg.norm(arm.at(q + way).tasks[:3] @ dq), rel=1e-9)
 
 
-def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
+def test_setpoint_waits_for_a_late_tool() -> None:
+    """A setpoint waits for a tool that is behind."""
     setpoint, tool = np.zeros((3, 3)), np.zeros(3)
     limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)
     setpoint[0, 0], setpoint[1, 0] = GAP_FREE_M + GAP_SLOW_M, 0.2
@@ -97,7 +81,8 @@ def test_a_setpoint_waits_for_a_tool_that_is_behind() -> None:
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int) -> None:
+def test_least_squares_under_inequalities(seed: int) -> None:
+    """Least squares under inequalities are those of another solver."""
     random = np.random.default_rng(seed)
     tasks, wanted, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
     damping, count = 10 ** random.uniform(-4, -1), int(random.integers(1, 12))
@@ -132,7 +117,8 @@ def test_least_squares_under_inequalities_are_those_of_another_solver(seed: int)
     assert cost(found) <= best.fun + 1e-6
 
 
-def test_between_two_things_that_cannot_both_be_left_the_way_along_them_is_free() -> None:
+def test_way_along_two_obstacles_is_free() -> None:
+    """Between two things that cannot both be left the way along them is free."""
     tasks, wanted, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
     rows, found = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
     least_squares(tasks, wanted, np.zeros(3), 1e-3, bounds, found)

@@ -64,7 +64,8 @@ def both_remembered(
 
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
-def test_the_service_remembers_what_was_learned_at_any_rate(rate_hz: int) -> None:
+def test_memory_is_that_of_learning(rate_hz: int) -> None:
+    """The service remembers what was learned at any rate."""
     shown = features(motion(np.arange(0.0, 6.0, 0.02))[0], 0.02, ORDER)
     live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[:: rate_hz // 50]
     behind = shown[:, 6:].reshape(-1, ORDER, 6) + shown[:, None, :6]
@@ -72,7 +73,8 @@ def test_the_service_remembers_what_was_learned_at_any_rate(rate_hz: int) -> Non
 
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
-def test_hands_are_turned_live_as_they_were_learned_at_any_rate(rate_hz: int) -> None:
+def test_turns_are_those_of_learning(rate_hz: int) -> None:
+    """Hands are turned live as they were learned at any rate."""
     turns = np.tile(motion(np.arange(0.0, 6.0, 0.02))[0], 3)
     shown = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
     told = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
@@ -80,12 +82,8 @@ def test_hands_are_turned_live_as_they_were_learned_at_any_rate(rate_hz: int) ->
     assert np.abs(TURN_WEIGHT_M * live - shown).max() < 0.0005
 
 
-def test_hands_that_rest_are_remembered_where_they_are_and_those_that_come_first_at_once() -> None:
-    rest = np.full((5, 6), 0.4)
-    np.testing.assert_array_equal(remembered(rest, 0.002), np.full((5, ORDER, 6), 0.4))
-
-
-def test_nothing_is_forgotten_while_no_hand_is_seen() -> None:
+def test_nothing_is_forgotten_unseen() -> None:
+    """Nothing is forgotten while no hand is seen."""
     hands = motion(np.arange(0.0, 8.0, 0.01))[0]
     hands[300:] = hands[299]
     gone = remembered(hands, 0.01, unseen=range(300, 700))
@@ -93,7 +91,8 @@ def test_nothing_is_forgotten_while_no_hand_is_seen() -> None:
     assert np.abs(gone[701] - remembered(hands, 0.01)[311]).max() < 0.002
 
 
-def test_inputs_move_as_their_velocity_and_acceleration_say() -> None:
+def test_inputs_move_with_their_derivatives() -> None:
+    """Inputs move as their velocity and acceleration say."""
     h = 1e-3
     times = np.arange(0.0, 4.0, h)
     moving = motion(times)
@@ -137,7 +136,8 @@ def order(skill: StoredSkill) -> int:
 
 
 @pytest.mark.thorough
-def test_learn_remembers_where_hands_alone_tell_too_little_and_nowhere_else() -> None:
+def test_learn_takes_memory_where_needed() -> None:
+    """Learn remembers where hands alone tell too little and nowhere else."""
     skill = learn(takes(8, remembers=True))
     assert order(skill) == ORDER
     assert figures_of(skill).taken.startswith("memory")

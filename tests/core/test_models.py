@@ -10,7 +10,7 @@ import pytest
 from support.paths import RECORDINGS
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
-from thirdhand.core.skill.model import Model, Motion, Seen
+from thirdhand.core.skill.model import Motion, Seen
 from thirdhand.core.skill.skill import MODELS, UNTOLD, Skill
 from thirdhand.core.skill.tuning import TURN_LAG_S
 from thirdhand.skills.skill_file import decoded, with_file
@@ -45,7 +45,8 @@ def predicted(skill: Skill, hands: Vector, velocity: Vector, **more: object) -> 
     return Motion(*found[:6])
 
 
-def test_a_prediction_is_the_mean_rounded_with_its_derivative_along_the_motion(skill: Skill, hands: Vector) -> None:
+def test_prediction_has_its_derivative(skill: Skill, hands: Vector) -> None:
+    """A prediction is the mean rounded with its derivative along the motion."""
     velocity = np.array([0.3, -0.4, 0.2, 0.4, 0.3, 0.1])
     found, belief = predicted(skill, hands, velocity), skill.model.belief(hands)
     rest = predicted(skill, hands, np.zeros(6))
@@ -55,19 +56,14 @@ def test_a_prediction_is_the_mean_rounded_with_its_derivative_along_the_motion(s
     assert not predicted(skill, hands, np.zeros(6)).velocity.any()
 
 
-def test_how_sure_it_is_and_what_the_gate_sees_are_those_of_many_hands(skill: Skill, hands: Vector) -> None:
+def test_covariance_and_gate_are_those_of_many_hands(skill: Skill, hands: Vector) -> None:
+    """How sure it is and what the gate sees are those of many hands."""
     found = predicted(skill, hands, np.zeros(6))
     np.testing.assert_allclose(found.covariance, skill.model.covariances(hands[None])[0], rtol=0, atol=0.6e-10)
     assert found.gate_m == pytest.approx(skill.model.gates_m(hands[None])[0], abs=1e-6)
     assert np.linalg.eigvalsh(found.covariance).min() > 0.0
     apart = hands + np.array([0.0, 0.0, 0.5, 0.0, 0.0, -0.5])
     assert predicted(skill, apart, np.zeros(6)).gate_m > skill.threshold
-
-
-def test_a_covariance_that_is_known_is_handed_back_and_changes_nothing_else(skill: Skill, hands: Vector) -> None:
-    whole = predicted(skill, hands, np.ones(6))
-    again = predicted(skill, hands, np.ones(6), before=(whole.covariance, np.zeros((3, 3)), -1.0, whole.gate_m))
-    assert [np.asarray(part).tobytes() for part in again] == [np.asarray(part).tobytes() for part in whole]
 
 
 def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
@@ -83,7 +79,8 @@ def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
     np.testing.assert_allclose(moves, (ahead - behind) / (2 * H), atol=1e-9)
 
 
-def test_stored_and_read_back_it_says_the_same(skill: Skill) -> None:
+def test_stored_model_says_the_same(skill: Skill) -> None:
+    """Stored and read back it says the same."""
     model = skill.model
     assert set(model.own_arrays()) - {"names", "task_clock"} == set(model.ranges) - LATER[type(model).__name__]
     back = decoded(skill.file, origin="a file")
@@ -91,23 +88,3 @@ def test_stored_and_read_back_it_says_the_same(skill: Skill) -> None:
     assert back.model.mean(model.hands).tobytes() == model.mean(model.hands).tobytes()
     assert back.model.covariances(model.hands).tobytes() == model.covariances(model.hands).tobytes()
     assert with_file(replace(back, file=b"")).file == skill.file
-
-
-def test_without_its_via_points_it_is_as_it_was_learned(skill: Skill) -> None:
-    learned = adapted(skill, (), tolerance=0.05).model
-    assert skill.model.unadapted().mean(learned.hands).tobytes() == learned.mean(learned.hands).tobytes()
-    assert skill.model.mean(learned.hands).tobytes() != learned.mean(learned.hands).tobytes()
-
-
-def test_models_are_told_apart_by_their_words() -> None:
-    assert all(len({words(model) for model in MODELS}) == len(MODELS) for words in (measure, units))
-
-
-def measure(model: type[Model]) -> str:
-    assert len(model.measure) > 10
-    return model.measure
-
-
-def units(model: type[Model]) -> str:
-    assert "[m]" in model.units
-    return model.units

@@ -21,7 +21,6 @@ from thirdhand.core.controller import outgoing
 from thirdhand.core.frame import blank, state_layout
 from thirdhand.core.geometry import (
     axis_of,
-    off_target,
     quaternion_of,
     swing,
     turn_between,
@@ -72,16 +71,8 @@ def test_rotations_are_those_of_scipy() -> None:
         assert abs(a @ (Rotation.from_rotvec(turn) * one).as_quat()) == pytest.approx(1.0, abs=1e-8)
 
 
-def test_a_tool_is_off_by_its_whole_turn_or_by_where_it_points() -> None:
-    tools, targets = random_rotations(50, 5), random_rotations(50, 6)
-    given = tools.as_quat(), targets.as_quat()
-    turns = (tools * targets.inv()).magnitude()
-    np.testing.assert_allclose(off_target(*given, direction=False), turns, atol=1e-7)
-    between = np.sum(tools.apply((0, 0, 1)) * targets.apply((0, 0, 1)), axis=1)
-    np.testing.assert_allclose(off_target(*given, direction=True), np.arccos(between), atol=1e-7)
-
-
-def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> None:
+def test_learned_orientation_is_that_of_kmp() -> None:
+    """A learned orientation is that of kmp with its angular velocity."""
     random = np.random.default_rng(3)
     inputs, zeta = random.normal(size=(12, 6)), 0.5 * random.normal(size=(12, 3))
     reference = Gaussians.of(zeta, deviation=0.01)
@@ -101,7 +92,8 @@ def test_a_learned_orientation_is_that_of_kmp_with_its_angular_velocity() -> Non
 
 
 @pytest.mark.parametrize("about", [False, True])
-def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(about: bool) -> None:
+def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
+    """An orientation that jumps is turned to within speed and acceleration."""
     settings = changed(Settings(), tool={"orientation": "full"}) if about else Settings()
     lead, state = OrientationSetpoint(settings), blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
@@ -120,7 +112,8 @@ def test_an_orientation_that_jumps_is_turned_to_within_speed_and_acceleration(ab
     assert np.linalg.norm(speeds[-1]) < 1e-2
 
 
-def test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to() -> None:
+def test_full_orientation_costs_no_position() -> None:
+    """The arm turns its tool all the way where it is told to."""
     settings = changed(Settings(), tool={"orientation": "full"})
     arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
     q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
@@ -135,7 +128,8 @@ def test_the_arm_turns_its_tool_all_the_way_where_it_is_told_to() -> None:
     assert farthest < 5e-4  # it costs the tool's position nothing
 
 
-def test_an_orientation_taught_at_a_place_is_predicted_and_followed_there(skill: Skill) -> None:
+def test_taught_orientation_is_followed(skill: Skill) -> None:
+    """An orientation taught at a place is predicted and followed there."""
     places = Scene().via_points()
     turned = (Rotation.from_euler("y", -40, degrees=True) * Rotation.from_quat(TOOL_ORIENTATION)).as_quat()
     x, y, z, w = turned.tolist()
@@ -153,7 +147,8 @@ def test_an_orientation_taught_at_a_place_is_predicted_and_followed_there(skill:
     assert last["orientation_covariance"].any()
 
 
-def test_a_gripper_is_decided_with_hysteresis() -> None:
+def test_gripper_has_hysteresis() -> None:
+    """A gripper is decided with hysteresis."""
     assert decided(UNKNOWN, 0.6) == CLOSED
     assert decided(UNKNOWN, 0.4) == OPEN
     for closure in np.linspace(0.11, 0.89, 20):
@@ -166,7 +161,8 @@ def test_a_gripper_is_decided_with_hysteresis() -> None:
     assert [decided(one, NO_GRIPPER) for one in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
 
 
-def test_orientation_covariance_and_gripper_go_out_with_a_frame() -> None:
+def test_orientation_and_gripper_are_sent() -> None:
+    """Orientation covariance and gripper go out with a frame."""
     frame = blank(FRAME)
     frame["covariance"], frame["orientation_covariance"] = np.eye(3), np.arange(9).reshape(3, 3)
     frame["orientation"], frame["setpoint_orientation"] = (0, 0, 0, 1), (0, 1, 0, 0)

@@ -27,7 +27,7 @@ def way(first: Vector, last: Vector, period_s: float) -> Vector:
 
 
 @pytest.mark.thorough
-def test_the_shipped_skill_does_the_same_in_every_round(taught: Skill) -> None:
+def test_every_round_is_as_the_first(taught: Skill) -> None:
     """After a hold, a fault, a round that was broken off, and with rests of 0.5 to 3 s."""
     script = HandScript(Scene(), seed=1)
     period_s = ASSUMED.period_s

@@ -16,7 +16,6 @@ from thirdhand.contract.records import Cause, Mode, Reason
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.geometry import place
 from thirdhand.core.separation.body import body_of
-from thirdhand.core.separation.stage import Separation
 from thirdhand.core.skill.skill import Skill
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.scene import Scene
@@ -26,12 +25,6 @@ from thirdhand_sim.script import HandScript
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return sliding_cell(tmp_path_factory.mktemp("sliding"))
-
-
-def test_units_and_limits_are_those_of_the_description(cell: Settings) -> None:
-    joints = cell.joints
-    assert joints.kinds == ("prismatic", *("revolute",) * 6)
-    assert (joints.units[0], joints.lower[0], joints.upper[0]) == ("m", -0.3, 0.3)
 
 
 def test_the_body_moves_as_the_links_do(cell: Settings) -> None:
@@ -60,21 +53,8 @@ def test_no_part_is_faster_than_its_bound(cell: Settings) -> None:
         assert (speed <= body.capsules["max_speed"] * (1 + 1e-4)).all()
 
 
-def test_separation_s_rows_are_the_speed_of_the_nearest_points(cell: Settings) -> None:
-    urdf = robot_description(cell)
-    arm, separation, rng = Arm(cell, urdf), Separation(cell, urdf), np.random.default_rng(4)
-    for _ in range(50):
-        q = np.array(cell.arm.posture) + rng.uniform(-0.2, 0.2, 7)
-        hand = arm.at(q).position + rng.uniform(-0.2, 0.2, 3) + [0.0, 0.0, 0.3]
-        velocity, step_s = rng.uniform(-0.3, 0.3, 7), 1e-5
-        hands = np.array([hand])
-        before, part, _ = separation.clearance(q, hands)
-        after, same, _ = separation.clearance(q + step_s * velocity, hands)
-        if part == same and before > 0.05:
-            assert abs(after - before) <= step_s * separation.max_speed
-
-
-def test_it_follows_with_every_limit_held_and_replays(cell: Settings, skill: Skill, tmp_path: Path) -> None:
+def test_rail_follows_within_limits_and_replays(cell: Settings, skill: Skill, tmp_path: Path) -> None:
+    """It follows with every limit held and replays."""
     loop = Loop(cell, skill)
     loop.hands = script_hands(HandScript(Scene(), seed=3))
     seen = loop.run(3500)
@@ -87,7 +67,8 @@ def test_it_follows_with_every_limit_held_and_replays(cell: Settings, skill: Ski
 
 
 @pytest.mark.parametrize(("off_m", "reason"), [(0.04, Reason.NONE), (0.06, Reason.ARM_ERROR)])
-def test_a_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, off_m: float, reason: Reason) -> None:
+def test_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, off_m: float, reason: Reason) -> None:
+    """A rail that does not follow is a fault."""
     loop, rail = Loop(cell, skill), np.eye(7)[0]
     loop.reports = lambda q, dq: (q + off_m * max(0, loop.index - 200) / 100 * rail, 0.0 * dq)
     assert int(loop.run(300)["reason"][-1]) == reason
@@ -96,9 +77,8 @@ def test_a_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, of
 @pytest.mark.parametrize(
     ("rail_m", "cause"), [(0.2, None), (0.38, None), (0.42, Cause.OUT_OF_RANGE), (200.0, Cause.OUT_OF_RANGE)]
 )
-def test_a_rail_outside_its_limits_is_brought_back_or_refused(
-    cell: Settings, skill: Skill, rail_m: float, cause: Cause | None
-) -> None:
+def test_rail_outside_limits_returns(cell: Settings, skill: Skill, rail_m: float, cause: Cause | None) -> None:
+    """A rail outside its limits is brought back or refused."""
     loop = Loop(cell, skill, (rail_m, *cell.arm.posture[1:]))
     loop.hands = None
     loop.reports = lambda q, dq: (q, 0.0 * dq)
@@ -112,7 +92,8 @@ def test_a_rail_outside_its_limits_is_brought_back_or_refused(
         assert int(seen["rejected"][-1][cause]) == 1500
 
 
-def test_joints_beyond_the_plate_change_nothing(tmp_path: Path) -> None:
+def test_joints_beyond_plate_change_nothing(tmp_path: Path) -> None:
+    """Joints beyond the plate change nothing."""
     plain = (ARMS / "ur5.urdf").read_text(encoding="utf-8")
     cells = []
     for name, urdf in (("plain", plain), ("more", plain.replace("</robot>", BEYOND + "</robot>"))):

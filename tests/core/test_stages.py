@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from support.paths import RECORDINGS
-from support.wam import URDF
-from thirdhand.core.controller import Controller, start_state
-from thirdhand.core.frame import Tick, order, structured
+from thirdhand.core.controller import start_state
+from thirdhand.core.frame import structured
 from thirdhand.core.skill.memory import along, delayed
 from thirdhand.core.skill.segments import (
     MOST_SEGMENTS,
@@ -66,7 +65,8 @@ def beliefs(segments: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def test_what_was_before_tells_visits_of_a_place_apart(there_and_back: np.ndarray) -> None:
+def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
+    """What was before tells visits of a place apart."""
     found = beliefs(there_and_back, legs(0.5, 0.9, 0.5, 0.9, 0.5))
     assert np.abs(found.sum(axis=1) - 1.0).max() < 1e-6
     for leg in range(4):
@@ -77,7 +77,7 @@ def test_what_was_before_tells_visits_of_a_place_apart(there_and_back: np.ndarra
     assert ends[3] > 0.7
 
 
-def test_a_belief_that_is_wrong_comes_right_within_a_second(there_and_back: np.ndarray) -> None:
+def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
     """A segment whose ways are elsewhere is told by where hands are; those before are forgotten."""
     segments = there_and_back.copy()
     segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
@@ -89,7 +89,8 @@ def test_a_belief_that_is_wrong_comes_right_within_a_second(there_and_back: np.n
     assert belief[3] > 0.8
 
 
-def test_a_hand_that_rests_near_an_end_is_there_and_a_moving_one_on_its_way(there_and_back: np.ndarray) -> None:
+def test_resting_hand_near_an_end_is_there(there_and_back: np.ndarray) -> None:
+    """A hand that rests near an end is there and a moving one on its way."""
     segment = there_and_back[0]
     near, half = np.array([0.54, 0.02, 0.1]), np.array([0.7, 0.0, 0.1])
     assert along_way(near, 1.0, segment, 0) < 0.01
@@ -98,7 +99,8 @@ def test_a_hand_that_rests_near_an_end_is_there_and_a_moving_one_on_its_way(ther
     assert along_way(half, 0.0, segment, 1) == 1.0  # the right hand stays
 
 
-def test_hands_are_delayed_as_they_were_learned_or_foreseen() -> None:
+def test_hands_are_delayed_as_learned() -> None:
+    """Hands are delayed as they were learned or foreseen."""
     times = np.arange(0.0, 4.0, PERIOD_S)
     hands = np.tile(0.2 * np.sin(times)[:, None], (1, 6))
     rows = along(hands, PERIOD_S, 0.3 / 4, 4)
@@ -112,7 +114,8 @@ def test_hands_are_delayed_as_they_were_learned_or_foreseen() -> None:
     assert out[0, 0] == pytest.approx(0.2 * np.sin(times[at] + 0.1), abs=0.002)
 
 
-def test_the_segment_is_set_kept_over_a_hold_and_begun_anew_by_another_task() -> None:
+def test_segment_is_set_kept_and_reset() -> None:
+    """The segment is set kept over a hold and begun anew by another task."""
     settings, skill = Settings(), shipped_skill()
     segment, state = SkillStage(settings, skill), start_state(settings, skill)
     segment.set_segment(state, "glass")
@@ -129,9 +132,3 @@ def test_the_segment_is_set_kept_over_a_hold_and_begun_anew_by_another_task() ->
 def segment_less(skill: Skill) -> Skill:
     """Another skill, which has no segments."""
     return decoded((RECORDINGS / "experiments/as-paper.npz").read_bytes(), origin="as-paper.npz")
-
-
-def test_a_request_sets_the_segment_in_the_loop() -> None:
-    controller = Controller(Settings(), shipped_skill(), urdf=URDF)
-    controller.step(Tick(0, (order("segment", "glass"),)))
-    assert controller.state["segment_belief"].argmax() == shipped_skill().model.names.index("glass")

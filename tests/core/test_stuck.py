@@ -82,7 +82,8 @@ def session(
 
 @pytest.mark.parametrize(("name", "seed"), [("wam", 1), ("panda", 2), ("ur5", 3)])
 @pytest.mark.one_case
-def test_from_any_free_start_the_tool_comes_to_its_target(taught: Skill, name: str, seed: int) -> None:
+def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) -> None:
+    """From any free start the tool comes to its target."""
     cell = replace(cell_of(name), rate_hz=250)
     random, hands = np.random.default_rng(seed), taught.hands.reshape(-1, 2, 3)
     late = []
@@ -108,9 +109,10 @@ def stuck(taught: Skill) -> tuple[Settings, Vector, Vector]:
     return cell, free_postures(cell, STUCK + 1, 1)[STUCK], drawn[STUCK]
 
 
-def test_where_it_is_stuck_that_is_said_within_a_second_and_a_way_out_is_gone(
+def test_stuck_tool_is_reported_and_led_out(
     taught: Skill, stuck: tuple[Settings, Vector, Vector], tmp_path: Path
 ) -> None:
+    """Where it is stuck that is said within a second and a way out is gone."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands)
     frames = np.array([frame for _, frame in ran.steps])
@@ -129,9 +131,8 @@ def test_where_it_is_stuck_that_is_said_within_a_second_and_a_way_out_is_gone(
     assert_replays(tmp_path / "stuck.mcap", cell, taught, ran.steps, state)
 
 
-def test_where_no_way_is_found_it_holds_until_the_target_is_another_one(
-    taught: Skill, stuck: tuple[Settings, Vector, Vector]
-) -> None:
+def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
+    """Where no way is found it holds until the target is another one."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands, seconds=12.0, finds=False)
     last = ran.steps[-1][1]
@@ -139,7 +140,8 @@ def test_where_no_way_is_found_it_holds_until_the_target_is_another_one(
     assert not last["joint_velocities"].any()
 
 
-def test_a_way_that_begins_elsewhere_is_not_gone(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
+def test_way_from_elsewhere_is_ignored(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
+    """A way that begins elsewhere is not gone."""
     cell, start, hands = stuck
     state = start_state(cell, taught)
     state["joints"][0] = start
@@ -152,7 +154,8 @@ def test_a_way_that_begins_elsewhere_is_not_gone(taught: Skill, stuck: tuple[Set
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_arm_that_stands_in_the_table_is_not_ready_until_it_is_out(skill: Skill, seed: int) -> None:
+def test_arm_in_the_table_leaves_it_first(skill: Skill, seed: int) -> None:
+    """An arm that stands in the table is not ready until it is out."""
     cell, random = replace(ASSUMED, arm=replace(ASSUMED.arm, source="state")), np.random.default_rng(seed)
     separation, kinematics = Separation(cell, URDF), Arm(cell, URDF)
     while True:

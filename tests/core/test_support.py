@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from support.paths import RECORDINGS
-from support.skills import at_rest
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import blank, frame_layout
 from thirdhand.core.numerics import UNPRIMED_DECIDED
-from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.model import LEVELS, NORMAL_RATIOS, Regions
+from thirdhand.core.skill.model import LEVELS, NORMAL_RATIOS
 from thirdhand.core.skill.segmented import SegmentedKMP, Unknown
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.stage import SkillStage
@@ -22,7 +19,6 @@ from thirdhand.core.skill.support import LocalErrors, error_probability
 from thirdhand.core.skill.tuning import LEAST_STD_M, UNSURE_M
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
-from thirdhand.skills.skill_file import decoded, with_file
 from thirdhand_sim.scene import Scene
 
 FAR_STD_M = 0.3
@@ -42,7 +38,8 @@ def errors() -> LocalErrors:
     return LocalErrors.of(primitive, inputs, off, FAR_STD_M)
 
 
-def test_the_covariance_is_the_scatter_of_near_errors_and_away_from_all_that_of_the_tool(errors: LocalErrors) -> None:
+def test_covariance_is_scatter_of_near_errors(errors: LocalErrors) -> None:
+    """The covariance is the scatter of near errors and away from all that of the tool."""
     least = LEAST_STD_M**2 * np.eye(3)
     near, other, far = errors.covariances(np.array([[0.0, 0.0], [1.0, 1.0], [6.0, -6.0]])) - least
     prior = 0.1 / 20.1 * FAR_STD_M**2
@@ -54,7 +51,10 @@ def test_the_covariance_is_the_scatter_of_near_errors_and_away_from_all_that_of_
     assert (np.diff(grows) >= -1e-12).all()
 
 
-def test_an_error_probability_is_the_share_of_errors_beyond_each_level_and_grows_with_the_covariance() -> None:
+def test_error_probability_follows_levels() -> None:
+    """An error probability is the share of errors beyond each level and grows with the
+    covariance.
+    """
     ratios = np.array(NORMAL_RATIOS)
     at_levels = [error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios]
     np.testing.assert_allclose(at_levels, 1.0 - np.array(LEVELS), atol=1e-6)
@@ -75,7 +75,8 @@ def segmented(**more: object) -> SegmentedKMP:
     return replace(model, **more)  # type: ignore[arg-type]
 
 
-def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are_uncertain() -> None:
+def test_unshown_places_are_uncertain() -> None:
+    """Between via points what was not shown and places that are not given are uncertain."""
     known = segmented(unknown=None)
     count = len(known.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
@@ -97,23 +98,6 @@ def test_between_via_points_what_was_not_shown_and_places_that_are_not_given_are
     assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this segment"
 
 
-def test_a_skill_of_the_hands_inputs_gates_by_its_primitive_whatever_its_covariance() -> None:
-    plain = decoded((RECORDINGS / "experiments/as-paper.npz").read_bytes(), origin="as-paper.npz")
-    assert isinstance(plain.model, HandsKMP)
-    hands = plain.hands[::10]
-    off = 0.01 * np.random.default_rng(3).normal(size=(len(hands), 3))
-    local = LocalErrors.of(plain.model.primitive, plain.model.inputs(hands), off, FAR_STD_M)
-    skill = decoded(with_file(replace(plain, model=replace(plain.model, errors=local))).file, origin="memory")
-    one, other = (at_rest(s, hands[3]) for s in (skill, plain))
-    assert one.gate_m == other.gate_m
-    np.testing.assert_allclose(one.covariance, local.covariances(hands[3:4])[0], atol=1e-9)
-    before = one.covariance, np.zeros((3, 3)), -1.0, one.gate_m
-    again = at_rest(skill, hands[3], before=before)
-    assert (again.gate_m, again.covariance.tobytes()) == (one.gate_m, one.covariance.tobytes())
-    apart = at_rest(skill, hands[3] + 1.0)
-    assert np.trace(apart.covariance) == pytest.approx(3 * (FAR_STD_M**2 + LEAST_STD_M**2), rel=1e-3)
-
-
 def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], list[bool], float]:
     """Error probabilities and flags of hands (2, 3) that rest, and the last unprimed belief in the
     first segment."""
@@ -130,7 +114,8 @@ def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], li
     return found, unsure, float(state["unprimed_belief"][0])
 
 
-def test_a_task_that_may_have_begun_in_another_segment_is_unsure_until_the_hands_tell() -> None:
+def test_possible_other_segment_is_unsure() -> None:
+    """A task that may have begun in another segment is unsure until the hands tell."""
     shipped = shipped_skill()
     regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
     model = segmented()
@@ -146,12 +131,3 @@ def test_a_task_that_may_have_begun_in_another_segment_is_unsure_until_the_hands
     _, unsure, decided = doubts(replace(shipped, regions=regions), begin, 600)
     assert decided == UNPRIMED_DECIDED
     assert not unsure[-1]
-
-
-def test_a_skill_without_an_alarm_has_an_error_probability_and_the_flag_that_it_had() -> None:
-    shipped = shipped_skill()
-    shipped = replace(shipped, model=segmented(unknown=None), regions=Regions(*shipped.regions[:3]))
-    told, unsure, decided = doubts(shipped, shipped.hands[1].reshape(2, 3), 3)
-    assert 0.0 < told[-1] < 0.01
-    assert not unsure[-1]
-    assert decided == 0.0

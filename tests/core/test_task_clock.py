@@ -28,7 +28,6 @@ from thirdhand.core.skill.task_clock import (
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import StoredSkill, decoded
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods.clock import Tempo, clock_of
 from thirdhand_sim.lab.people.left_out import judged, left_out, predicted_rounds
 
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
@@ -52,21 +51,15 @@ def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: flo
 @pytest.mark.parametrize(
     ("clock", "parts", "seconds"),
     [
-        (RUNS, [("rest", 3.0, HOME)], 0.0),
         (RUNS, [("rest", 3.0, HOME), ("move", 1.0, AWAY)], 0.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 2.9),
         (WAITS, [("move", 1.0, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 1.9),
         (RUNS, [("move", 20.0, AWAY)], 5.1),  # it ends with the longest demonstration
-        (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY)], 3.0),  # a pause, not the end of the task
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
-        (WAITS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 1.9),
-        (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, HOME), ("move", 1.0, HOME)], 0.9),  # begun again
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # it returns by itself
-        (RUNS, [("move", 20.0, AWAY), ("rest", 0.5, HOME), ("move", 1.0, AWAY)], 0.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),  # a hesitation
         (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),  # not where demonstrations begin
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)], 0.0),  # where this person began
-        (RUNS, 3 * [("rest", 0.5, OWN), ("move", 1.0, AWAY)], 0.9),
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, AWAY + 0.2)], 1.4),
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)], 1.4),  # a pause before leaving
         (RUNS, [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)], 2.4),  # first seen in motion
@@ -74,14 +67,16 @@ def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: flo
         (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),  # too short a rest
     ],
 )
-def test_a_clock_counts_from_the_first_motion(
+def test_clock_counts_from_first_motion(
     clock: TaskClock, parts: list[tuple[str, float, np.ndarray]], seconds: float
 ) -> None:
+    """A clock counts from the first motion."""
     assert along(clock, *parts)[-1, CLOCK_S] == pytest.approx(seconds, abs=0.06)
 
 
 @pytest.mark.parametrize("clock", [RUNS, WAITS])
-def test_its_rate_and_change_are_its_derivatives(clock: TaskClock) -> None:
+def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
+    """Its rate and change are its derivatives."""
     found = along(clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3)
     assert np.abs(np.diff(found[:, CLOCK_S]) / 1e-3 - found[1:, CLOCK_RATE]).max() < 1e-9
     assert np.quantile(np.abs(np.diff(found[:, CLOCK_RATE]) / 1e-3 - found[:-1, CLOCK_CHANGE]), 0.99) < 0.1
@@ -89,7 +84,8 @@ def test_its_rate_and_change_are_its_derivatives(clock: TaskClock) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [24, 100, 500])
-def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
+def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
+    """It is learned as it counts at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
     speeds, stillness = np.where(times > 1.0, 0.3, 0.0), np.where(times > 1.0, 0.0, 1.0)
     shown = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])
@@ -97,18 +93,19 @@ def test_it_is_learned_as_it_counts_at_any_rate(rate_hz: int) -> None:
     assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - shown).max() < 0.05
 
 
-def test_the_task_begins_again_once_in_each_rest_where_it_begins() -> None:
+def test_task_begins_again_once_in_a_rest() -> None:
+    """The task begins again once in each rest where it begins."""
     rows = RUNS.rows(np.stack([HOME, AWAY]))
     state, begun = np.zeros(CLOCK_SIZE), []
     for speed, hands, segment in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
         begun.append(count(hands, speed, 0.0, PERIOD_S, segment, rows, state))
-    assert np.flatnonzero(begun) == pytest.approx(50 + RUNS.home_s / PERIOD_S, abs=1)
+    assert np.flatnonzero(begun).tolist() == pytest.approx([50 + RUNS.home_s / PERIOD_S], abs=1)
     for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a segment begins anew, but not the task
         assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
     assert state[CLOCK_S] == 0.0
 
 
-def test_where_hands_began_is_kept_through_the_segments_of_a_task() -> None:
+def test_own_begin_is_kept_through_segments() -> None:
     rows, state = RUNS.rows(np.stack([HOME, HOME + 1.0])), np.zeros(CLOCK_SIZE)
     begun = [
         count(hands, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)
@@ -120,10 +117,10 @@ def test_where_hands_began_is_kept_through_the_segments_of_a_task() -> None:
         ]
         for _ in range(ticks)
     ]
-    assert np.flatnonzero(begun) == pytest.approx(150 + RUNS.home_s / PERIOD_S, abs=1)
+    assert np.flatnonzero(begun).tolist() == pytest.approx([150 + RUNS.home_s / PERIOD_S], abs=1)
 
 
-def test_numbers_of_a_file_that_are_no_clock_are_refused() -> None:
+def test_numbers_of_no_clock_are_refused() -> None:
     assert TaskClock.of(RUNS.numbers) == RUNS
     for bad in (RUNS.numbers[:-1], -RUNS.numbers, np.full(13, np.nan), np.full(13, 1e9)):
         with pytest.raises(ValueError, match="task_clock"):
@@ -136,23 +133,16 @@ def clock(skill: StoredSkill) -> TaskClock | None:
     return skill.model.clock if skill.model.is_timed else None
 
 
-def test_the_intake_finds_when_hands_begin_to_move() -> None:
-    for shown in takes(3, timetable=True):
-        moves = np.linalg.norm(np.gradient(shown.left[:, :3], shown.period_s, axis=0), axis=1) > 0.1
-        tempo = Tempo.of(shown)
-        starts_s = shown.seconds[np.argmax(tempo.seconds(clock_of([tempo], None, waits=False), None) > 0.0)]
-        assert shown.seconds[np.argmax(moves)] - 0.1 < starts_s < shown.seconds[np.argmax(moves)] + 0.2
-
-
 @pytest.mark.parametrize(
     ("kind_of_takes", "says", "late_s", "error_mm"),
     [(takes, "timetable", 6.0, 30.0), (named, "anew in each segment", 7.0, 20.0)],
     ids=["one clock", "in each segment"],
 )
 @pytest.mark.thorough
-def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else(
+def test_learn_takes_a_clock_for_a_timetable(
     kind_of_takes: Callable[..., list[Demonstration]], says: str, late_s: float, error_mm: float
 ) -> None:
+    """Learn takes a clock for a timetable and for nothing else."""
     shown = kind_of_takes(6, timetable=True)
     skill = learn(shown)
     figures = figures_of(skill)
@@ -180,7 +170,7 @@ def test_learn_takes_a_clock_for_a_timetable_and_for_nothing_else(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.thorough
-def test_each_round_of_a_session_is_predicted_as_the_first_one(kind: str) -> None:
+def test_every_round_is_predicted_as_the_first(kind: str) -> None:
     """With rests of 0.5 to 6 s where the take begins, also after half a round was broken off."""
     skill, asked = learned(kind)
     take = left_out("asked", "", asked)
@@ -192,7 +182,8 @@ def test_each_round_of_a_session_is_predicted_as_the_first_one(kind: str) -> Non
         assert (again.held or 0) - (first.held or 0) <= 0.03 * first.samples
 
 
-def test_a_clock_starts_anew_in_each_segment_with_the_next_motion() -> None:
+def test_each_segment_restarts_the_clock() -> None:
+    """A clock starts anew in each segment with the next motion."""
     rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(CLOCK_SIZE), []
     for speed, segment in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
         count(AWAY, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)

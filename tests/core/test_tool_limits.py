@@ -7,14 +7,10 @@ import pytest
 
 from support.followed import changed
 from thirdhand.contract.records import Flag, Mode
-from thirdhand.contract.requests import ALONG_TASK, ANY_DIRECTION
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.frame import blank, frame_layout
-from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tool_limits import (
     binding,
-    limits_of_task,
-    path_of,
     tool_limits,
 )
 from thirdhand.core.tuning import TUNING
@@ -25,7 +21,8 @@ PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_at_its_limit_the_tool_needs_all_that_is_planned_of_the_joint_that_is_named(name: str) -> None:
+def test_limit_uses_all_that_is_planned(name: str) -> None:
+    """At its limit the tool needs all that is planned of the joint that is named."""
     settings = cell_of(name)
     arm, random = Arm(settings, robot_description(settings)), np.random.default_rng(0)
     never_binding = {"max_speed": 100.0, "max_acceleration": 1000.0, "fault_speed": 200.0}
@@ -55,29 +52,8 @@ def test_at_its_limit_the_tool_needs_all_that_is_planned_of_the_joint_that_is_na
         assert least.acceleration <= found.acceleration + 1e-2
 
 
-def test_of_a_task_the_limits_follow_the_joints_until_the_tool_has_its_own(skill: Skill) -> None:
-    settings = Settings()
-    urdf, path = robot_description(settings), path_of(skill)
-
-    def limits(share: float, max_speed: float = 0.8) -> dict[str, tuple[float, str]]:
-        velocity = tuple(share * v for v in settings.joints.velocity)
-        cell = changed(settings, joints={"velocity": velocity}, tool={"max_speed": max_speed})
-        return {
-            where: (one.speed, one.speed_joint)
-            for where, one in limits_of_task(cell, urdf, path, skill.orientation).items()
-        }
-
-    whole, half, slow = limits(1.0), limits(0.5), limits(1.0, 0.1)
-    assert set(whole) == {ANY_DIRECTION, ALONG_TASK}
-    assert whole[ANY_DIRECTION] <= whole[ALONG_TASK]
-    assert all(joint in settings.joints.names for _, joint in whole.values())
-    for where, (speed, _) in whole.items():
-        assert half[where][0] == pytest.approx(0.5 * speed, rel=0.1)  # the postures differ a little
-        assert slow[where] == (0.1, "")
-    assert limits_of_task(settings, urdf, path + np.array([3.0, 0.0, 0.0]), skill.orientation) == {}
-
-
-def test_a_frame_meets_the_one_limit_of_which_it_uses_most() -> None:
+def test_frame_meets_its_binding_limit() -> None:
+    """A frame meets the one limit of which it uses most."""
     settings = Settings()
     frames = np.repeat(blank(frame_layout(7)).reshape(1), 6)
     frames["mode"] = Mode.FOLLOW

@@ -76,11 +76,13 @@ def done_in_a_process(script: str, *arguments: str) -> str:
     return done.stdout
 
 
-def test_a_rehearsal_leaves_nothing_to_compile() -> None:
+def test_warm_up_leaves_nothing_to_compile() -> None:
+    """A rehearsal leaves nothing to compile."""
     assert "identical" in done_in_a_process(REPLAYED, str(RECORDINGS / "golden.mcap"))
 
 
-def test_a_skill_of_another_kind_than_the_shipped_one_compiles_nothing_anew() -> None:
+def test_other_kind_of_skill_compiles_nothing() -> None:
+    """A skill of another kind than the shipped one compiles nothing anew."""
     done_in_a_process(
         OF_ANOTHER_KIND, *(str(RECORDINGS / name) for name in ("soldering.npz", "experiments/as-paper.npz"))
     )

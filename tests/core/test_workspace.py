@@ -24,7 +24,8 @@ def numbers(size: int) -> st.SearchStrategy[Vector]:
 
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(numbers(3), numbers(3), numbers(3))
-def test_a_clamped_target_is_in_the_reachable_region_and_leads_no_further_out(p: Vector, v: Vector, a: Vector) -> None:
+def test_clamped_target_is_reachable(p: Vector, v: Vector, a: Vector) -> None:
+    """A clamped target is in the reachable region and leads no further out."""
     v, a = v.clip(-1e6, 1e6), a.clip(-1e6, 1e6)
     position, velocity, acceleration, clamped = clamp(p, v, a, box=EVERYWHERE, reach=REACH)
     from_shoulder = position - REACH.centre
@@ -41,7 +42,7 @@ def test_a_clamped_target_is_in_the_reachable_region_and_leads_no_further_out(p:
         assert from_shoulder @ velocity <= 1e-6 * (1 + np.linalg.norm(velocity))
 
 
-def test_clamping_keeps_what_leads_along_the_boundary_or_back_in() -> None:
+def test_clamping_keeps_motion_along_the_boundary() -> None:
     position, velocity, acceleration, clamped = clamp(
         np.array([2.0, 0, REACH.centre[2]]),
         np.array([0.3, 0.2, 0.1]),
@@ -55,7 +56,8 @@ def test_clamping_keeps_what_leads_along_the_boundary_or_back_in() -> None:
     assert acceleration == pytest.approx([-1.0, 0.5, 0.0])
 
 
-def test_a_target_outside_the_box_stays_at_its_side_and_moves_along_it() -> None:
+def test_target_stays_at_a_side_of_the_box() -> None:
+    """A target outside the box stays at its side and moves along it."""
     box = np.array([[0.3, -0.4, 0.1], [0.7, 0.4, 0.5]])
     given, velocity = np.array([0.5, 0.6, 0.3]), np.array([0.1, 0.2, 0.3])
     position, moving, _, clamped = clamp(given, velocity, velocity, box=box, reach=REACH)

@@ -9,21 +9,8 @@ from kmp import KMP, Gaussians, ViaPointMissed, named_arrays
 from support.primitives import database, kernel, properties, representations, same_bits, seeds, skill, via
 
 
-def test_via_points_of_small_variance_are_met():
-    for seed in range(10):
-        inputs, points = via(seed, 3, std=1e-5)
-        adapted = skill(seed).adapt(inputs, points, tolerance=0.5)
-        np.testing.assert_allclose(adapted.mean(inputs), points.mean, atol=1e-5)
-
-
-def test_a_via_point_far_from_the_others_leaves_the_rest_as_it_was():
-    primitive = skill()
-    adapted = primitive.adapt(np.full((1, 4), 9.0), via(0, 1)[1], tolerance=0.1)
-    queries = np.random.default_rng(3).normal(size=(5, 4))
-    np.testing.assert_allclose(adapted.mean(queries), primitive.mean(queries), atol=1e-9)
-
-
-def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
+def test_near_point_is_replaced_and_far_one_inserted():
+    """A near desired point replaces its nearest and a far one is inserted."""
     primitive = skill()
     inputs = np.stack([primitive.inputs[7] + 0.01, np.full(4, 9.0)])
     adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
@@ -36,23 +23,21 @@ def test_a_near_desired_point_replaces_its_nearest_and_a_far_one_is_inserted():
     assert len(primitive.via_points) == 0
 
 
-def test_only_the_nearest_of_the_points_within_the_tolerance_is_replaced():
-    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
-    assert list(primitive.adapt([[0.49]], Gaussians([[5.0]], [[[1e-6]]]), tolerance=2).inner.changes.replaced) == [0]
-
-
-def test_the_tolerance_itself_is_not_near_enough():
+def test_tolerance_is_exclusive_and_takes_nearest():
+    """The tolerance itself is not near enough."""
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
     point = Gaussians([[5.0]], [[[1e-6]]])
     assert len(primitive.adapt([[0.25]], point, tolerance=0.25).inner.changes.replaced) == 0
     assert list(primitive.adapt([[0.25]], point, tolerance=0.26).inner.changes.replaced) == [0]
     assert list(primitive.adapt([[0.5]], point, tolerance=1).inner.changes.replaced) == [0, 1]
+    assert list(primitive.adapt([[0.49]], point, tolerance=2).inner.changes.replaced) == [0]
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
 @properties
 @given(seeds, st.floats(0, 3), representations)
-def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_one(seed, tolerance, representation):
+def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
+    """The order of via points does not matter nor whether they come one by one."""
     primitive = skill(seed, representation=representation)
     inputs, points = via(seed, 5, std=0.01)
     inputs[4] = inputs[3] + 0.05
@@ -73,7 +58,8 @@ def test_the_order_of_via_points_does_not_matter_nor_whether_they_come_one_by_on
 
 @properties
 @given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
-def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, tolerance):
+def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance):
+    """Adapting is fitting the changed database."""
     adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
     lambdas = {"lambda_mean": 2.0, "lambda_covariance": lambda_covariance}
     fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, **lambdas)
@@ -85,7 +71,8 @@ def test_adapting_is_fitting_the_changed_database(seed, lambda_covariance, toler
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
-def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation):
+def test_teaching_elsewhere_keeps_covariance(representation):
+    """Teaching elsewhere leaves the covariance here as it was."""
     inputs, reference = database()
     primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
     points = Gaussians.of(np.zeros((80, 3)), deviation=0.01)
@@ -99,23 +86,8 @@ def test_teaching_elsewhere_leaves_the_covariance_here_as_it_was(representation)
         np.testing.assert_allclose(again.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
 
 
-def test_every_point_of_the_base_may_be_replaced():
-    primitive = skill(count=2)
-    points = via(0, 2)[1]
-    adapted = primitive.adapt(primitive.inputs, points, tolerance=0.1)
-    np.testing.assert_array_equal(adapted.inputs, primitive.inputs)
-    np.testing.assert_allclose(adapted.mean(adapted.inputs), points.mean, atol=1e-4)
-
-
-def test_adapting_leaves_the_primitive_as_it_was():
-    primitive, queries = skill(), np.random.default_rng(0).normal(size=(3, 4))
-    before = primitive.predict(queries)
-    primitive.adapt(*via(0, 2), tolerance=1)
-    assert np.array_equal(primitive.predict(queries).covariance, before.covariance)
-    assert np.array_equal(primitive.mean(queries), before.mean)
-
-
-def test_a_via_point_that_is_missed_is_named_with_the_numbers():
+def test_missed_via_point_is_named():
+    """A via point that is missed is named with the numbers."""
     primitive = skill()
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
     points = Gaussians.of([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], deviation=0.01)
@@ -127,7 +99,8 @@ def test_a_via_point_that_is_missed_is_named_with_the_numbers():
     assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(told[0].message)
 
 
-def test_a_via_point_that_may_be_missed_or_is_missed_by_less_than_a_millimetre_is_not_named():
+def test_small_miss_is_not_named():
+    """A via point that may be missed or is missed by less than a millimetre is not named."""
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
     for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
         points = Gaussians.of([[0.0, 0, 0], [apart, 0, 0]], deviation=std)

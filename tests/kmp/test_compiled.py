@@ -26,7 +26,7 @@ def total(left, right):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_sums_keep_their_order_and_products_are_rounded(seed):
+def test_sums_keep_order_and_products_are_rounded(seed):
     """1e16 apart, so that any other order and any product that is not rounded gives other bits."""
     random = np.random.default_rng(seed)
     left, right = random.normal(size=(2, 1001)) * 10.0 ** random.integers(-8, 9, (2, 1001))
@@ -66,7 +66,7 @@ print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex
 
 
 @pytest.mark.thorough
-def test_operations_give_the_same_bits_as_on_a_cpu_without_vector_units():
+def test_bits_are_those_of_a_plain_cpu():
     """Not rounded: the golden session, whose states are, is replayed so at length."""
     here = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
     command = [sys.executable, "-c", OPERATIONS]
@@ -86,7 +86,8 @@ print(skill.mean([[0.5]]), skill.jacobian([0.5]))
 """
 
 
-def test_the_first_compilation_is_announced_once_and_what_is_cached_is_not(tmp_path):
+def test_first_compilation_is_announced_once(tmp_path):
+    """The first compilation is announced once and what is cached is not."""
     command = [sys.executable, "-c", FIRST]
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
@@ -98,7 +99,8 @@ def test_the_first_compilation_is_announced_once_and_what_is_cached_is_not(tmp_p
     assert (second.stdout, second.stderr) == (first.stdout, "")
 
 
-def test_exponentials_are_right_to_a_unit_in_the_last_place():
+def test_exponentials_are_exact_to_one_unit():
+    """Exponentials are right to a unit in the last place."""
     values = np.concatenate([np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]])
     found = values.copy()
     exponentials(found, 0.5, np.empty_like(values))

@@ -123,7 +123,8 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path / "one", tmp_path / "cache")
 
 
-def test_it_serves_the_same_sources_elsewhere(checkout: Checkout, tmp_path: Path) -> None:
+def test_same_sources_elsewhere_are_served(checkout: Checkout, tmp_path: Path) -> None:
+    """It serves the same sources elsewhere."""
     assert checkout.result() == [20.0, 2]
     checkout.change("apart.py", "", "# imported by nobody")
     assert checkout.result() == [20.0, 0]
@@ -135,22 +136,21 @@ def test_it_serves_the_same_sources_elsewhere(checkout: Checkout, tmp_path: Path
     [("inner.py", "x + STEP", "x - STEP", 0.0), ("numbers.py", "1.0", "2.0", 30.0), ("outer.py", "10.0", "5.0", 10.0)],
     ids=["what it calls", "a constant of what it calls", "itself"],
 )
-def test_a_function_is_compiled_anew_after_a_change_of(
-    checkout: Checkout, module: str, before: str, after: str, returned: float
-) -> None:
+def test_change_compiles_anew(checkout: Checkout, module: str, before: str, after: str, returned: float) -> None:
+    """A function is compiled anew after a change of."""
     assert checkout.result() == [20.0, 2]
     checkout.change(module, before, after)
     assert checkout.result() == [returned, 1 if module == "outer.py" else 2]
 
 
-def test_processes_that_compile_for_different_types_mix_nothing_up(checkout: Checkout) -> None:
+def test_processes_of_other_types_do_not_mix(checkout: Checkout) -> None:
     """Each names its first record type alike; the last process loads what both have compiled."""
     assert checkout.run(LENGTHS, "6") == [6]
     assert checkout.run(LENGTHS, "7") == [7]
     assert checkout.run(LENGTHS, "7", "6") == [7, 6]
 
 
-def test_forked_processes_that_compile_mix_nothing_up(checkout: Checkout) -> None:
+def test_forked_processes_do_not_mix(checkout: Checkout) -> None:
     """They go on where one process was when it was forked."""
     checkout.run(FORKED, "6", "7")
     assert checkout.run(LENGTHS, "7", "6") == [7, 6]
@@ -166,16 +166,8 @@ def test_damaged_files_are_compiled_anew(checkout: Checkout) -> None:
     assert checkout.result() == [20.0, 0]
 
 
-def test_files_that_nobody_reads_any_more_are_removed(checkout: Checkout) -> None:
-    checkout.result()
-    (old,) = checkout.cache.rglob("steps.outer*.nbc")
-    os.utime(old, (0.0, 0.0))
-    checkout.change("outer.py", "10.0", "5.0")
-    assert checkout.result() == [10.0, 1]
-    assert not old.exists()
-
-
-def test_a_full_disk_is_left_without_parts_of_files(checkout: Checkout) -> None:
+def test_full_disk_leaves_no_partial_files(checkout: Checkout) -> None:
+    """A full disk is left without parts of files."""
     full = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
     assert checkout.run(full + CALLED) == [20.0, 2]
     assert [path for path in checkout.cache.rglob("*") if path.is_file()] == []

@@ -31,7 +31,8 @@ def test_residuals_are_those_without_the_group():
             np.testing.assert_allclose(residuals[mine], shifted[number][mine] - mean, atol=1e-9)
 
 
-def test_covariances_are_those_without_the_group_and_without_a_points_own_noise():
+def test_covariances_are_those_without_the_group():
+    """Covariances are those without the group and without a points own noise."""
     roots = 0.3 * RANDOM.normal(size=(20, 3, 3)) + np.eye(3)
     scatter = roots @ roots.transpose(0, 2, 1)
     found = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)
@@ -47,7 +48,8 @@ def test_covariances_are_those_without_the_group_and_without_a_points_own_noise(
             np.testing.assert_allclose(covariances[i], expected, atol=1e-9)
 
 
-def test_the_first_candidate_that_is_good_enough_is_preferred():
+def test_first_good_candidate_is_preferred():
+    """The first candidate that is good enough is preferred."""
     assert preferred("abc", [3.0, 1.1, 1.0], 1.2) == "b"
     with pytest.raises(ValueError, match="at least the least score, 1"):
         preferred("abc", [3.0, 1.1, 1.0], 0.9)

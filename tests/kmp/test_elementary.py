@@ -23,7 +23,8 @@ RANDOM = np.random.default_rng(0)
     ],
     ids=["exp", "log", "sin", "cos", "atan2"],
 )
-def test_their_errors_are_a_few_units_in_the_last_place(ours, theirs, arguments):
+def test_errors_are_a_few_units_in_last_place(ours, theirs, arguments):
+    """Their errors are a few units in the last place."""
     for row in arguments.tolist():
         assert ours(*row) == pytest.approx(theirs(*row), rel=4 * 2.0**-52, abs=0.0)
 
@@ -34,7 +35,8 @@ def test_their_errors_are_below_1e_15(ours, theirs):
         assert ours(x) == pytest.approx(theirs(x), rel=0.0, abs=1e-15)
 
 
-def test_their_ends_are_those_of_the_functions():
+def test_values_at_ends():
+    """Their ends are those of the functions."""
     assert (exp(0.0), exp(-math.inf), exp(math.inf), log(1.0)) == (1.0, 0.0, math.inf, 0.0)
     assert math.isnan(exp(math.nan))
     assert [atan2(y, x) for y, x in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0))] == [0.0, math.pi / 2, math.pi]

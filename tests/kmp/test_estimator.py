@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from sklearn.exceptions import NotFittedError, SkipTestWarning
+from sklearn.exceptions import SkipTestWarning
 from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -24,7 +24,8 @@ def test_scikit_learns_own_checks_pass(components):
         check_estimator(KMPRegressor(components=components))
 
 
-def test_it_learns_outputs_of_any_unit_and_tells_how_sure_it_is():
+def test_learns_any_unit_with_deviation():
+    """It learns outputs of any unit and tells how sure it is."""
     noisy = Y + [0.02, 1.0] * RANDOM.normal(size=Y.shape)
     one = KMPRegressor().fit(X[:120], noisy[:120])
     assert one.score(X[120:], Y[120:]) > 0.95
@@ -35,13 +36,9 @@ def test_it_learns_outputs_of_any_unit_and_tells_how_sure_it_is():
     assert one.primitive_.jacobian(X[0]).shape == (2, 2)
 
 
-def test_it_is_found_in_pipelines_and_searches():
+def test_works_in_pipelines_and_searches():
+    """It is found in pipelines and searches."""
     pipeline = make_pipeline(StandardScaler(), KMPRegressor(ell=1.0))
     assert cross_val_score(pipeline, X, Y[:, 0], cv=3).min() > 0.9
     search = GridSearchCV(KMPRegressor(), {"ell": [0.001, 0.5], "noise": [0.05, 0.2]}, cv=3).fit(X, Y[:, 0])
     assert search.best_params_["ell"] == 0.5
-
-
-def test_one_that_is_not_fitted_predicts_nothing():
-    with pytest.raises(NotFittedError):
-        KMPRegressor().predict(X)

@@ -25,6 +25,7 @@ from kmp import (
 )
 from kmp.arrays.immutable import Immutable
 from kmp.storage import checksum
+from support.primitives import same_bits
 
 S = np.random.default_rng(0).normal(size=(20, 2))
 R = Gaussians.of(S, deviation=0.1)
@@ -65,17 +66,16 @@ VALUES = [
     *(ONE.predict_motion(S[0], S[1], S[2]), ONE.predict_motion(S[0], S[1], S[2], covariance=False)),
     *(AffineMean(np.eye(2), [1.0, 2.0]), KMP.fit(S, R, kernel=K, lambda_mean=1.0, prior_mean=AffineMean(S[:2], S[2]))),
     *(LinearConstraints(S, S, S[:, 0]), LinearConstraints(S, S, S[:, 0], S)),
+    CONSTRAINED.adapt(S[5:6], R[5:6], tolerance=0.01),
+    KMP.fit(S, R, kernel=K, lambda_mean=1.0, prior_mean=AffineMean(S[:2], S[2]), representation="low_rank"),
 ]
 
 
 def same(a, b):
     """Whether two values are the same, bit for bit."""
     if isinstance(a, KMP):
-        return (
-            isinstance(b, KMP)
-            and same(named_arrays.to_arrays(a), named_arrays.to_arrays(b))
-            and np.array_equal(a.mean(a.inputs), b.mean(a.inputs))
-        )
+        stored = isinstance(b, KMP) and same(named_arrays.to_arrays(a), named_arrays.to_arrays(b))
+        return stored and same_bits(a, b, a.inputs[:5] + 0.1)
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b) and a.dtype == b.dtype
     if isinstance(a, dict):
@@ -89,13 +89,17 @@ def same(a, b):
     return a == b
 
 
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
-def test_each_goes_to_a_file_and_back_bit_for_bit(tmp_path, value):
+def test_file_returns_same_bits(tmp_path, value):
+    """Each goes to a file and back bit for bit."""
     kmp.save(tmp_path / "value", value, input_unit="m", output_unit="rad")
     stored = kmp.load(tmp_path / "value")
     assert same(value, stored.value)
     assert (stored.input_unit, stored.output_unit) == ("m", "rad")
-    assert same(stored.primitive, value) if isinstance(value, KMP) else True
+    if isinstance(value, KMP):
+        place = value.inputs[3:4] + 0.05, value.reference[:1]
+        assert same(stored.primitive.adapt(*place, tolerance=0.01), value.adapt(*place, tolerance=0.01))
 
 
 def arrays(value):
@@ -110,13 +114,15 @@ IMMUTABLE = [value for value in VALUES if isinstance(value, Immutable)]
 
 
 @pytest.mark.parametrize("value", IMMUTABLE, ids=lambda value: type(value).__name__)
-def test_every_array_is_read_only_before_and_after_a_pickle_or_a_copy(value):
+def test_arrays_are_read_only_in_every_copy(value):
+    """Every array is read only before and after a pickle or a copy."""
     for one in (value, pickle.loads(pickle.dumps(value)), copy.copy(value), copy.deepcopy(value)):
         assert [array.shape for array in arrays(one) if array.flags.writeable] == []
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
-def test_a_pickle_leaves_out_the_factors_and_the_copy_makes_them_again(representation):
+def test_pickle_leaves_factors_out(representation):
+    """A pickle leaves out the factors and the copy makes them again."""
     one = used(representation)
     again = pickle.loads(pickle.dumps(one))
     dropped = {"mean_factor", "covariance_factor"}
@@ -125,44 +131,15 @@ def test_a_pickle_leaves_out_the_factors_and_the_copy_makes_them_again(represent
     assert same(again.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0), one.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0))
 
 
-LOW = KMP.fit(S, R, kernel=GaussianKernel([1.0, 2.0]), lambda_mean=1.0, representation="low_rank")
-AFFINE = {"prior_mean": AffineMean(S[:2], S[2]), "representation": "low_rank"}
-PRIMITIVES = [
-    *(value for value in VALUES if isinstance(value, KMP)),
-    *(LOW, LOW.adapt_jacobian(S[:1], [np.eye(2)], deviation=1.0)),
-    CONSTRAINED.adapt(S[5:6], R[5:6], tolerance=0.01),
-    KMP.fit(S, R, kernel=K, lambda_mean=1.0, **AFFINE).adapt(S[:1] + 0.1, R[:1], tolerance=0.2),
-]
-
-
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
-@pytest.mark.parametrize("one", PRIMITIVES, ids=repr)
-def test_a_primitive_that_was_stored_or_pickled_predicts_and_is_adapted_as_before(tmp_path, one):
-    kmp.save(tmp_path / "skill", one, input_unit="m", output_unit="m, m/s")
-    stored = kmp.load(tmp_path / "skill")
-    assert (stored.input_unit, stored.output_unit) == ("m", "m, m/s")
-    queries, place = one.inputs[:5] + 0.1, one.inputs[3:4] + 0.05
-    desired = Gaussians.of(one.mean(place) + 0.01, deviation=0.1)
-    for again in (stored.primitive, pickle.loads(pickle.dumps(one))):
-        assert again.representation == one.representation
-        assert not again.weights.flags.writeable
-        adapted = (primitive.adapt(place, desired, tolerance=0.01) for primitive in (again, one))
-        for a, b in ((again, one), (again.base, one.base), tuple(adapted)):
-            for many in (queries, queries[:1]):
-                assert np.array_equal(a.mean(many), b.mean(many))
-                assert np.array_equal(a.predict(many).covariance, b.predict(many).covariance)
-            assert np.array_equal(a.jacobian(queries[0]), b.jacobian(queries[0]))
-            motion = queries[0], queries[1], queries[2]
-            assert all(map(np.array_equal, a.predict_motion(*motion), b.predict_motion(*motion)))
-
-
-def test_all_types_that_the_package_offers_are_among_them():
+def test_every_public_type_is_tested():
+    """All types that the package offers are among them."""
     types = {name for name in kmp.__all__ if isinstance(getattr(kmp, name), type)}
     offered = {n for n in types if not issubclass(getattr(kmp, n), Warning)} - {"Stored"}
     assert offered == {type(value).__name__ for value in VALUES}
 
 
-def test_what_is_no_primitive_says_so_and_a_file_of_nothing_known_is_refused(tmp_path):
+def test_other_values_are_refused(tmp_path):
+    """What is no primitive says so and a file of nothing known is refused."""
     kmp.save(tmp_path / "value", R, input_unit="m", output_unit="m")
     with pytest.raises(ValueError, match="the stored value: Gaussians given, KMP needed: take `value`"):
         _ = kmp.load(tmp_path / "value").primitive
@@ -174,30 +151,3 @@ def test_what_is_no_primitive_says_so_and_a_file_of_nothing_known_is_refused(tmp
         kmp.load(tmp_path / "other.npz")
     with pytest.raises(ValueError, match=r"value: ndarray given, one of KMP, .* needed"):
         kmp.save(tmp_path / "value", S, input_unit="m", output_unit="m")
-
-
-@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
-def test_each_has_a_repr_of_a_line_that_names_it(value):
-    if isinstance(value, tuple):
-        return  # NumPy's own, of a few numbers
-    assert repr(value).startswith(type(value).__name__)
-    assert "\n" not in repr(value)
-    assert len(repr(value)) < 600
-
-
-def test_a_repr_tells_what_matters():
-    assert repr(ONE) == "KMP(20 points: 2 inputs, 2 outputs, GaussianKernel(ell=1.0), dense)"
-    assert repr(R) == "Gaussians(20 over 2 outputs)"
-    assert repr(K) == "GaussianKernel(ell=1.0)"
-    assert repr(FRAMES[0][0]) == "CoordinateFrame(matrix=array(2, 2), offset=array(2,))"
-
-
-def test_gaussians_are_chosen_by_index_as_numpy_would():
-    for index in (3, -1, slice(2, 5), [1, 2], S[:, 0] > 0, np.arange(0)):
-        chosen = R[index]
-        assert isinstance(chosen, Gaussians)
-        assert np.array_equal(chosen.mean, np.atleast_2d(R.mean[index]))
-        assert np.array_equal(chosen.covariance, R.covariance[np.atleast_1d(np.arange(20)[index])])
-    assert [len(one) for one in R] == [1] * 20
-    with pytest.raises(IndexError):
-        R[20]

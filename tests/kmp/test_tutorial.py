@@ -13,7 +13,8 @@ BLOCKS = [
 ]
 
 
-def test_the_tutorial_runs_as_it_stands_and_shows_what_it_says():
+def test_tutorial_runs_as_it_stands():
+    """The tutorial runs as it stands and shows what it says."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:
         code = compile("\n" * line + block, str(PAGE), "exec")  # so that a failure names the page's line
@@ -21,6 +22,7 @@ def test_the_tutorial_runs_as_it_stands_and_shows_what_it_says():
 
 
 @pytest.mark.parametrize("subject", ["learn", "predict", "adapt", "uncertainty", "OrientationKMP", "PeriodicKernel"])
-def test_each_subject_has_a_block_that_checks_itself(subject):
+def test_subjects_have_checked_blocks(subject):
+    """Each subject has a block that checks itself."""
     assert any(subject in block for _, block in BLOCKS)
     assert sum("assert" in block for _, block in BLOCKS) > 0.8 * len(BLOCKS) - 2

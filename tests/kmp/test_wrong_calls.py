@@ -309,7 +309,8 @@ def fault(function, name, right, value, must_fail):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_every_wrong_call_ends_in_a_value_error_that_names_the_argument(tmp_path, monkeypatch):
+def test_wrong_call_names_its_argument(tmp_path, monkeypatch):
+    """Every wrong call ends in a value error that names the argument."""
     monkeypatch.chdir(tmp_path)
     kmp.save("skill.npz", ONE, input_unit="m", output_unit="m")
     made = list(calls())
@@ -342,7 +343,8 @@ def public():
             yield "", name, inspect.signature(one).parameters
 
 
-def test_every_argument_of_every_public_callable_is_among_them():
+def test_every_public_argument_is_tested():
+    """Every argument of every public callable is among them."""
     given = {(one.__name__, name) for one, right in RIGHT.items() for name in right}
     lacking = [
         (of, name, parameter)

@@ -29,7 +29,8 @@ def along_a_line(number: int) -> Demonstration:
     return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, places=PLACES)
 
 
-def test_between_places_the_gate_is_no_nearer_than_noise() -> None:
+def test_gate_is_above_noise() -> None:
+    """Between places the gate is no nearer than noise."""
     skill = learn([along_a_line(number) for number in range(3)])
     assert skill.threshold >= FLOOR_M
     random = np.random.default_rng(1)
@@ -40,7 +41,8 @@ def test_between_places_the_gate_is_no_nearer_than_noise() -> None:
     assert any("less noise than any tracker" in one for one in said)
 
 
-def test_a_covariance_is_never_less_than_a_trackers_noise() -> None:
+def test_covariance_is_above_noise() -> None:
+    """A covariance is never less than a trackers noise."""
     made = [one._replace(tool=(one.left + one.right) / 2) for one in (circling(seed, noise_m=0.0) for seed in range(4))]
     figures = figures_of(learn(made, points=80))
     assert figures.all.error_mm < 1.0 < figures.all.predicted_mm

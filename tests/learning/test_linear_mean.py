@@ -12,19 +12,14 @@ from kmp.criteria.cross_validation import rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
 from support.circling import circling
 from support.paths import RECORDINGS
-from support.taught_scene import HANDOVER
-from thirdhand.core.frame import Vector
-from thirdhand.core.skill.model import standard_deviations
 from thirdhand.skills.skill_file import (
     SkillError,
     StoredSkill,
     decoded,
     with_file,
 )
-from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.learning.baselines import held_out_errors, linear
 from thirdhand.workbench.learning.choice import MAX_GAIN, RIDGE_M, selection_of
-from thirdhand.workbench.learning.gate import nonsense
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import Evidence
 
@@ -54,9 +49,10 @@ def mean_of(skill: StoredSkill) -> AffineMean:
     return prior
 
 
-def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant_and_than_by_a_line(
-    evidence: Evidence, choice: DirectSelection
-) -> None:
+def test_linear_mean_predicts_better(evidence: Evidence, choice: DirectSelection) -> None:
+    """Takes from all over the table are predicted better than over a constant and than by a
+    line.
+    """
     assert mean_of(evidence.skill).matrix.shape == (3, 6)
     error = rms(np.concatenate([one.errors for one in evidence.held_out]))
     constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
@@ -69,28 +65,16 @@ def test_takes_from_all_over_the_table_are_predicted_better_than_over_a_constant
     assert error < 0.75 * rms(np.concatenate(held_out_errors([one.take for one in evidence.held_out], linear)))
 
 
-def test_off_the_data_it_is_refused_as_over_a_constant(
-    skill: StoredSkill, choice: DirectSelection, evidence: Evidence
-) -> None:
-    """Where the mean extrapolates, the gate holds; and no less than with the constant mean."""
+def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Evidence) -> None:
+    """Gate holds where the mean extrapolates."""
     some = np.concatenate([one.take.hands[::20] for one in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
         assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
-    found = choice.parameters()
-    constant = choice.primitive(found, choice.residuals(found.ell, found.noise))
-
-    def rises(primitive: KMP, hands: Vector) -> Vector:
-        return standard_deviations(primitive.predict(hands).covariance) / np.quantile(
-            standard_deviations(primitive.predict(some).covariance), 0.98
-        )
-
-    for wrong in nonsense(some[::3]):
-        over_linear, over_constant = (rises(one, wrong) for one in (skill.model.primitive, constant))
-        assert (over_linear > 1.0).mean() > (over_constant > 1.0).mean() - 0.05
 
 
-def test_it_moves_the_tool_no_farther_than_between_via_points_whatever_was_shown(skill: StoredSkill) -> None:
+def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
+    """It moves the tool no farther than between via points whatever was shown."""
     assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
     random = np.random.default_rng(0)
     hands = random.normal(scale=0.1, size=(200, 6))
@@ -101,15 +85,8 @@ def test_it_moves_the_tool_no_farther_than_between_via_points_whatever_was_shown
     assert np.abs(trembling.matrix[:, 3:]).max() < 0.2  # a hand that moved by 1 mm tells nothing
 
 
-def test_via_points_are_met_and_contradictions_refused_over_it(skill: StoredSkill) -> None:
-    point = HANDOVER
-    taught = adapted(skill, [point], tolerance=0.05)
-    hands = np.array([[*point.left, *point.right]])
-    np.testing.assert_allclose(taught.mean(hands)[0], point.tool, atol=2e-3)
-    np.testing.assert_array_equal(mean_of(taught).matrix, mean_of(skill).matrix)
-
-
-def test_it_is_stored_and_served_as_it_was_learned(skill: StoredSkill) -> None:
+def test_file_serves_what_was_learned(skill: StoredSkill) -> None:
+    """It is stored and served as it was learned."""
     again = decoded(skill.file, origin="a file")
     hands = skill.hands[::10] + 0.01
     np.testing.assert_array_equal(again.mean(hands), skill.mean(hands))

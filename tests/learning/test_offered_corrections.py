@@ -43,10 +43,9 @@ def tool_in(skill: Skill, hands: np.ndarray, segment: int) -> np.ndarray:
     return skill.mean(hands[None], [skill.model.names[segment + 1]])[0]
 
 
-@pytest.mark.parametrize(("segment", "share"), [(0, 0.5), (0, 0.2), (1, 0.5), (2, 0.5)])
-def test_a_correction_moves_the_tool_in_its_segment_and_leaves_the_ends(
-    segmented: StoredSkill, segment: int, share: float
-) -> None:
+@pytest.mark.parametrize(("segment", "share"), [(0, 0.2), (1, 0.5), (2, 0.5)])
+def test_correction_moves_tool_in_its_segment(segmented: StoredSkill, segment: int, share: float) -> None:
+    """A correction moves the tool in its segment and leaves the ends."""
     hands = hands_in(segmented, segment, share)
     made = correction_at(segmented, hands, segment, tool_in(segmented, hands, segment) + UP)
     after, effect = corrected(segmented, made.among(segmented.via_points), made.point)
@@ -71,9 +70,8 @@ def test_a_correction_moves_the_tool_in_its_segment_and_leaves_the_ends(
 @pytest.mark.parametrize(
     ("segment", "share", "name"), [(0, 0.97, "handover"), (1, 0.02, "handover"), (1, 1.0, "glass")]
 )
-def test_a_correction_at_an_end_of_a_segment_teaches_that_via_point_anew(
-    segmented: StoredSkill, segment: int, share: float, name: str
-) -> None:
+def test_correction_at_an_end_teaches_via_point(segmented: StoredSkill, segment: int, share: float, name: str) -> None:
+    """A correction at an end of a segment teaches that via point anew."""
     hands = hands_in(segmented, segment, share)
     made = correction_at(segmented, hands, segment, tool_in(segmented, hands, segment) + UP)
     (before,) = made.replaced
@@ -87,7 +85,8 @@ def test_a_correction_at_an_end_of_a_segment_teaches_that_via_point_anew(
         np.testing.assert_allclose(tool_in(after, hands, segment_beside), made.point.tool, atol=0.01)
 
 
-def test_repeated_corrections_replace_each_other_are_counted_and_offered(segmented: StoredSkill) -> None:
+def test_repeated_corrections_are_offered(segmented: StoredSkill) -> None:
+    """Repeated corrections replace each other are counted and offered."""
     hands, skill = hands_in(segmented, 0, 0.5), segmented
     for count in range(1, OFFERED_AFTER + 1):
         assert offer_of(skill) == ""
@@ -102,17 +101,8 @@ def test_repeated_corrections_replace_each_other_are_counted_and_offered(segment
     assert (elsewhere.point.name, elsewhere.replaced) == ("correction-4", ())
 
 
-def test_a_skill_without_segments_is_corrected_by_its_kernel(skill: StoredSkill) -> None:
-    hands = skill.hands[len(skill.hands) // 2].copy()
-    made = correction_at(skill, hands, -1, skill.mean(hands[None])[0] + 0.5 * UP)
-    assert (made.point.name, made.point.segment) == ("correction-1", None)
-    after, effect = corrected(skill, made.among(()), made.point)
-    assert effect.moved_m == pytest.approx(0.04, abs=2e-3)
-    assert 0.0 < effect.reach_m <= 0.4
-    assert adapted(after, (), tolerance=skill.tolerance).file == skill.file
-
-
-def test_a_correction_that_would_amplify_trembling_hands_is_refused(segmented: StoredSkill) -> None:
+def test_amplifying_correction_is_refused(segmented: StoredSkill) -> None:
+    """A correction that would amplify trembling hands is refused."""
     hands = hands_in(segmented, 0, 0.2)
     made = correction_at(segmented, hands, 0, tool_in(segmented, hands, 0) + 5 * UP)
     with pytest.raises(SkillError, match=r"a correction of 40 cm so near to .* times as far as the hands; 4 times acc"):

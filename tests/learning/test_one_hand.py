@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from support.in_process import ASSUMED, hand
 from support.skills import STILL, at_rest, figures_of, made
 from support.spoiled import Streams, streams_of, write_streams
 from thirdhand.contract.records import Mode, Reason
-from thirdhand.contract.requests import Hands, ViaPoint
+from thirdhand.contract.requests import Hands
 from thirdhand.core.frame import Records, Tick
 from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.recordings.mcap_file import RecordingError
@@ -51,7 +50,8 @@ def conducting(skill: StoredSkill, at: tuple[float, ...], other: tuple[float, ..
     return np.concatenate([at, other] if skill.conductor == 0 else [other, at])
 
 
-def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: Path) -> None:
+def test_take_of_one_hand_through_a_file(tmp_path: Path) -> None:
+    """A take of one hand goes to a file without the other and back."""
     for who in ("left", "right"):
         write_demonstration(tmp_path / f"{who}.mcap", led(0, who)._replace(person="Ada"))  # type: ignore[arg-type]
         said: list[str] = []
@@ -63,7 +63,8 @@ def test_a_take_of_one_hand_goes_to_a_file_without_the_other_and_back(tmp_path: 
         assert [one.name for one in summary(tmp_path / f"{who}.mcap").streams] == [who, "tool"]
 
 
-def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(skill: StoredSkill) -> None:
+def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
+    """The other hand makes no difference and the skill is judged without it."""
     found = figures_of(skill)
     assert found.unsafe == ()
     assert found.all.error_mm < min(found.all.other_mm.values())
@@ -84,22 +85,8 @@ def test_the_other_hand_makes_no_difference_and_the_skill_is_judged_without_it(s
     assert off.gate_m > skill.threshold
 
 
-def test_via_points_are_met_by_the_one_hand_and_contradict_by_it_alone(skill: StoredSkill) -> None:
-    hands = conducting(skill, AT, (2.0, 2.0, 2.0))
-    near = np.array(AT) * [0.8, 0.8, 0.5] + [0.12, 0.05, 0.25]
-    point = ViaPoint("there", tuple(hands[:3].tolist()), tuple(hands[3:].tolist()), tuple(near.tolist()))
-    taught = adapted(skill, [point], tolerance=0.05)
-    for other in ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0)):
-        np.testing.assert_allclose(taught.mean(conducting(skill, AT, other)[None])[0], near, atol=2e-3)
-    beside = conducting(skill, AT, (-2.0, 2.0, 2.0))
-    other = msgspec.structs.replace(
-        point, name="twin", left=tuple(beside[:3].tolist()), right=tuple(beside[3:].tolist()), tool=(0.2, 0, 0.5)
-    )
-    with pytest.raises(SkillError, match="contradict each other"):
-        adapted(skill, [point, other], tolerance=0.05)
-
-
-def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() -> None:
+def test_takes_with_places_of_one_hand() -> None:
+    """Takes of one hand that name their places are learned between these."""
     shown = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
@@ -114,7 +101,8 @@ def test_takes_of_one_hand_that_name_their_places_are_learned_between_these() ->
             np.testing.assert_allclose(aimed.mean(hands, [point.name])[0], point.tool, atol=2e-3)
 
 
-def test_takes_of_different_hands_are_not_mixed() -> None:
+def test_different_hands_are_not_mixed() -> None:
+    """Takes of different hands are not mixed."""
     words = r"conducted by different hands: both, left; .*\(both: b; left: a\)"
     with pytest.raises(SkillError, match=words):
         learn([led(0), circling(1)], names=["a", "b"])
@@ -126,7 +114,7 @@ def streams_of_one(side: str, take: Demonstration) -> Streams:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_hand_that_a_take_does_not_have_is_not_needed(side: str, tmp_path: Path) -> None:
+def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
     """It has no topic, no sample, or is never seen; and the other hand is given as both."""
     take, other = circling(0), "right" if side == "left" else "left"
     path, said, whole = tmp_path / "a.mcap", list[str](), streams_of(take)
@@ -148,7 +136,8 @@ def test_a_hand_that_a_take_does_not_have_is_not_needed(side: str, tmp_path: Pat
     assert skill.conductor == ("left", "right").index(side)
 
 
-def test_one_stream_for_both_hands_whose_name_says_neither_is_refused(tmp_path: Path) -> None:
+def test_one_stream_for_both_hands_is_refused(tmp_path: Path) -> None:
+    """One stream for both hands whose name says neither is refused."""
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
     both = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
@@ -175,9 +164,12 @@ def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 12
     return list(zip(seen["mode"].tolist(), seen["reason"].tolist(), strict=True))
 
 
-def test_it_is_served_without_a_hand_that_was_never_seen_or_has_gone_but_waits_for_one_that_vanishes(
+def test_served_without_absent_hand(
     skill: StoredSkill,
 ) -> None:
+    """It is served without a hand that was never seen or has gone but waits for one that
+    vanishes.
+    """
     follow = (Mode.FOLLOW, Reason.NONE)
     assert set(modes(skill, 0, 0)[5:]) == {follow}
     lost = modes(skill, 300, 600, count=3200)
@@ -190,7 +182,8 @@ def test_it_is_served_without_a_hand_that_was_never_seen_or_has_gone_but_waits_f
     assert set(modes(skill, 0, 1200, one_to=0)) == {(Mode.HOLD, Reason.NO_HANDS)}
 
 
-def test_the_arm_keeps_away_from_where_a_hand_that_has_gone_was_seen_last(skill: StoredSkill) -> None:
+def test_arm_keeps_away_from_vanished_hand(skill: StoredSkill) -> None:
+    """The arm keeps away from where a hand that has gone was seen last."""
     there = (0.5, 0.21, 0.4)  # where the tool is to go
     seen = served(skill, 0, 50, count=3500, at=there)
     assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}

@@ -5,15 +5,12 @@ from __future__ import annotations
 import functools
 from random import Random
 
-import numpy as np
 import pytest
 
 from support.skills import figures_of, made
 from thirdhand.skills.demonstration import Demonstration, persons
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods.segmented import is_clear
-from thirdhand.workbench.learning.takes import takes_of
 
 
 @functools.cache
@@ -23,7 +20,8 @@ def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("named", [True, False])
-def test_the_order_of_the_files_makes_no_difference(named: bool) -> None:
+def test_order_of_files_makes_no_difference(named: bool) -> None:
+    """The order of the files makes no difference."""
     demonstrations = [one if named else one._replace(places=()) for one in shown()]
     names = [f"take {number}" for number in range(len(demonstrations))]
     first = learn(demonstrations, names=names)
@@ -33,15 +31,8 @@ def test_the_order_of_the_files_makes_no_difference(named: bool) -> None:
         assert again.file == first.file
 
 
-def test_blocks_that_are_held_out_have_tools_along_the_whole_path() -> None:
-    """Of three tasks, shown one after another, each block has takes of all."""
-    base = shown()[0]
-    tasks = [base._replace(tool=base.tool + np.eye(7)[0] * 0.3 * (n // 6)) for n in range(18)]
-    blocks = np.array_split(np.argsort([take.person for take in takes_of(tasks, ["take"] * 18)]), 6)
-    assert all({n // 6 for n in block.tolist()} == {0, 1, 2} for block in blocks)
-
-
-def test_takes_of_a_sitting_are_held_out_together() -> None:
+def test_sitting_is_held_out_together() -> None:
+    """Takes of a sitting are held out together."""
     base, hour_ns = shown()[0], 3600 * 10**9
     later = [base._replace(stamps_ns=base.stamps_ns + (n // 2) * hour_ns + n % 2 * 60 * 10**9) for n in range(8)]
     assert persons(later) == [0, 0, 1, 1, 2, 2, 3, 3]
@@ -49,7 +40,8 @@ def test_takes_of_a_sitting_are_held_out_together() -> None:
 
 
 @pytest.mark.thorough
-def test_a_take_with_exchanged_hands_is_left_out_and_named() -> None:
+def test_take_with_exchanged_hands_is_left_out() -> None:
+    """A take with exchanged hands is left out and named."""
     good = shown()
     spoilt = good[2]._replace(left=good[2].right, right=good[2].left)
     names = [f"take {number}" for number in range(len(good))]
@@ -61,12 +53,6 @@ def test_a_take_with_exchanged_hands_is_left_out_and_named() -> None:
     assert figures_of(skill).gate_mm < 150.0
     others = learn([*good[:2], *good[3:]], names=[name for name in names if name != "take 2"])
     assert figures_of(skill).all == figures_of(others).all
-
-
-def test_a_delay_is_stated_only_if_the_gain_is_clear() -> None:
-    assert not is_clear(np.array([0.1, -0.09, 0.02]))
-    assert not is_clear(np.array([0.16, -0.14, 0.15, -0.15]))
-    assert is_clear(np.array([0.02, 0.03, 0.02]))
 
 
 @pytest.mark.thorough

@@ -36,7 +36,8 @@ print(before, peak_mb())
 
 @pytest.mark.timeout(300)
 @pytest.mark.thorough
-def test_many_takes_are_learned_in_little_memory() -> None:
+def test_many_takes_need_little_memory() -> None:
+    """Many takes are learned in little memory."""
     done = subprocess.run(
         [sys.executable, "-c", CODE],
         capture_output=True,

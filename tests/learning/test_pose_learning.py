@@ -11,19 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from support.skills import at_rest, figures_of
 from support.taught_scene import PLACES, SCENE, with_hands
-from thirdhand.contract.requests import RequestError, ViaPoint, decode_request
+from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
-from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import SkillError, decoded
 from thirdhand.skills.via_points import adapted, in_force
-from thirdhand.workbench.learning.ambiguity import SAME_M
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.pose import learned_pose
-from thirdhand.workbench.learning.records import HeldOut
-from thirdhand.workbench.learning.takes import takes_of
 from thirdhand_sim.scene import TOOL_ORIENTATION
 from thirdhand_sim.teach import demonstrations
 
@@ -56,7 +51,8 @@ def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]
     return float(np.degrees((Rotation.from_quat(found) * Rotation.from_quat(orientation).inv()).magnitude()))
 
 
-def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
+def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
+    """A tool that turns by 120 degrees is learned."""
     figures = figures_of(posed)
     assert not any("orientation" in text for text in (*figures.unsafe, *figures.warnings))
     assert figures.orientation_error_deg < 5
@@ -66,29 +62,8 @@ def test_a_tool_that_turns_by_120_degrees_is_learned(posed: Skill, shown: list[D
     assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(np.radians(120))
 
 
-def test_tools_turned_otherwise_at_the_same_hands_are_refused(shown: list[Demonstration]) -> None:
-    other = [one._replace(tool=np.hstack([one.tool[:, :3], turning(one, -TURN).tool[:, 3:]])) for one in shown]
-    takes = takes_of([one._replace(gripper=None) for one in (*shown, other[0])], list("abcd"))
-    held_out = [
-        HeldOut(
-            take, np.zeros_like(take.position), np.zeros((len(take.hands), 3, 3)), np.zeros(0), take.hands, take.hands
-        )
-        for take in takes
-    ]
-    found = learned_pose(held_out, points=80, gripper_ell=HandsKMP.gripper_ell, near_m=SAME_M)
-    unsafe = next(verdict.text for verdict in found.verdicts if verdict.severity == "unsafe")
-    assert "contradicts itself" in unsafe
-    assert "a (sample" in unsafe
-    assert "d (sample" in unsafe
-
-
-def test_a_constant_orientation_and_no_gripper_stay_out_of_the_skill(coarse: Skill) -> None:
-    assert coarse.turn is None
-    assert coarse.gripper is None
-    assert b"turn." not in coarse.file
-
-
-def test_a_skill_with_orientation_and_gripper_comes_back_from_its_file(posed: Skill) -> None:
+def test_pose_comes_back_from_file(posed: Skill) -> None:
+    """A skill with orientation and gripper comes back from its file."""
     back = decoded(posed.file, origin="x.npz")
     one, other = (at_rest(skill, with_hands(PLACES[2])) for skill in (posed, back))
     assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
@@ -97,7 +72,8 @@ def test_a_skill_with_orientation_and_gripper_comes_back_from_its_file(posed: Sk
     assert back.digest == posed.digest
 
 
-def test_places_teach_orientation_and_gripper_and_give_them_back(posed: Skill, skill: Skill) -> None:
+def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) -> None:
+    """Places teach orientation and gripper and give them back."""
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
     told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
     hands = with_hands(told)
@@ -113,7 +89,8 @@ def test_places_teach_orientation_and_gripper_and_give_them_back(posed: Skill, s
         assert (cleared.turn is None, cleared.gripper is None) == (one.turn is None, one.gripper is None)
 
 
-def test_places_that_contradict_each_other_are_refused(skill: Skill) -> None:
+def test_contradicting_via_points_are_refused(skill: Skill) -> None:
+    """Places that contradict each other are refused."""
     x, y, z, w = TOOL_ORIENTATION
     near = ViaPoint("near", PLACES[2].left, PLACES[2].right, PLACES[2].tool, std=0.01, orientation=(y, x, w, z))
     with pytest.raises(SkillError, match=r"'soldering' and 'near' contradict each other: .* turned by 1\d\d°"):
@@ -123,31 +100,23 @@ def test_places_that_contradict_each_other_are_refused(skill: Skill) -> None:
         adapted(skill, (msgspec.structs.replace(PLACES[2], gripper="closed"), near), tolerance=0.05)
 
 
-@pytest.mark.parametrize(
-    ("told", "message"),
-    [('"orientation": [0, 0, 0, 0.5]', "norm 0.5; 1 needed"), ('"gripper": "ajar"', "gripper")],
-)
-def test_what_is_no_orientation_or_gripper_is_said(told: str, message: str) -> None:
-    point = f'{{"name": "a", "left": [0, 0, 0], "right": [0, 0, 0], "tool": [0, 0, 0], {told}}}'
-    with pytest.raises(RequestError, match=message):
-        decode_request(point.encode(), ViaPoint)
-
-
-def test_a_gripper_that_tells_millimetres_is_refused(shown: list[Demonstration]) -> None:
+def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
+    """A gripper that tells millimetres is refused."""
     spoilt = [one._replace(gripper=80.0 * np.asarray(one.gripper)) for one in shown]
     with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
         learn(spoilt, components=5, points=60)
 
 
 @pytest.mark.parametrize("turn_deg", [200, 300, 400, 480])
-def test_a_tool_that_turns_by_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
+def test_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
     """By each take alike, whichever signs its quaternions have."""
     found = figures_of(learn([spinning(seed, turn_deg) for seed in range(4)], points=60))
     assert found.orientation_error_deg < 15
     assert found.unsafe == ()
 
 
-def test_a_tool_whose_turns_are_learned_wrongly_is_unsafe() -> None:
+def test_wrongly_learned_turns_are_unsafe() -> None:
+    """A tool whose turns are learned wrongly is unsafe."""
     found = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
     assert any("up to 60° accepted: it turns by up to" in line for line in found.unsafe)
 

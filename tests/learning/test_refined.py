@@ -10,14 +10,10 @@ import pytest
 from support.circling import circling
 from support.skills import figures_of, made
 from thirdhand.core.frame import Vector
-from thirdhand.core.skill.segmented import SegmentedKMP
-from thirdhand.core.skill.segments import LEFT
 from thirdhand.skills.demonstration import Demonstration, NamedDemonstration
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
 from thirdhand.skills.stored_demonstrations import KEPT_HZ, packed, stored_demonstrations
-from thirdhand.workbench.learning.choice import shared_counts
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods.weights import chosen
 from thirdhand.workbench.learning.table import table
 
 HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
@@ -43,7 +39,8 @@ def others() -> StoredSkill:
     return decoded(learn(shown, name="others", names=names, points=80).file, origin="others.npz")
 
 
-def test_takes_of_whoever_works_with_a_skill_refine_it(others: StoredSkill) -> None:
+def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
+    """Takes of whoever works with a skill refine it."""
     mine = [circling(seed).every(4) for seed in range(10, 14)]
     mine = [one._replace(tool=one.tool + np.concatenate([HABIT_M, np.zeros(4)])) for one in mine]
     refined = learn(mine[:3], name="mine", names=["a", "b", "c"], points=80, refined=others)
@@ -58,14 +55,9 @@ def test_takes_of_whoever_works_with_a_skill_refine_it(others: StoredSkill) -> N
     assert sorted(one.name for one in kept) == ["a", "b", "c", "take-0", "take-1", "take-2", "take-3"]
 
 
-def test_takes_that_do_it_as_the_others_did_count_as_theirs(others: StoredSkill) -> None:
-    mine = [circling(seed).every(4) for seed in (20, 21)]
-    found = figures_of(learn(mine, points=80, refined=others))
-    assert found.weights_mm[found.weight] < 0.9 * found.weights_mm["yours alone"]
-
-
 @pytest.mark.thorough
-def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_theirs() -> None:
+def test_earlier_takes_of_a_person_count() -> None:
+    """Takes of a task refine it and earlier ones of the same person are theirs."""
     shown = [one.every(3) for one in made("three", range(3))]
     shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]
     skill = learn(shown, name="others")
@@ -82,7 +74,8 @@ def test_takes_of_a_task_refine_it_and_earlier_ones_of_the_same_person_are_their
         learn([one._replace(places=()) for one in mine[:2]], refined=skill)
 
 
-def test_what_cannot_be_refined_is_refused_with_the_remedy(others: StoredSkill) -> None:
+def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
+    """What cannot be refined is refused with the remedy."""
     mine = [circling(seed).every(4) for seed in (30, 31)]
     with pytest.raises(SkillError, match=r"does not hold the demonstrations .*learn it anew"):
         learn(mine, refined=replace(others, demonstrations=b""))
@@ -112,18 +105,3 @@ def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
     for name in ("left", "right", "tool", "gripper"):
         np.testing.assert_allclose(getattr(first.demonstration, name), getattr(expected, name), atol=1e-6)
     assert first.demonstration.period_s >= 1.0 / KEPT_HZ - 1e-6
-
-
-def test_points_are_shared_between_new_takes_and_earlier_ones() -> None:
-    assert shared_counts(200, 4, 0, 4) == [50] * 4
-    assert shared_counts(200, 2, 100, 4) == [50] * 2 + [4] * 100
-    assert chosen({1.0: 0.03, 4.0: 0.02, np.inf: 0.025}) == (4.0, ("4", {"1": 0.03, "4": 0.02, "yours alone": 0.025}))
-
-
-@pytest.mark.thorough
-def test_which_hand_leads_is_chosen_over_all_takes_and_not_by_three_of_one_person() -> None:
-    of_others = learn(made("path", range(4)), name="others")
-    mine = learn(made("path", [32], each=3), name="mine", refined=of_others)
-    assert isinstance(of_others.model, SegmentedKMP)
-    assert isinstance(mine.model, SegmentedKMP)
-    assert mine.model.task.leads == of_others.model.task.leads == LEFT

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from support.skills import at_rest
-from support.taught_scene import HANDOVER, SCENE, with_hands
+from support.taught_scene import SCENE
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.skills.demonstration import Demonstration
@@ -18,8 +17,9 @@ def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:
     return tuple(np.stack(pair) for pair in zip(hands.left, hands.right, strict=True))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("t", [0.7, 1.5, 2.6, 4.4, 5.9, 7.6, 8.8])
-def test_velocity_and_acceleration_are_those_of_the_predicted_motion(aimed: Skill, t: float) -> None:
+@pytest.mark.parametrize("t", [1.5, 5.9])
+def test_prediction_has_derivatives_of_motion(aimed: Skill, t: float) -> None:
+    """Velocity and acceleration are those of the predicted motion."""
     script, h = HandScript(SCENE, seed=11), 1e-3
     before, now, after = (aimed.mean(stacked(script.truth(at))[0].reshape(1, 6))[0] for at in (t - h, t, t + h))
     prediction = aimed.predict(*stacked(script.truth(t)))
@@ -28,13 +28,8 @@ def test_velocity_and_acceleration_are_those_of_the_predicted_motion(aimed: Skil
     np.testing.assert_allclose(prediction.acceleration, (after - 2 * now + before) / h**2, atol=1e-4)
 
 
-def test_hands_at_rest_ask_for_no_motion(aimed: Skill) -> None:
-    prediction = at_rest(aimed, with_hands(HANDOVER))
-    assert not prediction.velocity.any()
-    assert not prediction.acceleration.any()
-
-
-def test_a_prediction_is_rounded_and_its_covariance_is_one(learned: Skill, taught: list[Demonstration]) -> None:
+def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> None:
+    """A prediction is rounded and its covariance is one."""
     random = np.random.default_rng(2)
     prediction = learned.predict(
         taught[4].hands[300].reshape(2, 3), random.normal(size=(2, 3)), random.normal(size=(2, 3))

@@ -22,39 +22,19 @@ def test_places_are_met(aimed: Skill) -> None:
     assert all(point.missed_by_m < 0.003 for point in in_force(aimed))
 
 
-def test_a_place_without_neighbours_is_met(learned: Skill) -> None:
-    place = ViaPoint("there", left=(0.8, -0.2, 0.2), right=(0.95, 0.35, 0.1), tool=(0.5, 0.0, 0.3))
-    (point,) = in_force(adapted(learned, [place], tolerance=0.05))
-    assert point.missed_by_m < 0.0005
-
-
-@pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02), (-0.01, 0.01, 0.01)])
-def test_a_neighbourhood_follows_the_left_hand(aimed: Skill, step: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(
-        aimed.mean([with_hands(HANDOVER, left=step)])[0], np.add(HANDOVER.tool, step), atol=0.006
-    )
-
-
-@pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.0, 0.0, 0.02)])
-def test_a_flat_neighbourhood_stays_where_it_is(aimed: Skill, step: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (-0.01, 0.01, 0.01)])
+def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float, ...]) -> None:
     glass = PLACES[1]
+    followed = aimed.mean([with_hands(HANDOVER, left=step)])[0]
+    np.testing.assert_allclose(followed, np.add(HANDOVER.tool, step), atol=0.006)
     np.testing.assert_allclose(aimed.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006)
 
 
-def test_forgetting_all_places_gives_the_skill_as_it_was_learned(learned: Skill, aimed: Skill) -> None:
-    assert aimed.digest != learned.digest
-    assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
-
-
-def test_places_are_taught_to_the_base_and_not_on_top_of_each_other(learned: Skill, aimed: Skill) -> None:
+def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
+    """Places are taught to the base and not on top of each other."""
     anew = adapted(aimed, PLACES[1:], tolerance=0.05)
     assert anew.file == adapted(learned, PLACES[1:], tolerance=0.05).file
-    assert [place.name for place in aimed.via_points] == ["handover", "glass", "soldering"]
-
-
-def test_places_that_cannot_be_taught_are_named(learned: Skill) -> None:
-    with pytest.raises(SkillError, match=r"handover.*tolerance is -1"):
-        adapted(learned, [HANDOVER], tolerance=-1.0)
+    assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
 
 
 def moved(point: ViaPoint, name: str, *, hands: float, tool: float, **more: Any) -> ViaPoint:
@@ -69,7 +49,8 @@ EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
 
 
 @pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
-def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, hands: float) -> None:
+def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> None:
+    """Places that contradict each other are refused by name."""
     steep = 4.0 * hands + 0.001 + 0.0006
     with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
         adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
@@ -79,7 +60,8 @@ def test_places_that_contradict_each_other_are_refused_by_name(skill: Skill, han
     assert np.linalg.norm(allowed.model.primitive.jacobian(here), 2) < 10.0
 
 
-def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill: Skill) -> None:
+def test_loose_via_points_contradict_less(skill: Skill) -> None:
+    """Places that are not exact contradict less and neighbourhoods more."""
     adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
     apart = moved(EXACT, "twin", hands=0.05, tool=0.12)
     adapted(skill, (EXACT, apart), tolerance=0.05)
@@ -87,12 +69,8 @@ def test_places_that_are_not_exact_contradict_less_and_neighbourhoods_more(skill
         adapted(skill, (EXACT, msgspec.structs.replace(apart, radius=0.025)), tolerance=0.05)
 
 
-def test_places_that_are_met_and_move_none_give_no_misgivings(learned: Skill, aimed: Skill) -> None:
-    assert warnings_of(learned, aimed) == ()
-    assert warnings_of(aimed, aimed) == ()
-
-
-def test_a_place_that_is_missed_and_one_that_is_moved_are_told_of_by_name(aimed: Skill) -> None:
+def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
+    """A place that is missed and one that is moved are told of by name."""
     loose = moved(HANDOVER, "loose", hands=0.06, tool=0.2, radius=0.0, std=0.05)
     after = adapted(aimed, (*PLACES, loose), tolerance=0.05)
     missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")

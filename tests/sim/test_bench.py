@@ -69,7 +69,7 @@ class Follower:
         return tuple(self.joints.tolist()), tuple(velocity.tolist())
 
 
-def test_the_fingers_let_go_of_what_they_hold_when_they_are_told_to_open() -> None:
+def test_opening_fingers_let_go() -> None:
     with Bench(HandScript(SCENE, seed=1)) as bench:
         bench.begin()
         assert bench.step(gripper=1.0).gripper == 1.0
@@ -82,7 +82,8 @@ def test_the_fingers_let_go_of_what_they_hold_when_they_are_told_to_open() -> No
         assert not bench.events().handover.reached
 
 
-def test_a_learned_gripper_hands_the_board_over_and_grasps_the_glass() -> None:
+def test_learned_gripper_does_the_task() -> None:
+    """A learned gripper hands the board over and grasps the glass."""
     shown = [one.every(2) for one in demonstrations(SCENE, count=3, seed=1, gripper=True)]
     taught = adapted(learn(shown, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05)
     run = rehearse(HandScript(SCENE, seed=31), lambda bench: taught, rate_hz=100, keep=True)
@@ -110,7 +111,8 @@ def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
 
 
 @pytest.mark.quick
-def test_a_tool_that_goes_as_taught_does_the_task(bench: Bench) -> None:
+def test_taught_path_does_the_task(bench: Bench) -> None:
+    """A tool that goes as taught does the task."""
     play(bench)
     events = bench.events()
     assert events.success
@@ -122,7 +124,8 @@ def test_a_tool_that_goes_as_taught_does_the_task(bench: Bench) -> None:
     assert np.linalg.norm(np.subtract(world.pose(world.iron).position, SCENE.right_final)) < 0.06
 
 
-def test_a_tool_that_passes_six_centimetres_above_misses_every_event(bench: Bench) -> None:
+def test_path_above_misses_every_event(bench: Bench) -> None:
+    """A tool that passes six centimetres above misses every event."""
     play(bench, aside=(0.0, 0.0, 0.06))
     events = bench.events()
     assert not any(event.reached for event in (events.handover, events.grasp, events.carry))
@@ -131,7 +134,8 @@ def test_a_tool_that_passes_six_centimetres_above_misses_every_event(bench: Benc
     assert world.pose(world.glass).position == pytest.approx(SCENE.glass)
 
 
-def test_two_runs_with_the_same_commands_are_identical() -> None:
+def test_same_commands_give_same_run() -> None:
+    """Two runs with the same commands are identical."""
     traces = []
     for _ in range(2):
         with Bench(HandScript(SCENE, seed=2)) as bench:
@@ -139,14 +143,8 @@ def test_two_runs_with_the_same_commands_are_identical() -> None:
     assert traces[0] == traces[1]
 
 
-def test_the_arm_holds_its_posture_until_the_first_command(bench: Bench) -> None:
-    start = bench.observe().joints
-    for _ in range(200):
-        seen = bench.step()
-    assert seen.joints == pytest.approx(start, abs=1e-3)
-
-
-def test_the_arm_brakes_twenty_milliseconds_after_the_last_command(bench: Bench) -> None:
+def test_arm_brakes_without_commands(bench: Bench) -> None:
+    """The arm brakes twenty milliseconds after the last command."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
@@ -161,7 +159,8 @@ def test_the_arm_brakes_twenty_milliseconds_after_the_last_command(bench: Bench)
     assert seen.joints[0] - joints[0] < 0.8 * 0.025
 
 
-def test_an_arm_that_finds_its_commands_far_ahead_does_not_leap_after_them(bench: Bench) -> None:
+def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
+    """An arm that finds its commands far ahead does not leap after them."""
     joints = np.array(bench.observe().joints)
     speed, speeds = np.array([0.8, 0, 0, 0, 0, 0, 0]), []
     for tick in range(400):
@@ -172,7 +171,8 @@ def test_an_arm_that_finds_its_commands_far_ahead_does_not_leap_after_them(bench
     assert seen.joints[0] == pytest.approx(joints[0] + 0.002 * 0.8, abs=1e-3)
 
 
-def test_what_a_mended_network_sends_late_does_not_move_the_arm(bench: Bench) -> None:
+def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
+    """What a mended network sends late does not move the arm."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
@@ -192,7 +192,8 @@ def test_what_a_mended_network_sends_late_does_not_move_the_arm(bench: Bench) ->
     assert bench.refused == 21
 
 
-def test_hands_rest_at_their_start_until_the_script_begins_and_come_back_the_way_they_went() -> None:
+def test_hands_return_the_way_they_went() -> None:
+    """Hands rest at their start until the script begins and come back the way they went."""
     with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench:
         start = bench.observe().hands.left.position
         for _ in range(20):
@@ -208,11 +209,6 @@ def test_hands_rest_at_their_start_until_the_script_begins_and_come_back_the_way
             assert min(np.linalg.norm(np.subtract(seen.hands.left.position, was)) for was in (start, *forth)) < 1e-9
         np.testing.assert_array_equal(seen.hands.left.position, start)
         assert steps == np.ceil(bench.script.duration_s / 0.002)
-
-
-def test_clearance_tells_how_near_the_arm_is_to_a_hand(bench: Bench) -> None:
-    tool, hand = bench.observe().tool.position, SCENE.left_start
-    assert 0.2 < bench.world.clearance(bench.world.left) < np.linalg.norm(np.subtract(tool, hand))
 
 
 # --- on the network ------------------------------------------------------------------------------
@@ -250,9 +246,10 @@ def network() -> Iterator[tuple[zenoh.Session, str]]:
         yield session, endpoints(session)[0]
 
 
-def test_a_run_on_the_network_reports_events_and_latency_and_leaves_a_hidden_hand_out(
+def test_run_on_network_reports_latency(
     network: tuple[zenoh.Session, str],
 ) -> None:
+    """A run on the network reports events and latency and leaves a hidden hand out."""
     listening, endpoint = network
     service = Service(listening, "lab/bench")
     reports: list[RunReport] = []
@@ -274,14 +271,15 @@ def test_a_run_on_the_network_reports_events_and_latency_and_leaves_a_hidden_han
     assert 15 <= len(left - right) <= 25
 
 
-def test_the_bench_says_so_when_no_command_comes(network: tuple[zenoh.Session, str]) -> None:
+def test_missing_commands_are_reported(network: tuple[zenoh.Session, str]) -> None:
+    """The bench says so when no command comes."""
     result = sim("--connect", network[1], "--once", "--wait", "0.2")
     assert result.returncode == 1
     assert "no command on thirdhand/joints/command within 0.2 s" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_an_arm_elsewhere_is_scored_by_its_joint_states(network: tuple[zenoh.Session, str]) -> None:
+def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     """It stands where the board is offered: that is met, and nothing else."""
     listening, endpoint = network
     follower = Follower(Settings().arm.posture)
@@ -319,9 +317,8 @@ def test_an_arm_elsewhere_is_scored_by_its_joint_states(network: tuple[zenoh.Ses
     assert not report.events.carry.reached
 
 
-def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
-    network: tuple[zenoh.Session, str], tmp_path: Path
-) -> None:
+def test_process_ends_on_signal_with_report(network: tuple[zenoh.Session, str], tmp_path: Path) -> None:
+    """A process plays until it is asked to stop and leaves its reports."""
     service = Service(network[0], "thirdhand")
     target = tmp_path / "report.json"
     command = [
@@ -356,7 +353,8 @@ def test_a_process_plays_until_it_is_asked_to_stop_and_leaves_its_reports(
     assert set(report["latency_ms"]) == {"p50", "p99", "max"}
 
 
-def test_bad_usage_and_bad_scenes_have_their_exit_codes(tmp_path: Path) -> None:
+def test_exit_codes(tmp_path: Path) -> None:
+    """Bad usage and bad scenes have their exit codes."""
     (tmp_path / "scene.toml").write_text("glass = [0.5, 0.38, 0.5]")
     usage = sim("--once", "--hands-rate", "7")
     assert usage.returncode == 2
@@ -402,14 +400,16 @@ class _Sample:
         cdr.encode_joints(messages.JointState(1, JOINT_NAMES, (float("nan"),) * 7, STILL)),
     ],
 )
-def test_a_command_that_is_none_is_counted_and_never_followed(payload: bytes) -> None:
+def test_invalid_command_is_never_followed(payload: bytes) -> None:
+    """A command that is none is counted and never followed."""
     commands = Commands(JOINT_NAMES)
     commands.receive(_Sample(payload))  # type: ignore[arg-type]
     assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))
     assert commands.last_error
 
 
-def test_only_the_first_answer_to_each_hand_sample_tells_of_latency() -> None:
+def test_first_answer_counts_for_latency() -> None:
+    """Only the first answer to each hand sample tells of latency."""
     commands = Commands(JOINT_NAMES)
     payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
     now = time.time_ns()

@@ -54,7 +54,8 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 
 @pytest.mark.timeout(900)
 @pytest.mark.thorough
-def test_a_tool_that_was_led_goes_there_from_then_on_and_back_when_it_is_undone(tmp_path: Path) -> None:
+def test_correction_from_end_to_end(tmp_path: Path) -> None:
+    """A tool that was led goes there from then on and back when it is undone."""
     settings, records = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), tmp_path / "records"
     with (
         serving(tmp_path, "--rate", str(RATE_HZ), "--record", str(records)) as daemon,

@@ -6,10 +6,9 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +25,11 @@ from support.paths import ROOT
 from thirdhand_sim.lab.__main__ import main
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.load.live import is_evidence
-from thirdhand_sim.lab.reproduction.table import METHODS
 from thirdhand_sim.lab.reproduction.writing import recorded, write
 from thirdhand_sim.lab.results import Array, ExperimentError
 from thirdhand_sim.lab.scenes import draw
-from thirdhand_sim.lab.separation import ThrustScript
-from thirdhand_sim.lab.statistics import SCENES, wilson
+from thirdhand_sim.lab.statistics import SCENES
 from thirdhand_sim.scene import MOST_MOVED, Scene
-from thirdhand_sim.script import Clock, Teacher
 
 pytestmark = pytest.mark.timeout(300)
 SHIPPED = ROOT / "recordings" / "experiments"
@@ -68,134 +64,89 @@ def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.usefixtures("close_figures")
-@pytest.mark.thorough
-class TestExperiments:
-    """One test each."""
-
-    def test_the_tool_follows_moving_hands_closer_and_more_smoothly_than_its_rivals(self, tmp_path: Path) -> None:
-        found = numbers("motion", tmp_path)["by_follower"]
-        ours = found["ours"]
-        for rival in (name for name in found if not name.startswith("ours")):
-            for group in ("clean", "recorded"):
-                assert ours[group]["jerk_ratio"] < 0.7 * found[rival][group]["jerk_ratio"], rival
-                if rival != "no smoothing":  # it is as near, and shakes
-                    assert ours[group]["error_rms_mm"] < found[rival][group]["error_rms_mm"], rival
-                # a rival that does not follow is none
-                assert found[rival]["minimum jerk"]["error_rms_mm"] < 35, rival
-                assert found[rival][group]["error_rms_mm"] < 35, rival
-        for group in ("clean, skill of such hands", "recorded, skill of such hands"):
-            others = [found[rival][group] for rival in found if group in found[rival] and rival != "ours"]
-            assert others
-            assert all(ours[group]["error_rms_mm"] < other["error_rms_mm"] for other in others)
-        stops = ours["sudden stops"]
-        assert stops["overshoot_mean_mm"] < 6
-        assert stops["overshoot_worst_mm"] < 12
-        assert stops["settled_worst_ms"] < 250
-        assert all(group["top_speed"] <= 0.8 + 1e-6 for group in ours.values())
-        assert (tmp_path / "motion.rrd").stat().st_size > 50_000
-
-    def test_letters_go_through_their_desired_points_and_stay_as_they_were_elsewhere(
-        self, tmp_path: Path, letters: Path
-    ) -> None:
-        found = numbers("letters", tmp_path, "--letters", str(letters))
-        for summary in (found["model_summary"], found["recorded_summary"]):
-            assert summary["largest_miss_at_desired_points_cm"] < 0.01
-            assert summary["rms_deviation_elsewhere_cm"] < 1.0
-        assert found["figures"] == ["letters.png"]  # both sets in one
-        assert (tmp_path / "letters.rrd").stat().st_size > 1000
-
-    def test_promp_meets_them_too_and_its_basis_functions_explode_on_a_grid_only(
-        self, tmp_path: Path, letters: Path
-    ) -> None:
-        found = numbers("promp", tmp_path, "--letters", str(letters))
-        assert found["figures"] == ["promp.png", "promp-dimensions.png"]
-        for summary in (found["model_summary"], found["recorded_summary"]):
-            assert summary["promp"]["largest_miss_cm"] < 0.01
-            assert summary["promp_without_ridge"]["largest_miss_cm"] > 0.1
-            for who in ("kmp", "promp"):
-                both = summary[who]["mean_rms_deviation_elsewhere_cm"], summary[who]["largest_deviation_elsewhere_cm"]
-                assert both[0] < both[1]
-        at_six = {one["method"]: one for one in found["dimensions"] if one["inputs"] == 6}
-        assert at_six["KMP"]["functions"] == 200
-        assert at_six["ProMP, 10 per input"]["functions"] == 10**6
-        assert at_six["ProMP, 10 per input"]["error"] is None
-        # what the mixture costs, and that bases need no grid
-        for method in ("kernel ridge, 200 samples", "ProMP, at 200 samples"):
-            assert at_six[method]["functions"] == 200
-            assert at_six[method]["error"] < at_six["KMP"]["error"]
-
-    def test_the_arm_keeps_the_rule_of_speed_and_separation(self, tmp_path: Path) -> None:
-        found = numbers("separation", tmp_path, "--share", "0.02")
-        assert found["random"]["successes"] == found["scenes"] == 2
-        assert found["thrust"]["successes"] == 2
-        assert found["random"]["overlaps"] == 0
-        assert found["random"]["excess_after_reaction"] < found["slip_m_per_s"]
-        for kind in ("random", "thrust"):
-            assert found[kind]["excess_lasts_s"] <= 0.13  # the reaction time
-            assert found[kind]["pushed_mm"] < 2
-            assert min(found[kind]["self_mm"], found[kind]["table_mm"]) > 5
-
-    def test_learned_correlations_lower_the_cost_beside_controls_at_equal_distance(self, tmp_path: Path) -> None:
-        found = numbers("correlation", tmp_path)
-        assert found["cost_fall_percent"]["mean"] > 0
-        assert found["largest_miss_of_a_via_point_cm"] < 0.01
-        for trial in found["trials"]:
-            for control in ("constant", "random"):
-                assert trial[control]["distance_cm"] == pytest.approx(trial["learned"]["distance_cm"], rel=0.02)
-            # begun at the one number and kept there, learning returns nothing worse
-            assert trial["begun_at_c"]["cost_rad"] <= trial["constant"]["cost_rad"]
-
-    def test_what_each_method_can_be_given(self, tmp_path: Path) -> None:
-        found = numbers("table", tmp_path)["modelled"]
-        largest = {
-            who: {one: found[who][f"largest_miss_of_{one}_cm"] for one in ("start", "via", "end")} for who in METHODS
-        }
-        for who in ("kmp", "promp"):
-            assert max(largest[who].values()) < 0.02
-        assert largest["dmp"]["start"] < 0.02
-        assert largest["dmp"]["end"] < 0.1
-        assert min(largest["dmp"]["via"], *largest["gmm"].values()) > 1
-
-    def test_hands_are_drawn_as_in_the_paper(self, tmp_path: Path) -> None:
-        found = numbers("hands", tmp_path)
-        assert found["figures"] == ["hands-stages.png", "hands.png"]
-        assert is_evidence(found["evidence_is_periods_skipped_at_most"])
-        assert not is_evidence(found["evidence_is_periods_skipped_at_most"] + 1)
-        worth = {name: one["error_median_mm"] for name, one in found["beside_the_paper"].items()}
-        assert min(worth, key=lambda name: worth[name]) == "ours"
-        assert worth["one point a place"] > 3 * worth["ours"]
-
-    def test_statistics_compare_eight_methods_in_the_same_scenes(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("thirdhand_sim.lab.statistics.SCENES", SCENES._replace(numbers=range(10)))
-        monkeypatch.setattr("thirdhand_sim.lab.statistics.OURS_HZ", 250)
-        found = numbers("statistics", tmp_path)
-        reaching = ["ours", "none", "look_up", "gaussian_process_5"]
-        assert list(found["methods"]) == [*reaching, "gaussian_process", "paper", "promp", "gmr"]
-        assert found["scenes"] == 1
-        # taught places are reached without any demonstration too
-        assert [found["methods"][method]["successes"] for method in reaching] == [1, 1, 1, 1]
-        assert found["methods"]["gmr"]["successes"] == 0
+def follows_better(found: dict[str, Any]) -> bool:
+    """True if the tool follows closer and more smoothly than its rivals, and within its limit."""
+    rivals = found["by_follower"]
+    ours = rivals["ours"]
+    for rival in (name for name in rivals if not name.startswith("ours")):
+        for group in ("clean", "recorded"):
+            assert ours[group]["jerk_ratio"] < 0.7 * rivals[rival][group]["jerk_ratio"], rival
+            assert rivals[rival][group]["error_rms_mm"] < 35, rival  # a rival that does not follow is none
+            if rival != "no smoothing":  # it is as near, and shakes
+                assert ours[group]["error_rms_mm"] < rivals[rival][group]["error_rms_mm"], rival
+    assert all(group["top_speed"] <= 0.8 + 1e-6 for group in ours.values())
+    stops = ours["sudden stops"]
+    return stops["overshoot_worst_mm"] < 12 and stops["settled_worst_ms"] < 250
 
 
-NAMED = {  # in these tests and their neighbours, with what they claim
-    name
-    for path in Path(__file__).parent.glob("test_*.py")
-    for name in re.findall(
-        r'(?:numbers|Results)\((?:tmp_path, )?"([a-z-]+)"|main\(\["([a-z-]+)"', path.read_text("utf-8")
-    )
-    for name in name
+def keeps_separation(found: dict[str, Any]) -> bool:
+    """True if the arm keeps the rule of speed and separation."""
+    assert found["random"]["overlaps"] == 0
+    assert found["random"]["excess_after_reaction"] < found["slip_m_per_s"]
+    for kind in ("random", "thrust"):
+        assert found[kind]["excess_lasts_s"] <= 0.13  # the reaction time
+        assert found[kind]["pushed_mm"] < 2
+        assert min(found[kind]["self_mm"], found[kind]["table_mm"]) > 5
+    return found["random"]["successes"] == found["thrust"]["successes"] == found["scenes"]
+
+
+def meets_points(found: dict[str, Any]) -> bool:
+    """True if letters go through their desired points and stay as they were elsewhere."""
+    summaries = found["model_summary"], found["recorded_summary"]
+    misses = [one["largest_miss_at_desired_points_cm"] for one in summaries]
+    return max(misses) < 0.01 and max(one["rms_deviation_elsewhere_cm"] for one in summaries) < 1.0
+
+
+def explodes_on_a_grid(found: dict[str, Any]) -> bool:
+    """True if ProMP meets points with a ridge only, and its bases explode on a grid."""
+    for summary in (found["model_summary"], found["recorded_summary"]):
+        assert summary["promp"]["largest_miss_cm"] < 0.01
+        assert summary["promp_without_ridge"]["largest_miss_cm"] > 0.1
+    functions = {one["method"]: one["functions"] for one in found["dimensions"] if one["inputs"] == 6}
+    return functions["KMP"] == 200 and functions["ProMP, 10 per input"] == 10**6
+
+
+def lowers_cost(found: dict[str, Any]) -> bool:
+    """True if learned correlations lower the cost and keep the via-points."""
+    return found["cost_fall_percent"]["mean"] > 0 and found["largest_miss_of_a_via_point_cm"] < 0.01
+
+
+def is_stable_only_with_places(found: dict[str, Any]) -> bool:
+    """True if each method that is told its places reaches them, and regression alone does not."""
+    reached = {name: one["successes"] for name, one in found["methods"].items()}
+    return reached["ours"] == reached["look_up"] == found["scenes"] == 1 and reached["gmr"] == 0
+
+
+CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's numbers
+    "motion": follows_better,
+    "letters": meets_points,
+    "promp": explodes_on_a_grid,
+    "separation": keeps_separation,
+    "correlation": lowers_cost,
+    "table": lambda found: found["modelled"]["kmp"]["largest_miss_of_via_cm"] < 0.02,
+    "hands": lambda found: is_evidence(found["evidence_is_periods_skipped_at_most"]),
+    "statistics": is_stable_only_with_places,
 }
+ELSEWHERE = {"motion-of-others", "sensitivity", "camera", "people", "partners", "faults"}  # or hours long
 
 
-def test_an_experiment_without_a_test_of_its_own_makes_its_files_too(tmp_path: Path) -> None:
-    assert len(NAMED & set(EXPERIMENTS)) > 14
-    for name in (
-        set(EXPERIMENTS) - NAMED - {"motion-of-others", "sensitivity", "camera"}
-    ):  # recordings; hours; MediaPipe
-        assert numbers(name, tmp_path)["experiment"] == name
+@pytest.mark.usefixtures("close_figures")
+@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - ELSEWHERE))
+@pytest.mark.thorough
+def test_experiment_bears_out_its_claim(
+    name: str, tmp_path: Path, letters: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Experiment makes its files and bears out its claim."""
+    monkeypatch.setattr("thirdhand_sim.lab.statistics.SCENES", SCENES._replace(numbers=range(10)))
+    monkeypatch.setattr("thirdhand_sim.lab.statistics.OURS_HZ", 250)
+    more = {
+        "separation": ("--share", "0.02"),
+        "letters": ("--letters", str(letters)),
+        "promp": ("--letters", str(letters)),
+    }
+    found = numbers(name, tmp_path, *more.get(name, ()))
+    assert found["experiment"] == name
+    assert name not in CLAIMS or CLAIMS[name](found)
 
 
 DRAWN = [
@@ -215,28 +166,14 @@ def grey(path: Path) -> Array:
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.usefixtures("close_figures")
 @pytest.mark.one_case
-def test_the_shipped_figures_are_of_the_shipped_numbers(name: str, tmp_path: Path) -> None:
+def test_figures_are_of_shipped_numbers(name: str, tmp_path: Path) -> None:
+    """The shipped figures are of the shipped numbers."""
     shutil.copy(SHIPPED / f"{name}.json", tmp_path)
     assert main([name, "--output", str(tmp_path), "--redraw", "--quiet"]) == 0
     figures = list(tmp_path.glob("*.png"))
     assert figures
     for figure in figures:
         np.testing.assert_allclose(grey(figure), grey(SHIPPED / figure.name), atol=10, err_msg=figure.name)
-
-
-def test_a_figure_of_other_numbers_is_another_one(tmp_path: Path) -> None:
-    numbers = json.loads((SHIPPED / "people.json").read_text())
-    numbers["methods"]["ours"]["success"]["mean"] -= 0.02
-    (tmp_path / "people.json").write_text(json.dumps(numbers))
-    assert main(["people", "--output", str(tmp_path), "--redraw", "--quiet"]) == 0
-    assert np.abs(grey(tmp_path / "people.png") - grey(SHIPPED / "people.png")).max() > 10
-
-
-def test_what_shows_more_than_its_numbers_is_not_drawn_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["correlation", "--output", str(tmp_path), "--redraw", "--quiet"]) == 1
-    assert "run it without --redraw" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", range(100))
@@ -253,39 +190,18 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
     assert max(progress) <= drawn.scene.duration_s + 1e-6
 
 
-def test_a_hand_is_thrust_where_the_tool_is_going_in_a_scene_that_is_too_slow_too() -> None:
-    """In this scene the tool is nowhere 22 cm farther after 1.5 s."""
-    drawn = draw(29, seed=7003)
-    script = ThrustScript(drawn)
-    teacher = Teacher(drawn.scene, seed=drawn.seed, clock=Clock(speed=drawn.speed, pauses=drawn.pauses))
-    path = np.array([teacher.truth(t).position for t in script.at_s + np.arange(0.0, 1.5, 0.01)])
-    there = script.truth(script.at_s + script.lasts_s)[script.side].position
-    assert np.linalg.norm(path - there, axis=1).min() < 0.003
-    assert 0.15 < np.linalg.norm(there - path[0]) < 0.22
-    assert all(p.at_s + p.lasts_s <= script.at_s or p.at_s >= script.at_s + script.lasts_s for p in drawn.pauses)
-
-
-def test_the_interval_of_a_rate_is_wilsons() -> None:
-    assert wilson(98, 100) == pytest.approx((0.9300, 0.9945), abs=1e-4)  # as in Newcombe 1998, method 3
-    assert wilson(100, 100)[1] == pytest.approx(1.0)
-
-
-def test_written_letters_are_the_same_for_the_same_seed_and_vary_between_repetitions() -> None:
-    one = write("G", seed=4)
-    assert one.tobytes() == write("G", seed=4).tobytes()
-    assert 0.2 < one.std(axis=0).mean() < 2.0
-
-
-def test_a_folder_without_letters_says_what_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_letters_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder without letters says what is needed."""
     with pytest.raises(ExperimentError, match="demo00"):
         recorded(tmp_path)
     assert main(["letters", "--output", str(tmp_path), "--letters", str(tmp_path), "--share", "0.1", "--quiet"]) == 1
     assert "No letters in" in capsys.readouterr().err
 
 
-def test_without_matplotlib_the_command_names_the_extra(
+def test_missing_matplotlib_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Without matplotlib the command names the extra."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["letters", "--output", str(tmp_path)]) == 1
     assert "thirdhand[experiments]" in capsys.readouterr().err

@@ -19,35 +19,26 @@ from thirdhand.contract.records import SIDES, Mode
 from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Tick
-from thirdhand.core.skill.model import NORMAL
-from thirdhand.core.skill.segmented import SegmentedKMP
-from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.skill import Skill
-from thirdhand.recordings.shipped import recordings, shipped_skill
+from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.via_points import adapted
-from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods import segmented
 from thirdhand_sim.lab import rehearsal
-from thirdhand_sim.lab.open_loop import targets
 from thirdhand_sim.lab.people.moving_hands import stops
 from thirdhand_sim.lab.people.trials import (
     RATE_HZ,
     Seen,
-    judge,
     seen,
     served,
 )
 from thirdhand_sim.lab.reached import ours
 from thirdhand_sim.lab.rivals import followers
-from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
 from thirdhand_sim.lab.rivals.service import LearnedByService
 from thirdhand_sim.people import person
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 from thirdhand_sim.sessions import session
-from thirdhand_sim.teach import by_people, places_of
+from thirdhand_sim.teach import places_of
 
 pytestmark = pytest.mark.thorough
 
@@ -94,69 +85,22 @@ def wanted(shown: Seen, taught: Skill) -> np.ndarray:
 class TestPeople:
     """`people`: every method's trial is a run of the service."""
 
-    def test_what_is_called_ours_is_what_the_controller_predicts_and_decides(
-        self, shown: Seen, wanted: np.ndarray
-    ) -> None:
+    def test_ours_is_what_the_controller_decides(self, shown: Seen, wanted: np.ndarray) -> None:
+        """What is called ours is what the controller predicts and decides."""
         placed = LearnedByService(shipped_skill(), start=True).place(shown.session.told)
         found = served(placed, shown)
         for name in (*PREDICTED, "mode", "reason", "setpoint", "tool"):
             assert found[name].tobytes() == wanted[name].tobytes(), name
         assert 0 < (wanted["mode"] == Mode.FOLLOW).sum() < len(wanted)
 
-    def test_the_outcome_is_counted_from_these_frames(self, shown: Seen, taught: Skill, wanted: np.ndarray) -> None:
-        found = judge(taught, shown)
-        judged = shown.times > 0.5
-        held = wanted["mode"] != Mode.FOLLOW
-        good = judged & ~shown.due
-        assert found.held == held[judged].mean()
-        variances = np.trace(wanted["covariance"][good], axis1=1, axis2=2)
-        assert found.predicted_mm == 1000 * np.sqrt(variances.mean())
-        delay = round(found.delay_s * RATE_HZ)
-        teacher = np.concatenate([np.repeat(shown.tool[:1], delay, axis=0), shown.tool[: len(wanted) - delay]])
-        assert found.path_mm == 1000 * np.sqrt(np.mean(np.sum((wanted["target"] - teacher)[good] ** 2, axis=1)))
-
-    def test_hands_are_estimated_as_the_controller_does(self, shown: Seen, wanted: np.ndarray) -> None:
+    def test_hands_are_those_of_the_controller(self, shown: Seen, wanted: np.ndarray) -> None:
+        """Hands are estimated as the controller does."""
         assert shown.estimates[:, 0].tobytes() == wanted["hands"].tobytes()
         assert shown.estimates[:, 1].tobytes() == wanted["hand_velocities"].tobytes()
 
-    def test_a_rival_that_predicts_as_ours_gets_the_target_that_ours_has(
-        self, shown: Seen, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """Of one segment and without a clock, so that nothing before makes a difference."""
-        monkeypatch.setattr(segmented, "CLOCKS", {})
-        of_two = [one._replace(places=(one.places[0], one.places[2])) for one in by_people(3)]
-        learned = learn(of_two)
-        assert isinstance(learned.model, SegmentedKMP)
-        assert not learned.model.is_timed
-        exact = replace(learned, model=replace(learned.model, delay_s=0.0), regions=NORMAL, threshold=1.0)
-        placed, belief = exact.model.placed, np.eye(1, MOST_SEGMENTS)[0]
 
-        class Copy:
-            """Our means and covariances as a rival's: only how they move is the experiments'."""
-
-            depends_on = DependsOn.HANDS
-
-            @staticmethod
-            def tempos(seen: Observed) -> np.ndarray:
-                return np.column_stack([seen.stillness, np.zeros(len(seen.hands))])
-
-            def mean(self, seen: Observed) -> np.ndarray:
-                return placed.mean(seen.hands, np.tile(belief, (len(seen.hands), 1)), self.tempos(seen))
-
-            def predict(self, seen: Observed) -> Predicted:
-                rows = zip(seen.hands, [belief] * len(seen.hands), self.tempos(seen), strict=True)
-                far = placed.gates_m(seen.hands) > exact.threshold
-                return Predicted(self.mean(seen), np.array([placed.covariance(*one) for one in rows]), far)
-
-        wanted, found = served(exact, shown), served(Copy(), shown)
-        both = (wanted["mode"] == Mode.FOLLOW) & (found["mode"] == Mode.FOLLOW)
-        assert both.mean() > 0.8
-        assert np.abs(wanted["target_acceleration"][both]).max() == 3.0  # the service's own limit is met
-        for name in PREDICTED[:3]:
-            assert found[name][both].tobytes() == wanted[name][both].tobytes(), name
-
-
-def test_motion_follows_through_the_controller() -> None:
+def test_motion_follows_through_controller() -> None:
+    """Motion follows through the controller."""
     skill = shipped_skill()
     hands = stops(skill.hands.mean(axis=0), numbers=(0,), rate_hz=30, noise=0.002)[0]
     found = followers.ours(skill, Settings())(hands)
@@ -175,7 +119,7 @@ def test_motion_follows_through_the_controller() -> None:
 
 
 @pytest.mark.parametrize("teach", [True, False])
-def test_what_is_rehearsed_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rehearsal_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """`statistics`, `separation`, and `hands` in process."""
     known: list[Tick] = []
     run = rehearsal.run
@@ -193,15 +137,3 @@ def test_what_is_rehearsed_is_what_the_controller_does(teach: bool, monkeypatch:
     wanted = of_the_service(taught, known, msgspec.structs.replace(Settings(), rate_hz=125))
     assert done.frames.tobytes() == wanted.tobytes()
     assert (wanted["mode"] == Mode.FOLLOW).mean() > 0.5
-
-
-@pytest.mark.parametrize("file", ["soldering.npz", "experiments/as-paper.npz"])
-def test_an_open_loop_target_is_where_the_controller_leads_the_tool(file: str) -> None:
-    """`hands` beside the paper, and what `motion` measures against."""
-    known = decoded((recordings() / file).read_bytes(), origin=file)
-    rows = known.hands[:: max(1, len(known.hands) // 8)] + 0.004
-    for row, target in zip(rows, targets(known, rows), strict=True):
-        at = list(zip(SIDES, row.reshape(2, 3).tolist(), strict=True))
-        ticks = [Tick(k, tuple(sample(side, x, 1 + k) for side, x in at)) for k in range(500)]
-        wanted = of_the_service(known, ticks, ASSUMED)["target"]  # which segment it is it believes in time
-        np.testing.assert_allclose(wanted[-1], target, atol=0.51e-6 if file != "soldering.npz" else 0.004)

@@ -86,7 +86,8 @@ def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(suff
     assert suffered["unaccounted_ticks"] == 0  # what is neither recorded nor said to be lost
 
 
-def test_a_frozen_relay_is_silent_and_a_killed_one_tears(tmp_path: Path) -> None:
+def test_relay_freezes_or_tears(tmp_path: Path) -> None:
+    """A frozen relay is silent and a killed one tears."""
     with socket.create_server(("127.0.0.1", 0)) as far_end:
         target = f"tcp/127.0.0.1:{far_end.getsockname()[1]}"
         with closing(CellPart("relay", target, "0")) as relay:

@@ -49,7 +49,8 @@ def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engi
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_bench_has_the_tool_where_the_core_has_it(tmp_path: Path, engine: str) -> None:
+def test_bench_and_core_agree_on_the_tool(tmp_path: Path, engine: str) -> None:
+    """The bench has the tool where the core has it."""
     cell = sliding_cell(tmp_path)
     posture = (0.2, *cell.arm.posture[1:])
     with (

@@ -44,7 +44,8 @@ def test_the_demo_succeeds_at_other_rates(rate_hz: int, arm: str, engine: str) -
 
 
 @pytest.mark.parametrize(("rate_hz", "bench_hz"), [(1000, 250), (100, 500)])
-def test_a_bench_of_another_rate_follows_the_service_at_its_own_pace(rate_hz: int, bench_hz: int) -> None:
+def test_bench_follows_rate_of_service(rate_hz: int, bench_hz: int) -> None:
+    """A bench of another rate follows the service at its own pace."""
     assert_succeeded(done(rate_hz, "wam", "pybullet", bench_hz), rate_hz, bench_hz)
 
 
@@ -52,12 +53,14 @@ def test_a_bench_of_another_rate_follows_the_service_at_its_own_pace(rate_hz: in
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 @pytest.mark.thorough
-def test_the_demo_succeeds_at_every_rate_with_every_arm_in_every_engine(rate_hz: int, engine: str, arm: str) -> None:
+def test_demo_succeeds_with_every_arm(rate_hz: int, engine: str, arm: str) -> None:
+    """The demo succeeds at every rate with every arm in every engine."""
     assert_succeeded(done(rate_hz, arm, engine), rate_hz)
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_at_50_hz_the_loop_does_the_task_and_a_follower_says_why_it_cannot(arm: str) -> None:
+def test_loop_at_50_hz_does_the_task(arm: str) -> None:
+    """At 50 hz the loop does the task and a follower says why it cannot."""
     cell = cell_of(arm, rate_hz=50)
     run = rehearse(HandScript(SCENE, seed=1), lambda _: taught(), settings=cell)
     assert run.events.success

@@ -25,7 +25,8 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     assert one[0] != one[1]
 
 
-def test_a_file_holds_hands_and_tool_at_a_hundred_hertz_in_frame_base(tmp_path: Path) -> None:
+def test_file_of_a_demonstration(tmp_path: Path) -> None:
+    """A file holds hands and tool at a hundred hertz in frame base."""
     assert teach.main(["--output", str(tmp_path), "--count", "1", "--seed", "3", "--cell", "lab/bench2"]) == 0
     taught = teach.demonstrations(Scene(), count=1, seed=3)[0]
     with (tmp_path / "demonstration-1.mcap").open("rb") as stream:
@@ -49,12 +50,8 @@ def test_a_file_holds_hands_and_tool_at_a_hundred_hertz_in_frame_base(tmp_path: 
     assert set(np.diff(taught.stamps_ns)) == {10_000_000}
 
 
-def test_the_first_demonstrations_do_not_depend_on_how_many_there_are() -> None:
-    few, many = (teach.demonstrations(Scene(), count=count, seed=1) for count in (2, 3))
-    np.testing.assert_array_equal(few[1].left, many[1].left)
-
-
-def test_bad_usage_and_failure_have_their_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Bad usage and failure have their exit codes."""
     with pytest.raises(SystemExit, match="2"):
         teach.main(["--output", str(tmp_path), "--count", "0"])
     (tmp_path / "scene.toml").write_text("glas = [0, 0, 0]")
@@ -62,7 +59,8 @@ def test_bad_usage_and_failure_have_their_exit_codes(tmp_path: Path, capsys: pyt
     assert "glas" in capsys.readouterr().err
 
 
-def test_the_tutorials_task_visits_the_tray_twice_in_one_scene_and_its_places_are_written(tmp_path: Path) -> None:
+def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
+    """The tutorials task visits the tray twice in one scene and its places are written."""
     file = tmp_path / "places.json"
     assert teach.main(["--visits", "--places", str(file)]) == 0
     told = places_in(file)
@@ -74,11 +72,3 @@ def test_the_tutorials_task_visits_the_tray_twice_in_one_scene_and_its_places_ar
         for place in told:
             assert off_via_point(shown, place, NONE).min() < 0.02
     assert len(one.tool) != len(other.tool)
-
-
-@pytest.mark.parametrize("more", [["--output", "out"], ["--places", "places.json", "--live"], []])
-def test_the_tutorials_task_is_shown_live_or_its_places_written(more: list[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        teach.main(["--visits", *more])
-    with pytest.raises(SystemExit, match="2"):
-        teach.main(["--places", "places.json"])

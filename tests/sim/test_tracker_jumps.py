@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from thirdhand_sim.lab.gains import gain
-from thirdhand_sim.lab.people.moving_hands import (
-    SMALL_KINDS,
-    recorded,
-    small_motion,
-    tracker_kind,
-)
-from thirdhand_sim.lab.people.tracker_jumps import exchanged_samples, noise_std_m, repair
+from thirdhand_sim.lab.people.tracker_jumps import repair
 from thirdhand_sim.lab.results import Array
 
 WAY = np.array([0.6, 0.64, 0.48])
@@ -108,51 +99,3 @@ def test_exchanged_hands_are_put_right(samples: int, tracker: str) -> None:
     assert np.flatnonzero(found.exchanged).tolist() == list(range(len(t)))[run]
     assert not found.wrong.any()
     assert off_mm(found.hands, true) == pytest.approx(clean_mm)
-
-
-def test_hands_that_pass_each_other_are_not_exchanged() -> None:
-    t = np.arange(0.0, 1.0, 1 / 30)
-    left = 0.3 * eased(t / 0.4)
-    passing = np.stack([left, 0 * t, 0 * t, 0.3 - left, 0 * t + 0.03, 0 * t], axis=1)
-    assert not exchanged_samples(t, passing).any()
-
-
-def test_the_noise_of_a_tracker_is_found_in_quick_motion_and_names_its_kind() -> None:
-    kinds: dict[str, NDArray[np.str_] | str] = {}
-    for tracker, (rate_hz, noise_m) in TRACKERS.items():
-        _, _, seen = hands(PATHS["reach at 2 m/s"], tracker, seed=1)
-        assert noise_std_m(seen[:, :3]) == pytest.approx(noise_m, rel=0.4, abs=0.0001)
-        kinds[tracker] = tracker_kind(rate_hz, seen)
-    assert kinds == {"24 Hz": "motion capture", "30 Hz": "camera", "120 Hz": "motion capture"}
-    noisy = hands(PATHS["rest"], "30 Hz", seed=2)[2]
-    assert tracker_kind(200, noisy) == "other"
-
-
-def test_both_truths_of_a_recording_are_kept_and_cleanly_tracked_hands_have_no_jumps(tmp_path: Path) -> None:
-    t, _, seen = hands(PATHS["reach at 1 m/s"], "30 Hz", seed=3)
-    begin = int(np.searchsorted(t, 0.1))
-    seen[begin : begin + 3, 2] += 0.08
-    np.savez(tmp_path / "someone_1.npz", time_s=t, left=seen[:, :3], right=seen[:, 3:])
-    found = {one.group: one for one in recorded(tmp_path, np.zeros(6))}
-    as_recorded = found["recorded"]
-    assert as_recorded.jumping is not None
-    assert as_recorded.tracker == "camera"
-    np.testing.assert_array_equal(as_recorded.truth, found["clean"].truth)
-    off = np.linalg.norm(as_recorded.jumping - as_recorded.truth, axis=1)
-    assert 0.03 < off.max() < 0.08  # low-passed
-    assert off[:50].max() < 0.01
-    clean = found["clean"]
-    at = np.round(clean.stamps / 0.002).astype(int)
-    assert np.abs(clean.samples - clean.truth[np.minimum(at, len(clean.truth) - 1)]).max() < 0.005
-
-
-@pytest.mark.parametrize("kind", SMALL_KINDS)
-def test_the_gain_of_small_motion_is_found_beside_its_drift(kind: str) -> None:
-    for number, rate_hz in enumerate((1.0, 5.0, 12.0)):
-        small = small_motion(np.zeros(6), kind, rate_hz, number)
-        still = small_motion(np.zeros(6), kind, 0.0, number)
-        hand = slice(3 * (number % 2), 3 * (number % 2) + 3)
-        shaken, drift = small.truth[:, hand], still.truth[:, hand]
-        late = np.roll(shaken - drift, round(0.1 / rate_hz / 0.002), axis=0)
-        assert np.abs(shaken - drift).max() <= SMALL_KINDS[kind][0]
-        assert gain(shaken, 1.7 * late + drift, rate_hz) == pytest.approx(1.7, rel=0.02)
