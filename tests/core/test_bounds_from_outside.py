@@ -10,13 +10,16 @@ import os
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from support import bounds
+from support.arm_geometry import ArmGeometry
 from support.bounds import Bound, Session, broken
-from support.drawn_cells import ARMS
+from support.drawn_cells import ARMS, drawn_cell
 from support.drawn_session import play
 from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.settings.config import robot_description
 
 SEEDS: tuple[int, ...] = (0, 1, *range(3, 20), 23)
 LENGTH = {"wild_ticks": 1000, "quiet_s": 8.0, "most_quiet_ticks": 2700}
@@ -104,3 +107,26 @@ def test_entered_clearance_is_found(kept: Session) -> None:
     frames["setpoint_velocity"] = 0.0  # it began at rest
     frames["setpoint"][-100] += 2.0
     assert bounds.setpoint_stays_in_the_workspace(replace(kept, frames=frames)).max() > 0.0
+
+
+@pytest.mark.parametrize("arm", dict.fromkeys(ARMS))
+def test_parts_and_tool_are_where_pinocchio_has_them(arm: str) -> None:
+    random = np.random.default_rng(1)
+    settings = drawn_cell(random, arm)
+    urdf, tool = robot_description(settings), np.array(settings.tool.plate_from_tool[:3])
+    geometry, model = ArmGeometry(settings, urdf), pin.buildModelFromXML(urdf)
+    data, plate = model.createData(), model.getFrameId(settings.arm.plate)
+    joints = [model.getJointId(name) for name in settings.joints.names]
+    postures = random.uniform(settings.joints.lower, settings.joints.upper, (50, len(joints)))
+    capsules, tools = geometry.place(postures)
+    at_zero, _ = geometry.place(np.zeros((1, len(joints))))
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    zero = [data.oMi[joint].copy() for joint in joints]
+    for q, ends, at in zip(postures, capsules, tools, strict=True):
+        full = pin.neutral(model)
+        full[[model.joints[joint].idx_q for joint in joints]] = q
+        pin.framesForwardKinematics(model, data, full)
+        np.testing.assert_allclose(at, data.oMf[plate].act(tool), atol=1e-9)
+        for link, moved, still in zip(geometry.links, ends, at_zero[0], strict=True):
+            place = data.oMi[joints[link - 1]] * zero[link - 1].inverse() if link else pin.SE3.Identity()
+            np.testing.assert_allclose(moved, [place.act(end) for end in still], atol=1e-9)

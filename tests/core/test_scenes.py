@@ -306,3 +306,25 @@ def along(speed: float, parts: slice) -> Vector:
 def test_slow_hand_moves_tool_evenly(speed: float) -> None:
     """A tool moves evenly with a slow hand."""
     assert along(speed, slice(0, 3)).std() < 0.001
+
+
+QUICK = {
+    "wam": (cell_of("wam"), 2),
+    "wam, 1 kHz": (changed(cell_of("wam"), rate_hz=1000), 0),
+    "wam, slow": (changed(cell_of("wam"), rate_hz=250, max_speed=0.3), 19),
+    "ur5": (cell_of("ur5"), 3),
+    "panda, 250 Hz": (changed(cell_of("panda"), rate_hz=250), 0),
+    "panda, orientation": (changed(cell_of("panda"), orientation="full"), 0),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.one_case
+def test_quick_reaches_never_fault(taught: Skill, name: str) -> None:
+    cell, first = QUICK[name]
+    for seed in range(first, first + (MANY or 1)):
+        hands = reaches(taught, cell, np.random.default_rng(seed), 8)
+        found = played(cell, taught, led(hands, first=1, every=every(cell)))
+        speed = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1).max() / cell.period_s
+        assert speed <= cell.tool.max_speed, f"seed {seed}: {speed:.4f} m/s"
+        assert np.ptp(found["tool"], axis=0).max() > 0.1

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 from support.paths import RECORDINGS
 from thirdhand.contract.channels import POSE
 from thirdhand.recordings.mcap_file import RecordingError
-from thirdhand.recordings.recording import Recording
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
 from thirdhand.workbench.takes.pose_streams import POSE_TYPES, TAKE_KEYS, PoseTopic
@@ -147,7 +146,7 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
     )
 
 
-@pytest.mark.parametrize("read", [read_demonstration, hand_samples, Recording.open])
+@pytest.mark.parametrize("read", [read_demonstration, hand_samples])
 @pytest.mark.parametrize(
     ("kind", "encoding"),
     [("geometry_msgs/msg/Pose", "cdr"), ("geometry_msgs/msg/PointStamped", "cdr"), (POSE.type, "json")],
