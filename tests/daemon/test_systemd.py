@@ -163,14 +163,6 @@ def test_without_a_manager_nothing_is_sent_and_a_wrong_environment_does_not_matt
     assert manager.heard(0.1) == ["WATCHDOG=1", "WATCHDOG=1"]
 
 
-def test_an_abstract_socket_is_reached() -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(f"\0thirdhand-{os.getpid()}")
-        manager.settimeout(5)
-        Systemd({"NOTIFY_SOCKET": f"@thirdhand-{os.getpid()}"}).notify("READY=1")
-        assert manager.recv(100) == b"READY=1"
-
-
 def commands() -> dict[str, list[str]]:
     """The commands of the unit by the name of their setting, as words."""
     lines = (line.partition("=") for line in UNIT.read_text(encoding="utf-8").splitlines())
