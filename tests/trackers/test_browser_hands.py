@@ -26,8 +26,6 @@ from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import WireError
 from thirdhand.workbench.trackers import browser_hands
 from thirdhand.workbench.trackers.browser_hands import (
-    FULL,
-    MAX_PAGES,
     NO_TOKEN,
     TAKEN,
 )
@@ -163,28 +161,6 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
                     assert await reason(socket) == (4403, FOREIGN)
             await go_on()
             assert len(heard.poses["left"]) == len(REFUSED) + 2
-
-    with page_of_hands() as (page, heard):
-        asyncio.run(scenario())
-
-
-def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
-    async def scenario() -> None:
-        async with serving_page(page) as at, contextlib.AsyncExitStack() as stack:
-            first = await stack.enter_async_context(opened(page, at))
-            await first.send_bytes(hands_message())
-            await heard.until("left", 1)
-            others = [await stack.enter_async_context(opened(page, at)) for _ in range(100)]
-            refused = [await reason(socket) for socket in others[MAX_PAGES - 1 :]]
-            assert set(refused) == {(4429, FULL)}
-            assert len(refused) == 101 - MAX_PAGES
-            await first.send_bytes(hands_message(number=1))
-            await heard.until("left", 2)
-            await others[0].close()
-            async with opened(page, at) as late:  # there is room again
-                await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
-                while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
-                    pass
 
     with page_of_hands() as (page, heard):
         asyncio.run(scenario())

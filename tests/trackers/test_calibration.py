@@ -33,7 +33,6 @@ from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import (
     HandSettings,
     Settings,
-    TrackerSettings,
     load,
 )
 from thirdhand.workbench.takes.track import Track
@@ -50,7 +49,6 @@ from thirdhand.workbench.trackers.calibration.collecting import (
     LedTracks,
     distances_m,
     held_tool,
-    progress,
     solved,
 )
 from thirdhand.workbench.trackers.calibration.solver import (
@@ -140,42 +138,6 @@ def test_spoilt_samples_cost_little(how: str) -> None:
     assert 1e3 * error_m(found) < 1.5
     if how == "outliers":
         assert 10 < found.outliers < 40, "of 400 samples"
-
-
-@pytest.mark.parametrize(("kind", "median_mm"), [("mocap", 8), ("headset", 15)])
-def test_touched_points_show_it_too(kind: str, median_mm: float) -> None:
-    errors = []
-    for seed in range(9):
-        random = np.random.default_rng(seed)
-        hand, base = touched(path_of("wam", seed % 3), 12, KINDS[kind], random)
-        hand[5] += 0.2 * (seed % 2)  # one touch that misses
-        found = solve_points(hand, base, CORNERS)
-        errors.append(1e3 * error_m(found))
-    assert np.median(errors) < median_mm, errors
-
-
-def test_more_time_makes_it_more_accurate_and_progress_says_what_to_do() -> None:
-    stds = []
-    for share in (0.2, 0.4, 1.0):
-        held = held_by("headset")
-        count, states = int(share * len(held.hand)), int(share * len(held.tool))
-        part = HeldTool(
-            held.hand_s[:count], held.hand[:count], held.tool_s[:states], held.tool[:states], held.turn[:states]
-        )
-        seen = progress(led_of(part), Settings(), CORNERS, None)
-        assert seen is not None
-        assert seen.std_m is not None
-        stds.append(seen.std_m)
-    assert stds[0] > stds[1] > stds[2]
-    still = np.repeat(held.turn[:1], states, 0)
-    seen = progress(led_of(part._replace(turn=still)), Settings(), CORNERS, "right")
-    assert seen is not None
-    assert (seen.std_m, seen.advice) == (None, "turn the wrist while you lead the tool, about two axes")
-    assert seen.text().startswith("led over ")
-    flat = part._replace(tool=part.tool * [1, 1, 0.1])
-    seen = progress(led_of(flat), Settings(), CORNERS, "right")
-    assert seen is not None
-    assert seen.advice == "lead the tool farther apart along (0.0, 0.0, 1.0)"
 
 
 # --- refusals -------------------------------------------------------------------------------------
@@ -301,17 +263,6 @@ def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(noise_m: flo
     assert accepted >= (25 if missed_m == 0.3 else 70)
 
 
-def test_a_point_that_decides_the_sense_of_an_axis_is_no_outlier() -> None:
-    """Seven points in the plane of the table, and one above it that is wrong."""
-    flat = np.array([[x, y, 0.0] for x in (0.4, 0.6, 0.8) for y in (-0.3, 0.3)] + [[0.7, 0.0, 0.0]])
-    base = np.concatenate([flat, [[0.5, -0.2, 0.25]]])
-    base[-1, 2] -= 0.2
-    hand = TURN.inv().apply(base - ORIGIN) + np.random.default_rng(0).normal(0.0, 0.002, base.shape)
-    base[-1, 2] += 0.2
-    with pytest.raises(CalibrationError, match=r"point 8 does not fit the others.*Touch it again, and two more points"):
-        solve_points(hand, base, CORNERS)
-
-
 # --- from streams to a hand and a tool ------------------------------------------------------------
 
 BEGIN_NS = 10**18
@@ -347,45 +298,6 @@ def test_of_two_hands_one_must_be_given_and_an_exchange_is_named() -> None:
         solved(led_of(held), Settings(), CORNERS, "left")
     with pytest.raises(CalibrationError, match="no hand arrives"):
         solved(streams._replace(hands={}), Settings(), CORNERS, None)
-
-
-@pytest.mark.parametrize(
-    ("axes", "words"), [((1e3, 1e3, 1e3), "moves 1000 times as far as the tool.*publish mm"), ((1, 1, -1), "mirrored")]
-)
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_the_cause_is_that_of_the_hand_at_the_tool(side: str, axes: tuple[float, ...], words: str) -> None:
-    """The other one rests on the bench, and is seen by the same tracker."""
-    held = held_by("mocap")
-    held = held._replace(hand=held.hand * axes)
-    noise = np.random.default_rng(2).normal(0.0, 0.001, held.hand.shape) * axes
-    other = "left" if side == "right" else "right"
-    streams = led_of(held, side, **{other: held._replace(hand=held.hand[0] + noise)})
-    with pytest.raises(CalibrationError, match=words):
-        solved(streams, Settings(), CORNERS, side)
-
-
-def test_each_hand_is_mapped_by_the_table_of_its_own_tracker() -> None:
-    held = held_by("mocap")
-    free = held._replace(hand=held.hand[::-1].copy())
-    tool, of_right, of_left = led_of(held).tool, led_of(held).hands["right"], led_of(free, "left").hands["left"]
-    mocap = of_right.poses * np.r_[[1000.0, 1000.0, -1000.0], np.ones(4)]
-    streams = LedTracks({"left": of_left._replace(frame="webxr"), "right": of_right._replace(poses=mocap)}, tool)
-    tables = {"mocap": TrackerSettings(unit="mm", axes="left-handed")}
-    found = solved(streams, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, "right")
-    assert (found.side, found.frame) == ("right", "mocap")
-    assert 1e3 * error_m(found.calibration) < 1.5
-    wrong = {"mocap": TrackerSettings(axes="left-handed")}
-    with pytest.raises(CalibrationError, match=r'Set \[trackers\.mocap\] unit = "mm"'):
-        solved(streams, Settings(trackers=wrong), CORNERS, "right")
-    with pytest.raises(CalibrationError, match=r"or change \[trackers\.mocap\] axes"):
-        solved(streams, Settings(trackers={"mocap": TrackerSettings(unit="mm")}), CORNERS, "right")
-    recentred = streams._replace(hands={"right": of_right._replace(frame="webxr1")})
-    with pytest.raises(
-        CalibrationError,
-        match=r"hands/right is in frame 'webxr1', which has no table in the settings: add \[trackers\.webxr1\], or, "
-        r"if it is that of \[hands\] \(now 'webxr'\), set \[hands\] frame = 'webxr1'",
-    ):
-        solved(recentred, Settings(hands=HandSettings(frame="webxr"), trackers=tables), CORNERS, None)
 
 
 def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:

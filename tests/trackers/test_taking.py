@@ -4,7 +4,6 @@ rest ends a take and is left out, and what was taken is shown, trimmed and delet
 
 from __future__ import annotations
 
-import argparse
 import re
 import threading
 import time
@@ -17,7 +16,6 @@ import pytest
 import zenoh
 
 from support.cell import until
-from support.paths import ROOT
 from thirdhand.client import endpoints, open_session
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, channels
@@ -32,7 +30,6 @@ from thirdhand.settings.config import (
     ToolSettings,
     robot_description,
 )
-from thirdhand.workbench.cli.record_options import add_options
 from thirdhand.workbench.takes.demonstration_files import (
     demonstration_paths,
     summary,
@@ -41,13 +38,9 @@ from thirdhand.workbench.takes.demonstration_files import (
     uncut,
 )
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
-from thirdhand.workbench.takes.dwells import REST_M
 from thirdhand.workbench.takes.pose_streams import PoseRecording, PoseTopic
 from thirdhand.workbench.trackers.capture import (
     JOINT_STATES,
-    MOVED_RATIO,
-    REST_RAD,
-    RETAINED_REST_S,
     Capture,
     CaptureError,
     Sample,
@@ -246,17 +239,6 @@ def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Sess
     np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, wanted - now_ns, atol=6e7)
     assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
     assert 190 < len(taken.samples["tool/pose"]) < 220
-
-
-def test_what_rest_is_is_told_as_it_is() -> None:
-    parser = argparse.ArgumentParser()
-    add_options(parser)
-    options = " ".join(parser.format_help().split())
-    assert f"all stay within {1000 * REST_M:g} mm, joints within {REST_RAD:g} rad" in options
-    assert f"{RETAINED_REST_S:g} s are then retained" in options
-    page = " ".join((ROOT / "docs" / "record-takes.md").read_text(encoding="utf-8").split())
-    assert f"each stays within {1000 * REST_M:g} mm, and each joint of the arm within {REST_RAD:g} rad" in page
-    assert MOVED_RATIO == 5, "the page says five times"
 
 
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
