@@ -14,11 +14,8 @@ import zstandard
 from mcap.opcode import Opcode
 
 from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
-from thirdhand.contract.cdr import encode_pose
-from thirdhand.contract.channels import POSE
-from thirdhand.contract.messages import PoseStamped
 from thirdhand.core.frame import encode
-from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.recordings.steps import Step
@@ -109,20 +106,6 @@ def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
     assert all("lacks its settings: " in error for error in refused)
 
 
-def test_damage_and_a_cut_are_told_apart_also_in_one_file(tmp_path: Path, whole: bytes) -> None:
-    third, tenth = chunks(whole)[3], chunks(whole)[10]
-    cut = flipped(whole, third[0] + 100)[: (tenth[0] + tenth[1]) // 2]
-    recording, steps = read(tmp_path / "a.mcap", cut)
-    assert [fault.cut for fault in recording.faults] == [False, True]
-    assert recording.truncated
-    assert str(recording.faults[1]).startswith(f"cut at byte {tenth[0]}: the end is missing")
-    assert len([step for step in steps if step.damage]) == 1
-    between_records, _ = read(tmp_path / "a.mcap", whole[: tenth[0]])
-    assert [str(fault) for fault in between_records.faults] == [
-        f"cut at byte {tenth[0]}: the end is missing (the file ends before the recording does)"
-    ]
-
-
 @pytest.mark.parametrize("compression", ["zstd", "zstd of another size", "lz4"])
 def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whole: bytes, compression: str) -> None:
     size = 100 << 20
@@ -164,25 +147,6 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
         list(hand_samples(path))
-
-
-def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp_path: Path) -> None:
-    path, said, total = tmp_path / "a.mcap", list[str](), 300
-    file = McapFile(path, joints=0)
-    for i in range(total):
-        for key in ("x/hands/left", "x/hands/right", "x/tool/pose"):
-            pose = PoseStamped(i * 10_000_000, "base", (0.001 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-            file.put(key, POSE.type, encode_pose(pose), i * 10_000_000, i)
-        if i % 50 == 49:
-            file.flush()
-    file.close()
-    assert len(read_demonstration(path, say=said.append).stamps_ns) == total
-    assert said == []
-    path.write_bytes(path.read_bytes()[: chunks(path.read_bytes())[3][0] + 100])
-    assert len(read_demonstration(path, say=said.append).stamps_ns) == 150
-    (line,) = said
-    assert "cut at byte" in line
-    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose were read")
 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])

@@ -22,14 +22,11 @@ from support.circling import circling
 from support.paths import ROOT
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import POSE
-from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.ros2msg import schema
 from thirdhand.recordings.mcap_file import RecordingError
-from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.skills.skill_file import skill_in
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
 from thirdhand.workbench.takes.pose_streams import PoseTopic
 
@@ -147,8 +144,6 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstr
         (lambda rows: rows[:0], "holds no frame, 2 needed: export"),
         (lambda rows: [[row[0], "inf", *row[2:]] for row in rows], "frame 1 of 20 is at inf s, up to 1e.09 s needed"),
         (lambda rows: [[row[0], "nan", *row[2:]] for row in rows], "frame 1 of 20 is at nan s"),
-        (lambda rows: [row[:1] for row in rows], "frame 1 of 20 is at nan s"),
-        (lambda rows: [[row[0], f"{row[1]}e12", *row[2:]] for row in rows], "frame 2 of 20 is at .* s, up to"),
         (lambda rows: rows[::-1], "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed"),
         (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit in the file"),
     ],
@@ -200,27 +195,6 @@ def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demo
             read_demonstration(tmp_path / "a.c3d", settings=CAPTURE)
 
 
-POINTERS = ["a.mcap", "a.csv", "a.c3d", "a.bag", "a.db3", "bag/a.db3", "a.npz", "a.urdf", "a.stl"]
-
-
-@pytest.mark.parametrize("name", POINTERS)
-def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_path: Path) -> None:
-    path = tmp_path / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n")
-    shape = '<link name="a"><collision><geometry><mesh filename="a.stl"/></geometry></collision></link>'
-    (tmp_path / "b.urdf").write_text(f"<robot>{shape}</robot>")
-    read: Callable[[], object] = {
-        ".npz": lambda: skill_in(path),
-        ".urdf": lambda: description(path),
-        ".stl": lambda: description(tmp_path / "b.urdf"),
-    }.get(path.suffix, lambda: read_demonstration(path.parent if "/" in name else path))
-    with pytest.raises(
-        ExplainedError, match="it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches"
-    ):
-        read()
-
-
 def lerobot(path: Path) -> None:
     (path / "meta").mkdir(parents=True)
     (path / "meta" / "info.json").write_text("{}")
@@ -231,8 +205,6 @@ def lerobot(path: Path) -> None:
     [
         ("set", lerobot, r"set is a data set of LeRobot, .*docs/arrays\.md"),
         ("a.csv", lambda path: path.write_text("t,x\n0,1\n"), r"is not a CSV file as Motive exports it .*docs/arrays"),
-        ("b.csv", lambda path: path.write_bytes(b""), "is not a CSV file as Motive exports it"),
-        ("c.csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not a CSV file that can be read"),
         ("a.c3d", lambda path: path.write_bytes(b"nothing"), "is not a C3D file that can be read"),
         ("a.mcap.zst", lambda path: path.write_bytes(b"x"), "is not read: decompress it first, or give the folder"),
         (

@@ -128,24 +128,6 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
             read_demonstration(path, topics=given)
 
 
-def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
-    zero = made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    still = made("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-    return made(
-        "nav_msgs/msg/Odometry",
-        header=header(stamp_ns, frame),
-        child_frame_id="hand",
-        pose=made("geometry_msgs/msg/PoseWithCovariance", pose=pose(*at), covariance=np.zeros(36)),
-        twist=made("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36)),
-    )
-
-
-def test_odometry_of_a_tracker_is_read_as_poses(tmp_path: Path) -> None:
-    tool = moving(stamped, "base", 0.5, 0.0)
-    got = read_demonstration(bag(tmp_path / "bag", {"/left_hand": moving(odometry, "base", 0.3, 0.0), "/tool": tool}))
-    np.testing.assert_allclose(got.left[:, :3], np.column_stack([np.full(40, 0.3), np.zeros(40), WAY]))
-
-
 def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:
     """Of a motion capture in millimetres, y up, the arm's base 1 m before its origin."""
     y_up = Rotation.from_euler("x", 90, degrees=True)
