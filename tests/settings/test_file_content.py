@@ -13,9 +13,7 @@ import pytest
 
 from support.cell import told
 from thirdhand.contract.explain import in_words
-from thirdhand.daemon.skill_worker import skill_of
 from thirdhand.settings.file_content import UnusableError, content
-from thirdhand.skills.skill_file import SkillError
 
 LARGEST = 1000
 COMMANDS = {
@@ -104,20 +102,3 @@ def test_commands_refuse_it_in_one_line_that_names_it(tmp_path: Path, what: str,
     assert re.search(rf"{path}\b", last), done.stderr
     assert "Errno" not in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_skill_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
-    path = odd(tmp_path, kind)
-    with pytest.raises(SkillError, match=rf"cannot read skill {path}: \w"):
-        skill_of(path)
-
-
-@pytest.mark.parametrize("kind", ["a file", "a pipe", "a full device"])
-def test_a_folder_of_recordings_that_is_none_is_refused(tmp_path: Path, kind: str) -> None:
-    path = odd(tmp_path, kind)
-    if kind == "a file":
-        path.write_bytes(b"")
-    done = told("serve", "--joints", "assumed", "--record", str(path))
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"cannot record in {path}: it is not a folder\n")
