@@ -16,7 +16,6 @@ from support.cell import serving, thirdhand
 from support.paths import ROOT
 from thirdhand.client import (
     Client,
-    Tracker,
     UnreachableError,
     client_settings,
     endpoints,
@@ -66,17 +65,6 @@ def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
         open_session(listen=["tcp/127.0.0.1:0"])
 
 
-def test_without_the_variable_the_file_is_in_the_users_configuration(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    home = file.parent.parent
-    monkeypatch.setenv("HOME", str(home))
-    monkeypatch.delenv("XDG_CONFIG_HOME")
-    (home / ".config" / "thirdhand").mkdir(parents=True)
-    (home / ".config" / "thirdhand" / "client.toml").write_text('cell = "mine"')
-    assert client_settings().cell == "mine"
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -98,21 +86,6 @@ def test_a_wrong_file_is_told_with_what_is_accepted(
     assert str(file) in capsys.readouterr().err
 
 
-def test_a_wrong_variable_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("THIRDHAND_CONNECT", "localhost")
-    with pytest.raises(SettingsError, match=r"\$THIRDHAND_CONNECT: .*tcp/localhost:7447 \?"):
-        client_settings()
-
-
-@pytest.mark.parametrize("command", ["status", "record", "view", "hold", "metrics"])
-def test_help_says_where_it_is_taken_from(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    named = [f"$THIRDHAND_{name}" for name in VARIABLES if name != "CELL" or command != "metrics"]
-    assert all(name in told for name in (*named, "$XDG_CONFIG_HOME/thirdhand/client.toml"))
-
-
 def test_endpoint_and_cell_are_given_once(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with serving(tmp_path, "--cell", "lab/bench2", "--joints", "assumed") as daemon:
         file.write_text(f'connect = "{daemon.endpoint}"\ncell = "lab/bench2"\n')
@@ -124,21 +97,6 @@ def test_endpoint_and_cell_are_given_once(file: Path, tmp_path: Path, capsys: py
 
 
 # --- whoever is started first --------------------------------------------------------------------
-
-
-def test_a_tracker_needs_a_listener_and_no_daemon() -> None:
-    """As `thirdhand record --listen` is one."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as recorder:
-        took = recorder.declare_subscriber("thirdhand/hands/*")
-        with open_session(connect=endpoints(recorder)) as session, Tracker(session, timeout_s=10) as tracker:
-            tracker.publish("left", (0.1, 0.2, 0.3))
-            sample = took.recv()  # type: ignore[no-untyped-call]
-        assert cdr.decode_pose(sample.payload.to_bytes()).position == (0.1, 0.2, 0.3)
-        with (
-            open_session(connect=endpoints(recorder)) as session,
-            pytest.raises(UnreachableError, match="nobody listens to elsewhere/hands/left: is a daemon or `thirdhand"),
-        ):
-            Tracker(session, "elsewhere", timeout_s=0.1)
 
 
 class Example:
