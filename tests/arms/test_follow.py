@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from zenoh.handlers import RingChannel
 
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
@@ -233,22 +232,6 @@ def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program:
     )
 
 
-@pytest.mark.timed
-def test_an_arm_follows_a_daemon_at_1000_hz_without_being_told_its_rate(tmp_path: Path) -> None:
-    with serving(tmp_path, "--rate", "1000", network=PATIENT) as daemon, Tracker(daemon.session) as tracker:
-        joints = Joints(daemon.session)
-        with following("simulated", "--connect", daemon.endpoint) as running:
-            running.until("commands arrive")
-            for attempt in range(20):
-                tracker.left = LEFT if attempt % 2 else NEAR_LEFT
-                with contextlib.suppress(TimeoutError):
-                    running.waits(joints.moving, 3.0)
-                    break
-            assert daemon.client.status().mode != "fault"
-            assert running.ended() == 0
-    assert "0 commands were refused" in running.said[-1]
-
-
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     arm, told_so = (
         SimulatedArm(Settings()),
@@ -257,17 +240,3 @@ def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
         follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)
-
-
-def test_the_joints_are_told_by_their_names() -> None:
-    with open_session() as session:
-        heard = session.declare_subscriber("thirdhand/joints/state", RingChannel(1))
-        stop = threading.Event()
-        arm = threading.Thread(
-            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"stop": stop}
-        )
-        arm.start()
-        state = cdr.decode_joints(heard.recv().payload.to_bytes())
-        stop.set()
-        arm.join(20)
-    assert (state.names, state.position) == (Settings().joints.names, Settings().arm.posture)
