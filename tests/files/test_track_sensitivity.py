@@ -19,7 +19,7 @@ from support.paths import RECORDINGS
 from support.spoiled import Spoil, Streams, streams_of
 from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.takes import track_check
+from thirdhand.workbench.takes import track_check, track_offsets
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
 from thirdhand.workbench.takes.track import Track
 from thirdhand_sim.scene import Scene
@@ -27,6 +27,20 @@ from thirdhand_sim.teach import demonstrate
 
 NAMES = ("left", "right", "tool")
 OFF_M = 0.005  # what is farther than this from the truth is bad
+SEEDS = 2
+CHECK = ("MAX_HAND_MPS2",)
+OFFSETS = (
+    "HALF_WINDOW",
+    "STEP_M",
+    "UNUSUAL_RATIO",
+    "USUAL_PERCENTILE",
+    "USUAL_S",
+    "MAX_REMAINDER",
+    "MAX_BESIDE",
+    "MAX_JUMP_S",
+)
+AROUND = {"USUAL_PERCENTILE": (60, 90), "HALF_WINDOW": (2, 8)}
+INTAKE = "_intake_verdicts"  # what takes longest, and is the same whatever these constants are
 SETTINGS = Settings()
 
 
@@ -117,3 +131,43 @@ def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
         found.append(not retained[name][wrong].any())
         assert not found[-1] or all(retained[one][~is_bad(take, streams, one)].all() for one in NAMES)
     assert np.mean(found) >= 0.9
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.thorough
+def test_each_constant_matters_and_none_is_better_halved_or_doubled(
+    clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cases = [
+        (take, spoilt(take, spoil, 100 * number + seed)[0])
+        for spoil in (*spoiled.SPOILS, *spoiled.SUBTLE)
+        for number, take in enumerate(clean)
+        for seed in range(SEEDS)
+    ]
+    whole, known = getattr(track_check, INTAKE), {}
+
+    def remembered(tracks: list[Track], settings: Settings) -> object:
+        key = tuple((track.stamps_ns.tobytes(), track.poses.tobytes()) for track in tracks)
+        if key not in known:
+            known[key] = whole(tracks, settings)
+        return known[key]
+
+    monkeypatch.setattr(track_check, INTAKE, remembered)
+    now = shares(cases, clean)
+    lines, idle, better = [f"as it is: {now}"], [], []
+    for module, names in ((track_check, CHECK), (track_offsets, OFFSETS)):
+        for name in names:
+            value = getattr(module, name)
+            others = []
+            for other in AROUND.get(name, (0.5 * value, 2.0 * value)):
+                with monkeypatch.context() as patch:
+                    patch.setattr(module, name, other)
+                    others.append(shares(cases, clean))
+                lines.append(f"{module.__name__}.{name} = {other:g}: {others[-1]}")
+            if all(np.abs(np.subtract(one, now)).max() < 2e-4 for one in others):
+                idle.append(name)
+            better += [name for one in others if one.removed <= now.removed and one.missed < now.missed - 0.01]
+    print("\n".join(lines))
+    assert (idle, better) == ([], [])
+    assert now.missed < 0.02
+    assert now.removed == 0.0
