@@ -5,7 +5,6 @@ which follows again once there is another.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import signal
 import subprocess
@@ -26,7 +25,6 @@ from support.paths import ROOT
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import (
-    Client,
     UnreachableError,
     endpoints,
     open_session,
@@ -34,7 +32,6 @@ from thirdhand.client import (
 from thirdhand.contract import cdr
 from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
-from thirdhand_sim.scene import Scene
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
 STILL_RADPS = 0.02  # of a measured joint at rest
@@ -163,25 +160,6 @@ def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path
         )
     assert there.new.mean() > 0.99
     assert_allowed(there.velocity[there.new], there.joints[there.new])
-
-
-@pytest.mark.timed
-def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_path: Path) -> None:
-    (tmp_path / "arm.toml").write_text(PATIENT)
-    with serving(tmp_path, network=PATIENT) as daemon:
-        at = ("--connect", daemon.endpoint)
-        with following("simulated", *at, "--config", str(tmp_path / "arm.toml")) as running:
-            running.until("driving simulated")
-            Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
-            done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
-            assert done.returncode == 0, done.stderr
-            running.until("commands arrive")
-            assert running.ended() == 0
-    report = json.loads(done.stdout)
-    for name in ("handover", "grasp", "carry"):
-        assert report["events"][name]["reached"]
-        assert report["events"][name]["error_mm"] < 10.0  # as late as this machine is; in step it is below 1
-    assert "ended at rest" in running.said[-1]
 
 
 # --- bad input -----------------------------------------------------------------------------------
