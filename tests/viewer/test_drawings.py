@@ -19,7 +19,6 @@ from thirdhand.contract.printable import as_markdown, printable
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import encode_json
 from thirdhand.core.separation.body import body_of
-from thirdhand.core.skill.skill import Skill
 from thirdhand.settings.config import WAM, Settings
 from thirdhand.viewer.stream import Viewer
 from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
@@ -74,21 +73,6 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         said = [text for (text,) in values(rows["/log"], TEXT) if "ROS_PACKAGE_PATH" in text]
         assert len(said) == is_drawn
         assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
-
-
-def test_the_name_of_a_thing_that_a_place_has_too_is_shown_once(tmp_path: Path, skill: Skill) -> None:
-    at, size = (0.5, 0.38, 0.16), (0.1, 0.1, 0.006)
-    found = [SceneObject(name, "cylinder", "base", at, (0, 0, 0, 1), size, (1, 1, 1, 1)) for name in ("glass", "iron")]
-    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
-    for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-        if tick.index == 10:
-            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    shown = [values(rows[f"/scene/things/{name}/name"], "Points3D:show_labels")[-1] for name in ("glass", "iron")]
-    assert shown == [[False], [True]]
-    assert "glass" in values(rows["/skill/places/tool"], "Points3D:labels")[-1]
 
 
 def test_without_vulkan_one_line_tells_what_a_picture_needs(
