@@ -16,7 +16,6 @@ from support.paths import RECORDINGS
 from support.spoiled import SPOILS, START_NS, Streams, streams_of, write_streams
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration
 
 SEEDS = 3
@@ -118,26 +117,3 @@ def test_where_a_clock_begins_anew_the_times_of_recording_count(
     assert f"the clock of {', '.join(spoiled.KEYS[name] for name in which)} restarts or was set" in said[0]
     np.testing.assert_array_equal(got.hands, take.hands)
     np.testing.assert_array_equal(got.tool, take.tool)
-
-
-def test_what_is_learned_is_what_the_clean_rest_teaches(tmp_path: Path) -> None:
-    """By positions: so what is learned is a function of the samples that are left."""
-    takes = [circling(seed, apart_m=0.03) for seed in range(4)]
-    whole = learn(takes, points=80, ell=5.0)
-    for spoil in (spoiled.jump, spoiled.freeze, spoiled.gap, spoiled.nans, spoiled.zeros):
-        got, rest = [], []
-        for seed, take in enumerate(takes):
-            random = np.random.default_rng(seed)
-            mask = (take.seconds >= 3.0 + seed) & (take.seconds < 5.0 + seed)
-            streams = streams_of(take)
-            spoil(streams, "left", mask, random)
-            got.append(read_back(tmp_path / "a.mcap", streams))
-            at = np.isin(take.stamps_ns, got[-1].stamps_ns - START_NS)
-            rest.append(Demonstration._make(x[at] if isinstance(x, np.ndarray) else x for x in take))
-            rest[-1] = rest[-1]._replace(begins=got[-1].begins)
-        skill, wanted = learn(got, points=80, ell=5.0), learn(rest, points=80, ell=5.0)
-        held_out = circling(9, apart_m=0.03)
-        np.testing.assert_array_equal(skill.mean(held_out.hands), wanted.mean(held_out.hands))
-        assert skill.threshold == wanted.threshold
-        assert np.linalg.norm(skill.mean(held_out.hands) - whole.mean(held_out.hands), axis=1).max() < 0.01
-        assert skill.threshold == pytest.approx(whole.threshold, rel=0.25)

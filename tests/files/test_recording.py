@@ -18,12 +18,8 @@ from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
 from support.wam import FRAME
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.channels import EVENT_NUMBERS
-from thirdhand.contract.ros2msg import schema
 from thirdhand.core.frame import (
-    Event,
-    Tick,
     blank,
-    definitions,
     encode,
 )
 from thirdhand.recordings.mcap_file import McapFile, RecordingError
@@ -67,13 +63,6 @@ def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_an
         (21, 1, SKILL),
     ]
     assert all(step.state is not None for step in steps[10:])
-
-
-def test_a_skill_adopted_in_a_tick_is_not_written_again_after_a_gap(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
-        recorder.write(Tick(0, (Event("skill", b"new", None),)), blank(FRAME), time_ns=0)
-        recorder.write(Tick(5), blank(FRAME), time_ns=10, state=state_after(5), skill=b"new", lost=4)
-    assert [step.skill for step in Recording.open(tmp_path / "a.mcap").steps()] == [None, None]
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
@@ -163,11 +152,3 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
         next(message.position.tolist() for topic, message in reversed(read) if topic.endswith("joints/command"))
         == told[-1][1]["joints"].tolist()
     )
-
-
-@pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
-def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
-    text = schema(kind, definitions(7))
-    told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
-    needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
-    assert needed == told
