@@ -18,22 +18,17 @@ from typing import Any
 
 import aiohttp
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from thirdhand.contract.explain import ExplainedError
-from thirdhand.contract.messages import WireError
 from thirdhand.workbench.trackers import browser_hands
 from thirdhand.workbench.trackers.browser_hands import (
     NO_TOKEN,
     TAKEN,
 )
 from thirdhand.workbench.trackers.hand_message import (
-    HANDS_LAYOUT,
     PING,
     PING_MAGIC,
-    decode_hands,
 )
 from thirdhand.workbench.trackers.hands_page import WORKER, HeadsetPage
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
@@ -240,12 +235,3 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
         server_certificate("localhost", tmp_path / "state")
     with pytest.raises(ExplainedError, match="a name in plain letters, or an address, needed"):
         server_certificate("not plain", tmp_path / "state")
-
-
-@given(
-    st.binary(max_size=200)
-    | st.binary(min_size=HANDS_LAYOUT.size, max_size=HANDS_LAYOUT.size).map(lambda b: hands_message()[:4] + b[4:])
-)
-def test_no_bytes_are_an_unexplained_error(data: bytes) -> None:
-    with contextlib.suppress(WireError):
-        decode_hands(data, time.time_ns())

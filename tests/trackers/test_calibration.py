@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from support.cell import serving, told
 from support.cell_commands import assert_refused, started, succeeded
 from support.paths import ROOT
-from thirdhand.client import endpoints, open_session
+from thirdhand.client import open_session
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.daemon.launch import free_port
@@ -47,7 +47,6 @@ from thirdhand.workbench.trackers.calibration.cell_file import (
 )
 from thirdhand.workbench.trackers.calibration.collecting import (
     LedTracks,
-    distances_m,
     held_tool,
     solved,
 )
@@ -335,15 +334,6 @@ def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
     np.testing.assert_array_equal(righted.hand, held_tool(hand, tool, tracker)[0].hand)
 
 
-def test_a_check_measures_how_far_the_tracker_moved() -> None:
-    held = held_by("headset")
-    found = solve_held(held, CORNERS)
-    again = held_by("headset", seed=4)
-    assert 5 < 1e3 * np.median(distances_m(again, found)) < 15
-    moved = again._replace(hand=again.hand + TURN.inv().apply([0.0, 0.05, 0.0]))
-    assert 45 < 1e3 * np.median(distances_m(moved, found)) < 60
-
-
 # --- the cell's file ------------------------------------------------------------------------------
 
 FOUND = Calibration(
@@ -556,8 +546,6 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     ):
         assert_refused(code, words, *cell, *more)
     assert load(tmp_path / "cell.toml").hands.base_from_tracker[0] == pytest.approx(1.44)
-    without = told("calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "ur5", "--hand", "left")
-    assert 'Write this into the cell\'s settings; --config FILE does it:\n[hands]\nframe = "mocap"' in without.stdout
     words = "has no joints/state of the joints"
     assert_refused(
         1, f"{words} wam/base_yaw_joint", "calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam"
@@ -581,10 +569,6 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
         done.stderr
     )
     assert_refused(1, "cell.calibration.json does not exist", *command, "--check", "--hand", "right")
-    record_path(cell).write_bytes(record_path(cell, "mocap").read_bytes().replace(b'"mocap"', b'"webxr"'))
-    words = "hands are of two trackers, 'mocap' and 'webxr': give the hand that holds the tool by --hand"
-    assert_refused(1, words, *command, "--check")
-    succeeded(*command, "--check", "--hand", "left")
     cell.write_text(text.replace("mocap", "optitrack"))
     assert_refused(1, "hands/left is in frame 'mocap', which has no table", *command, "--hand", "left")
     assert load(cell).hands == HandSettings(frame="webxr")
@@ -593,11 +577,8 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tm
 class LedCell:
     """An arm that is led in real time and a hand that holds its tool, published until closed.
 
-    While `touched` is a position in frame `base` [m], the right hand rests there instead. While not
-    `is_seen`, it is not published.
+    While `touched` is a position in frame `base` [m], the right hand rests there instead.
     """
-
-    is_seen = True
 
     def __init__(self, endpoint: str, settings: Settings, arm: LedArm) -> None:
         self.touched: tuple[float, float, float] | None = None
@@ -616,8 +597,7 @@ class LedCell:
             at = self._hands[k] if self.touched is None else np.array(self.touched)
             seen = TURN.inv().apply(at - ORIGIN) + 0.001 * random.normal(size=3)
             pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(seen.tolist()), (0.0, 0.0, 0.0, 1.0))
-            if self.is_seen:
-                self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
+            self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
 
     def __enter__(self) -> LedCell:
         return self
@@ -649,51 +629,17 @@ POINTS = ((0.5, -0.3, 0.05), (0.5, 0.3, 0.05), (0.9, 0.3, 0.1), (0.9, -0.3, 0.1)
 
 @pytest.mark.timeout(600)
 @pytest.mark.thorough
-def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cell, endpoint = tmp_path / "my.toml", f"tcp/127.0.0.1:{free_port()}"
+def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
+    cell = tmp_path / "my.toml"
     cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
     arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
-    with (
-        started("calibrate", "--config", str(cell), "--listen", endpoint) as process,
-        LedCell(endpoint, Settings(), arm) as hand,
-    ):
-        line_with(process, "hold the tool and lead it")
-        hand.is_seen = False
-        line_with(process, "hands/right no longer arrives")
-        hand.is_seen = True
-        line_with(process, "all streams arrive again")
-        assert "accuracy" in line_with(process, "led over")
-        time.sleep(8)
-        press_enter(process)
-        out, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    assert "ended by the operator" in errors
-    assert out.startswith("right hand     held, ")
-    delay_ms = int(next(line for line in out.splitlines() if line.startswith("delay")).split()[1])
-    assert abs(delay_ms - 35) < 15
-    assert load(cell).hands.frame == "webxr"
-    np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.02)
-    assert "# my cell" in cell.read_text()
-
-    monkeypatch.setattr("thirdhand.workbench.cli.calibrate.CHECK_S", 2.0)
-    check = ["calibrate", "--check", "--config", str(cell)]
-    with open_session(listen=["tcp/127.0.0.1:0"]) as hub, LedCell(endpoints(hub)[0], Settings(), arm):
-        done = told(*check, "--connect", endpoints(hub)[0])
-        assert (done.returncode, "hand at the tool: " in done.stdout) == (0, True), done.stdout + done.stderr
-
-    with serving(tmp_path, "--config", str(cell)) as daemon, LedCell(daemon.endpoint, Settings(), arm) as led_cell:
-        led_cell.touched = (0.7, 0.2, 0.2)
-        status = daemon.until(lambda now: "right" in now["hands_m"] and now["sources"]["right"]["fresh"], 30)
-        np.testing.assert_allclose(status["hands_m"]["right"], led_cell.touched, atol=0.01)
-        assert status["below_table_m"] == {}
+    with serving(tmp_path, "--config", str(cell)) as daemon, LedCell(daemon.endpoint, Settings(), arm) as hand:
         points = ["--config", str(cell), "--connect", daemon.endpoint]
         for point in POINTS:
             points += ["--at", *map(str, point)]
         with started("calibrate", *points) as process:
             for number, point in enumerate(POINTS, 1):
-                led_cell.touched = point
+                hand.touched = point
                 line_with(process, f"{number}: touch ({point[0]:g}, ")
                 time.sleep(0.8)
                 press_enter(process)
@@ -702,7 +648,7 @@ def test_a_led_arm_is_calibrated_checked_and_its_daemon_maps_right(
     assert out.startswith("right hand     points, ")
     assert ", 6 points, 0 outliers" in out
     np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.005)
-    assert len(list(tmp_path.glob("my.toml.before-*"))) == 2
+    assert len(list(tmp_path.glob("my.toml.before-*"))) == 1
 
 
 def test_without_hands_or_arm_the_command_says_what_is_missing() -> None:

@@ -64,13 +64,6 @@ def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) ->
     assert palm_pose("left", spoil(picture), shape, LENS, LENGTH_M) is None
 
 
-@pytest.mark.skipif(HAS_MEDIAPIPE, reason="MediaPipe is installed")
-def test_without_mediapipe_the_remedy_is_named(tmp_path: Path) -> None:
-    for call in (lambda: HandCamera(tmp_path, view_deg=60.0, hand_length=0.18), lambda: next(pictures("0"))):
-        with pytest.raises(CameraError, match=r"pip install 'thirdhand\[camera\]'"):
-            call()
-
-
 @pytest.mark.skipif(not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'")
 def test_a_camera_that_is_not_there_and_a_file_that_is_no_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="no camera 63"):
