@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from thirdhand.cli.diagnosis import Y_UP, Finding, findings
-from thirdhand.cli.status import line, rows
+from thirdhand.cli.status import rows
 from thirdhand.contract.incidents import what_to_do
 from thirdhand.contract.requests import (
     Percentiles,
@@ -191,17 +191,10 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert rows(ahead)["latency"] == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
     assert rows(HEALTHY)["latency"] == "p50 1.00, p99 2.00, max 3.00 ms"
     gone = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
-    unseen = msgspec.structs.replace(HEALTHY, sources={"left": gone, "right": gone})
-    assert rows(unseen)["nearest"] == "no hand is seen"
-    assert "not seen for 5.0 s" in line(unseen)
     one = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": gone})
     assert rows(one)["nearest"].endswith("; the left hand is assumed where it was last seen")
-    assert "±" in line(HEALTHY)
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
-    why = {"cause": "ahead", "refused": "stamped 2 s after the newest accepted one, which was held up for 2 s"}
-    named = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"ahead": 3}, **why))
-    assert rows(named)["rejected"] == f"right hand 3 ahead (newest as ahead: {why['refused']})"
 
 
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
@@ -311,8 +304,6 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
     gone = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
     assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | gone))[0]  # it may be anywhere
-    seen = {"sources": HEALTHY.sources, "hand_age_ms": HEALTHY.hand_age_ms, "hands_m": HEALTHY.hands_m}
-    assert not wrongs(diagnosed(**unseen | seen))
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
     assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: the skill needs both hands"

@@ -9,13 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from support.paths import RECORDINGS
-from support.wam import STATE
 from thirdhand.command_line import main
-from thirdhand.core.frame import blank
-from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.recording import Recording
 from thirdhand.settings import palette
-from thirdhand.settings.config import Settings
 
 
 def rows(path: Path) -> list[list[str]]:
@@ -93,21 +89,3 @@ def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
     assert float(totals["followed [%]"]) == pytest.approx(
         100 * float(one["follow [s]"]) / float(one["duration [s]"]), abs=1
     )
-
-
-def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
-    tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    empty, cut = tmp_path / "empty.mcap", tmp_path / "cut.mcap"
-    with Recorder(empty, settings=Settings(), skill=(RECORDINGS / "soldering.npz").read_bytes(), state=blank(STATE)):
-        pass
-    whole = golden.read_bytes()
-    cut.write_bytes(whole[: len(whole) // 8])
-    page = tmp_path / "page.html"
-    assert main(["report", str(empty), str(cut), "--html", str(page), "--csv", str(tmp_path / "tables")]) == 0
-    said = capsys.readouterr().out
-    assert "never: it holds no tick" in said
-    assert "Something is missing in it, once." in said
-    assert "cut at byte" in said
-    assert "<svg" in page.read_text(encoding="utf-8")
-    assert len(rows(tmp_path / "tables" / "empty" / "ticks.csv")) == 1
