@@ -4,14 +4,8 @@ stopped.
 
 from __future__ import annotations
 
-import signal
-import time
 from pathlib import Path
 
-import pytest
-
-from support.cell import Tracker, serving
-from thirdhand.cli.status import rows
 from thirdhand.contract.evidence import Evidence, explained
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import Source
@@ -68,20 +62,3 @@ def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
     for left, is_blamed in ((stale, True), (Source(rate_hz=60.0, age_ms=9.0, fresh=True), False)):
         sources = {"left": left, "right": stale}
         assert ("busy" in explained(Reason.STALE_HAND, seen._replace(sources=sources)).why) == is_blamed
-
-
-@pytest.mark.thorough
-def test_a_service_that_stood_still_names_the_machine_before_the_tracker(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as tracker:
-        daemon.until(lambda status: status["mode"] == "follow", timeout_s=60.0)
-        daemon.process.send_signal(signal.SIGSTOP)
-        tracker.left = tracker.right = None
-        time.sleep(0.5)
-        daemon.process.send_signal(signal.SIGCONT)
-        daemon.until(lambda status: status["reason"] == "stale_hand")
-        time.sleep(3.0)  # longer than what is looked at
-        status = daemon.client.status()
-    assert status.because.startswith("this machine was too busy, ")
-    assert "deadlines were missed" in status.busy
-    assert "hand was last seen" in status.because
-    assert rows(status)["machine"] == f"too busy: {status.busy}"

@@ -229,15 +229,3 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
     with open_session(listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}) as listening:
         assert endpoints(listening)[0].startswith("tcp/127.0.0.1:")
         assert not list(listening.info.routers_zid())
-
-
-def test_a_zenoh_configuration_that_is_none_is_told(
-    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "broken.json5").write_text("{ mode: ")
-    for name, words in (("broken.json5", "broken.json5: "), ("missing.json5", "No such file")):
-        monkeypatch.setenv("THIRDHAND_ZENOH_CONFIG", str(tmp_path / name))
-        assert main(["status", "--connect", lab.endpoint]) == 1
-        assert words in (said := capsys.readouterr().err)
-        assert said.startswith("thirdhand status: cannot read the Zenoh configuration ")
-        assert said.count("\n") == 1

@@ -48,14 +48,6 @@ def saved(tmp_path: Path) -> SavedViaPoints:
     return SavedViaPoints(Settings(cell="lab/bench2", files=Files(state=str(tmp_path))))
 
 
-def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
-    other = replace(skill, learned_from="other demonstrations")
-    for one, count in ((skill, 2), (other, 1)):
-        keep(saved, adapted(one, POINTS[:count], tolerance=0.03))
-    assert saved.read(skill) == (POINTS[:2], 0.03)
-    assert saved.read(other) == (POINTS[:1], 0.03)
-
-
 def files_in(folder: Path) -> dict[Path, bytes]:
     """All files below a folder, with their contents."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -365,14 +365,10 @@ def test_two_trackers_a_few_millimetres_apart_are_detected_while_the_hand_rests(
 
 
 LONE = {
-    "noise": lambda t, random: random.uniform(5e-4, 6e-3) * random.standard_normal((len(t), 3)),
-    "steps": lambda t, random: np.round(random.uniform(5e-4, 6e-3) * random.standard_normal((len(t), 3)), 2),
     "outliers": lambda t, random: 1e-3 * random.standard_t(2, size=(len(t), 3)),
     "tremor": lambda t, random: along_x(random.uniform(1e-3, 6e-3) * np.sin(2 * np.pi * random.uniform(3, 5) * t)),
-    "drift": lambda t, random: along_x(0.02 * t),
     "reaches": lambda t, random: along_x(0.15 * np.sin(2 * np.pi * random.uniform(0.2, 2) * t)),
     "moved once": lambda t, random: along_x(random.uniform(2e-3, 0.02) * (t > t.mean())),
-    "each twice": lambda t, random: along_x(0.2 * np.sin(3 * np.floor(0.5 * np.arange(len(t))) / 30)),
 }
 
 

@@ -4,7 +4,6 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import select
@@ -14,7 +13,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -38,8 +36,6 @@ from thirdhand.daemon.start import Startup, starting
 from thirdhand.process.priority import AHEAD_NICE
 from thirdhand.settings.config import Files, Settings
 from thirdhand.settings.network import Network
-
-COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
 
 NEVER_CACHED = """
 import numba
@@ -123,40 +119,6 @@ def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that
     assert min(begun) == AHEAD_NICE
     assert kept.keys() >= {"scribe", "skill worker"}
     assert all(nice >= 0 for nice in kept.values()), kept
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
-    started: tuple[Startup, str],
-    terminal: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    caplog.set_level(logging.INFO)
-    started[0].over()
-    capsys.readouterr()
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr("thirdhand.daemon.start.REPORT_EVERY_S", 0.01)
-    start = Startup(started[0].lock, started[0].session, "other")
-    caplog.clear()
-    functions = {str(number): SimpleNamespace(signatures=[]) for number in range(60)}
-    start._functions = functions  # noqa: SLF001
-    for one in functions.values():
-        time.sleep(0.03)
-        one.signatures = ["compiled"]
-    time.sleep(0.05)
-    start.over()
-    shown, logged = capsys.readouterr().err, [line for line in caplog.messages if "starting:" in line]
-    if terminal:
-        assert logged == []
-        assert "\n" not in shown
-        assert shown.count("\r\x1b[K") > 30
-        assert shown.endswith("60 of 60 functions are ready\r\x1b[K")
-    else:
-        assert shown == ""
-        assert [COUNTED.search(line)[2] for line in logged[-4:]] == ["15", "30", "45", "60"]  # type: ignore[index]
-        assert len(logged) <= 6
 
 
 @pytest.mark.thorough
